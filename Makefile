@@ -1,0 +1,39 @@
+# `make demo` builds the template of the embedded fixture and writes a report; `make test` runs the tests.
+# Both make the virtual environment they need. Python 3.11+, a C++17 compiler and make are all that must be there.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+RUN ?= runs/demo
+
+.PHONY: demo test test-slow lint bench fixture clean
+
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/raster/*.cpp)
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade pip
+	$(BIN)/pip install --quiet "$$(grep '^torch==' constraints.txt)"
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[train,video,dev]'
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/python -m pipelines.demo --out $(RUN)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks
+
+fixture: $(STAMP)
+	$(BIN)/pip install --quiet -c constraints.txt 'anny>=0.6.2'
+	$(BIN)/python -m pipelines.fixture --out data/fixtures/person
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info

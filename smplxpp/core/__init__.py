@@ -1,0 +1,1 @@
+"""Data types in which the stages meet."""

@@ -1,0 +1,97 @@
+"""Pinhole and orthographic cameras in OpenCV's convention: x right, y down, z forward, pixel centres at +0.5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera without distortion.
+
+    Attributes:
+        K: (3, 3) intrinsics in pixels. For an orthographic camera the focal lengths are pixels a metre.
+        cam_from_world: (4, 4) rigid transform, `x_cam = R x_world + t`.
+        width, height: image size in pixels.
+        orthographic: parallel projection instead of a pinhole.
+        name: for messages and files.
+    """
+
+    K: np.ndarray
+    cam_from_world: np.ndarray
+    width: int
+    height: int
+    orthographic: bool = False
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for field, shape in (("K", (3, 3)), ("cam_from_world", (4, 4))):
+            value = np.asarray(getattr(self, field), dtype=np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise InputError(
+                    f"camera {self.name!r}: {field}",
+                    expected=f"finite values of shape {shape}",
+                    received=f"shape {value.shape}, finite: {bool(np.isfinite(value).all())}",
+                    remedy="check the calibration file",
+                )
+            object.__setattr__(self, field, value)
+        if self.width < 1 or self.height < 1:
+            raise InputError(
+                f"camera {self.name!r}: image size", expected="at least 1 x 1", received=f"{self.width} x {self.height}"
+            )
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) centre of projection in the world (meaningless for an orthographic camera)."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """(3,) unit viewing direction in the world."""
+        return self.cam_from_world[2, :3]
+
+    def screen_from_world(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world points -> (N, 4): x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
+        cam = np.asarray(points, dtype=np.float64) @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
+        z = cam[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = np.ones_like(z) if self.orthographic else 1.0 / z
+        x = (self.K[0, 0] * cam[:, 0] + self.K[0, 1] * cam[:, 1]) * weight + self.K[0, 2]
+        y = self.K[1, 1] * cam[:, 1] * weight + self.K[1, 2]
+        return np.stack([x, y, z, weight], axis=1)
+
+    @staticmethod
+    def look_at(
+        *, eye: np.ndarray, target: np.ndarray, fov_y_deg: float, width: int, height: int, up: tuple = (0.0, 1.0, 0.0)
+    ) -> Camera:
+        """Pinhole camera at `eye` looking at `target` (world, metres), vertical field of view in degrees."""
+        f = 0.5 * height / np.tan(np.radians(fov_y_deg) / 2)
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+        return Camera(K, _look_at_pose(np.asarray(eye, float), np.asarray(target, float), up), width, height)
+
+    @staticmethod
+    def orthographic_view(*, center: np.ndarray, direction: np.ndarray, half_extent: float, size: int) -> Camera:
+        """Square parallel view of the ball about `center` with radius `half_extent`, seen along `-direction`.
+
+        `direction` points from the centre to the camera.
+        """
+        direction = np.asarray(direction, float) / np.linalg.norm(direction)
+        eye = np.asarray(center, float) + direction * 2.0 * half_extent
+        up = (0.0, 1.0, 0.0) if abs(direction[1]) < 0.99 else (0.0, 0.0, 1.0)
+        scale = size / (2.0 * half_extent)
+        K = np.array([[scale, 0, size / 2], [0, scale, size / 2], [0, 0, 1.0]])
+        return Camera(K, _look_at_pose(eye, np.asarray(center, float), up), size, size, orthographic=True)
+
+
+def _look_at_pose(eye: np.ndarray, target: np.ndarray, up: tuple) -> np.ndarray:
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, np.asarray(up, float))
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose

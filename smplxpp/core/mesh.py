@@ -1,0 +1,162 @@
+"""TriangleMesh: the geometry that every stage takes and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """An indexed triangle mesh; metres, +Y up, counter-clockwise faces seen from outside.
+
+    Attributes:
+        vertices: (N, 3) float64.
+        faces: (M, 3) int64 indices into `vertices`.
+
+    The constructor copies, converts and checks shapes, finite coordinates and index range; it changes nothing else
+    (duplicate vertices, zero-area faces and several components are legal: see `smplxpp.clean`).
+
+    Raises:
+        InputError: wrong shapes, NaN or infinite coordinates, indices out of range.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64, order="C")
+        faces = np.asarray(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise InputError("mesh vertices", expected="shape (N, 3)", received=f"shape {vertices.shape}")
+        if faces.ndim != 2 or faces.shape[1] != 3:
+            raise InputError(
+                "mesh faces", expected="shape (M, 3)", received=f"shape {faces.shape}", remedy="triangulate the mesh"
+            )
+        if faces.size and not np.issubdtype(faces.dtype, np.integer):
+            raise InputError("mesh faces", expected="integers", received=str(faces.dtype))
+        bad = ~np.isfinite(vertices).all(axis=1)
+        if bad.any():
+            raise InputError(
+                "mesh vertices",
+                expected="finite coordinates",
+                received=f"{int(bad.sum())} vertices with NaN or infinity, first at index {int(np.argmax(bad))}",
+                remedy="remove them with smplxpp.clean.sanitize(vertices, faces)",
+            )
+        faces = np.array(faces, dtype=np.int64, order="C")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise InputError(
+                "mesh faces",
+                expected=f"indices in [0, {len(vertices)})",
+                received=f"indices in [{faces.min()}, {faces.max()}]",
+                remedy="check for 1-based indices",
+            )
+        vertices.setflags(write=False)
+        faces.setflags(write=False)
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def face_count(self) -> int:
+        return len(self.faces)
+
+    @cached_property
+    def triangles(self) -> np.ndarray:
+        """(M, 3, 3) corner positions."""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def face_cross(self) -> np.ndarray:
+        """(M, 3) normals of length twice the area."""
+        t = self.triangles
+        return np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+
+    @cached_property
+    def face_areas(self) -> np.ndarray:
+        """(M,) square metres."""
+        return 0.5 * np.linalg.norm(self.face_cross, axis=1)
+
+    @cached_property
+    def face_normals(self) -> np.ndarray:
+        """(M, 3) unit normals; zero for a face without area."""
+        return normalize_rows(self.face_cross)
+
+    @cached_property
+    def vertex_normals(self) -> np.ndarray:
+        """(N, 3) unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
+        t, normals = self.triangles, self.face_normals
+        out = np.zeros_like(self.vertices)
+        for k in range(3):
+            u = normalize_rows(t[:, (k + 1) % 3] - t[:, k])
+            v = normalize_rows(t[:, (k + 2) % 3] - t[:, k])
+            angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
+            for axis in range(3):
+                out[:, axis] += np.bincount(self.faces[:, k], angle * normals[:, axis], minlength=len(out))
+        return normalize_rows(out)
+
+    @cached_property
+    def bbox_diagonal(self) -> float:
+        """Length of the bounding box's diagonal of the referenced vertices; 0 for an empty mesh."""
+        if not self.face_count:
+            return 0.0
+        used = self.vertices[np.unique(self.faces)]
+        return float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(E, 2) undirected edges, each once, lower index first, sorted."""
+        return self.edges_with_counts[0]
+
+    @cached_property
+    def edges_with_counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """(E, 2) undirected edges and (E,) the number of faces at each."""
+        f = self.faces
+        directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+        key = directed[:, 0] * max(self.vertex_count, 1) + directed[:, 1]
+        unique, counts = np.unique(key, return_counts=True)
+        n = max(self.vertex_count, 1)
+        return np.stack([unique // n, unique % n], axis=1), counts
+
+    @cached_property
+    def border_edges(self) -> np.ndarray:
+        """(B, 2) edges with one face."""
+        edges, counts = self.edges_with_counts
+        return edges[counts == 1]
+
+    def with_vertices(self, vertices: np.ndarray) -> TriangleMesh:
+        """The same faces on other positions."""
+        return replace(self, vertices=vertices)
+
+    def submesh(self, face_mask: np.ndarray) -> tuple[TriangleMesh, np.ndarray]:
+        """Faces selected by a mask or index array, unreferenced vertices dropped.
+
+        Returns the mesh and (n,) the index in this mesh of each of its vertices, in increasing order.
+        """
+        faces = self.faces[face_mask]
+        used = np.unique(faces)
+        lookup = np.full(self.vertex_count, -1, dtype=np.int64)
+        lookup[used] = np.arange(len(used))
+        return TriangleMesh(self.vertices[used], lookup[faces]), used
+
+
+def normalize_rows(x: np.ndarray) -> np.ndarray:
+    """Unit rows of (N, D); rows without length stay zero."""
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
+
+
+def concatenate_meshes(meshes: list[TriangleMesh]) -> TriangleMesh:
+    """All meshes as one, in order, nothing merged."""
+    offsets = np.cumsum([0] + [m.vertex_count for m in meshes])
+    return TriangleMesh(
+        np.concatenate([m.vertices for m in meshes]),
+        np.concatenate([m.faces + o for m, o in zip(meshes, offsets[:-1], strict=True)]),
+    )

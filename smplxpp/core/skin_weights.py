@@ -1,0 +1,76 @@
+"""SkinWeights: what skin-weight transfer returns and skinning takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class SkinWeights:
+    """Sparse skinning weights of N vertices over J joints, with where they came from.
+
+    Attributes:
+        joint_indices: (N, K) int32.
+        joint_weights: (N, K) float64, rows sum to 1, none negative; unused slots have weight 0.
+        joint_count: J.
+        matched: (N,) bool, taken from the source by correspondence (not inpainted).
+        distance: (N,) float64 metres to the closest source point (NaN where unknown).
+        angle: (N,) float64 radians between the normals there (NaN where unknown).
+        component: (N,) int32 connected component of each vertex.
+        policies: the policy taken for each component ("matched", "nearest", "rigid:head", ...).
+    """
+
+    joint_indices: np.ndarray
+    joint_weights: np.ndarray
+    joint_count: int
+    matched: np.ndarray
+    distance: np.ndarray
+    angle: np.ndarray
+    component: np.ndarray
+    policies: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.joint_indices)
+
+    def dense(self) -> np.ndarray:
+        """(N, J) float64; every row sums to 1."""
+        out = np.zeros((len(self), self.joint_count))
+        np.add.at(out, (np.arange(len(self))[:, None], self.joint_indices), self.joint_weights)
+        return out
+
+    @staticmethod
+    def from_dense(weights: np.ndarray, *, max_influences: int | None = None, **provenance) -> SkinWeights:
+        """Keep the `max_influences` largest of each row of (N, J) weights, clip at 0, renormalise.
+
+        Raises:
+            InputError: a row without a positive weight, or NaN.
+        """
+        weights = np.asarray(weights, dtype=np.float64)
+        if weights.ndim != 2 or not np.isfinite(weights).all():
+            raise InputError("skinning weights", expected="finite (N, J)", received=f"shape {weights.shape} or NaN")
+        n, joint_count = weights.shape
+        clipped = np.clip(weights, 0.0, None)
+        used = int((clipped > 0).sum(axis=1).max(initial=1))
+        k = max(1, min(used, max_influences or joint_count))
+        # Stable order: larger weight first, then lower joint index.
+        order = np.argsort(-clipped, axis=1, kind="stable")[:, :k]
+        kept = np.take_along_axis(clipped, order, axis=1)
+        total = kept.sum(axis=1, keepdims=True)
+        if (total <= 0).any():
+            raise InputError(
+                "skinning weights",
+                expected="a positive weight in every row",
+                received=f"{int((total <= 0).sum())} rows without, first at vertex {int(np.argmax(total <= 0))}",
+            )
+        defaults = {
+            "matched": np.ones(n, dtype=bool),
+            "distance": np.full(n, np.nan),
+            "angle": np.full(n, np.nan),
+            "component": np.zeros(n, dtype=np.int32),
+            "policies": (),
+        }
+        return SkinWeights(order.astype(np.int32), kept / total, joint_count, **{**defaults, **provenance})

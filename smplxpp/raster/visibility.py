@@ -1,0 +1,53 @@
+"""The visible outer surface: what some camera around the mesh could see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster.zbuffer import rasterize_mesh
+
+
+def view_directions(count: int) -> np.ndarray:
+    """`count` unit vectors spread evenly over the sphere (Fibonacci lattice): (count, 3)."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(angle), z, r * np.sin(angle)], axis=1)
+
+
+def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    radius = 0.5 * float(np.linalg.norm(high - low)) * 1.01
+    return [
+        Camera.orthographic_view(center=0.5 * (low + high), direction=d, half_extent=radius, size=resolution)
+        for d in view_directions(views)
+    ]
+
+
+def outer_visible_faces(mesh: TriangleMesh, *, views: int = 48, resolution: int = 768) -> np.ndarray:
+    """(M,) bool: faces that own a pixel in some of `views` orthographic views from outside."""
+    seen = np.zeros(mesh.face_count, dtype=bool)
+    for camera in _cameras(mesh, views, resolution):
+        ids = rasterize_mesh(mesh, camera).face_id
+        seen[ids[ids >= 0]] = True
+    return seen
+
+
+def outer_visible_points(
+    mesh: TriangleMesh, points: np.ndarray, *, tolerance: float, views: int = 48, resolution: int = 768
+) -> np.ndarray:
+    """(P,) bool: points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
+    points = np.asarray(points, dtype=np.float64)
+    seen = np.zeros(len(points), dtype=bool)
+    for camera in _cameras(mesh, views, resolution):
+        depth = rasterize_mesh(mesh, camera).depth
+        x, y, z = camera.screen_from_world(points).T[:3]
+        col, row = np.floor(x).astype(int), np.floor(y).astype(int)
+        inside = (col >= 0) & (col < camera.width) & (row >= 0) & (row < camera.height)
+        front = np.full(len(points), np.inf)
+        front[inside] = depth[row[inside], col[inside]]
+        seen |= z <= front + tolerance
+    return seen

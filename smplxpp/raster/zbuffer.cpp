@@ -1,0 +1,117 @@
+// Z-buffer triangle rasteriser: face id, barycentrics and depth of the nearest face at every pixel centre.
+//
+// Rows are dealt to threads in interleaved bands and every band visits the faces in index order with a strict
+// depth test, so the result does not depend on the number of threads. On equal depth the lower face index wins.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <thread>
+#include <vector>
+
+namespace {
+
+constexpr int kBandRows = 8;
+
+struct Target {
+    int width, height;
+    int32_t* face_id;   // (H,W), -1 = background
+    float* barycentric; // (H,W,3), of the face's three corners, perspective-correct; 0 on the background
+    float* depth;       // (H,W), +inf = background
+};
+
+void clear_band(const Target& t, int y0, int y1) {
+    const size_t begin = size_t(y0) * t.width, end = size_t(y1) * t.width;
+    std::fill(t.face_id + begin, t.face_id + end, -1);
+    std::fill(t.barycentric + 3 * begin, t.barycentric + 3 * end, 0.0f);
+    std::fill(t.depth + begin, t.depth + end, std::numeric_limits<float>::infinity());
+}
+
+// `screen` holds x, y in pixels (pixel centres at +0.5), z, and the interpolation weight (1/z for perspective,
+// 1 for orthographic) of each vertex, in double: edge functions of slivers lose their sign in float.
+void raster_rows(const double* screen, const int32_t* faces, int64_t first, int64_t last, const int32_t* order,
+                 double near, int y_begin, int y_end, const Target& t) {
+    for (int64_t k = first; k < last; ++k) {
+        const int32_t f = order[k];
+        const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
+        const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
+        const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
+        if (a[2] <= near || b[2] <= near || c[2] <= near) continue;
+        const double area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]);
+        if (area == 0.0) continue;
+        const double ymin = std::min({a[1], b[1], c[1]}), ymax = std::max({a[1], b[1], c[1]});
+        const double xmin = std::min({a[0], b[0], c[0]}), xmax = std::max({a[0], b[0], c[0]});
+        if (!(ymax >= y_begin && ymin <= y_end && xmax >= 0 && xmin <= t.width)) continue;
+        const int y0 = std::max(y_begin, int(std::ceil(ymin - 0.5))), y1 = std::min(y_end - 1, int(std::floor(ymax - 0.5)));
+        const int x0 = std::max(0, int(std::ceil(xmin - 0.5)));
+        const int x1 = int(std::min(double(t.width - 1), std::floor(xmax - 0.5)));
+        const double inv = 1.0 / area;
+        const double ax = (b[1] - c[1]) * inv, ay = (c[0] - b[0]) * inv;
+        const double bx = (c[1] - a[1]) * inv, by = (a[0] - c[0]) * inv;
+        for (int y = y0; y <= y1; ++y) {
+            const double py = y + 0.5 - c[1];
+            for (int x = x0; x <= x1; ++x) {
+                const double px = x + 0.5 - c[0];
+                const double wa = ax * px + ay * py, wb = bx * px + by * py, wc = 1.0 - wa - wb;
+                if (wa < 0 || wb < 0 || wc < 0) continue;
+                const double qa = wa * a[3], qb = wb * b[3], qc = wc * c[3], q = 1.0 / (qa + qb + qc);
+                const float z = float((qa * a[2] + qb * b[2] + qc * c[2]) * q);
+                const size_t i = size_t(y) * t.width + x;
+                if (z < t.depth[i]) {
+                    t.depth[i] = z;
+                    t.face_id[i] = f;
+                    t.barycentric[3 * i] = float(qa * q);
+                    t.barycentric[3 * i + 1] = float(qb * q);
+                    t.barycentric[3 * i + 2] = float(qc * q);
+                }
+            }
+        }
+    }
+}
+
+}  // namespace
+
+extern "C" __attribute__((visibility("default"))) void smplxpp_zbuffer(
+    const double* screen, const int32_t* faces, int64_t face_count, double near, int width, int height,
+    int32_t* face_id, float* barycentric, float* depth, int threads) {
+    const Target target{width, height, face_id, barycentric, depth};
+    const int bands = (height + kBandRows - 1) / kBandRows;
+
+    // Faces of each band, in index order (counting sort): small faces are touched by one band alone.
+    std::vector<int64_t> start(size_t(bands) + 1, 0);
+    auto span = [&](int64_t f, int& lo, int& hi) {
+        double ymin = std::numeric_limits<double>::infinity(), ymax = -ymin;
+        for (int k = 0; k < 3; ++k) {
+            const double y = screen[4 * size_t(faces[3 * size_t(f) + k]) + 1];
+            if (!std::isfinite(y)) return false;
+            ymin = std::min(ymin, y), ymax = std::max(ymax, y);
+        }
+        if (ymax < 0 || ymin > height) return false;
+        lo = int(std::max(0.0, ymin)) / kBandRows;
+        hi = std::min(bands - 1, int(std::min(double(height), ymax)) / kBandRows);
+        lo = std::min(lo, bands - 1);
+        return true;
+    };
+    int lo, hi;
+    for (int64_t f = 0; f < face_count; ++f)
+        if (span(f, lo, hi))
+            for (int b = lo; b <= hi; ++b) ++start[size_t(b) + 1];
+    for (int b = 0; b < bands; ++b) start[size_t(b) + 1] += start[size_t(b)];
+    std::vector<int32_t> order(static_cast<size_t>(start[size_t(bands)]));
+    std::vector<int64_t> cursor(start.begin(), start.end() - 1);
+    for (int64_t f = 0; f < face_count; ++f)
+        if (span(f, lo, hi))
+            for (int b = lo; b <= hi; ++b) order[size_t(cursor[size_t(b)]++)] = int32_t(f);
+
+    auto work = [&](int thread) {
+        for (int b = thread; b < bands; b += threads) {
+            const int y0 = b * kBandRows, y1 = std::min(height, y0 + kBandRows);
+            clear_band(target, y0, y1);
+            raster_rows(screen, faces, start[size_t(b)], start[size_t(b) + 1], order.data(), near, y0, y1, target);
+        }
+    };
+    std::vector<std::thread> pool;
+    for (int k = 1; k < threads; ++k) pool.emplace_back(work, k);
+    work(0);
+    for (auto& t : pool) t.join();
+}
