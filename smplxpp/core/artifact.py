@@ -1,7 +1,7 @@
 """Run folders: one folder a stage, skipped while its configuration, inputs and version stand.
 
-A stage lies in `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so a kill at any
-moment loses at most the stage under way.
+A stage lies in `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so a kill at
+any moment loses at most the stage under way.
 """
 
 from __future__ import annotations

@@ -1,0 +1,89 @@
+"""The reference frame of a capture: its scan, body parameters and labels."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class ReferenceFrame:
+    """Files of one frame, found by name; nothing is read yet.
+
+    Attributes:
+        subject: name of the capture's folder.
+        frame: number of the frame.
+        scan, params: files that must be there. `params_frame` is the row of `params` that belongs to the frame.
+        scan_labels: labels of the scan's vertices, or None.
+        label_maps: label image of each camera by name, with `cameras_file` their cameras.
+    """
+
+    subject: str
+    frame: int
+    scan: Path
+    params: Path
+    params_frame: int
+    scan_labels: Path | None = None
+    label_maps: dict[str, Path] = field(default_factory=dict)
+    cameras_file: Path | None = None
+
+
+def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | None = None) -> ReferenceFrame:
+    """Find frame `frame` in a capture folder of our simple layout.
+
+    The layout: `scans/scan_FFFFFF.ply` (`.obj`), `scans/scan_FFFFFF_labels.npz`, `params/params.npz` (stacked) or
+    `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `cameras.json` or `calibration.csv`. `params` names another
+    stacked parameter file (for instance a tracker's).
+
+    Raises:
+        InputError: no such folder, or scan or parameters missing.
+    """
+    root = Path(capture)
+    if not root.is_dir():
+        raise InputError("capture", expected="an existing folder", received=str(root))
+    number = f"{frame:06d}"
+    scan = _first(root / "scans", [f"scan_{number}{suffix}" for suffix in (".ply", ".obj", ".glb")])
+    if scan is None:
+        have = sorted(p.name for p in (root / "scans").glob("scan_*") if not p.name.endswith("_labels.npz"))
+        raise InputError(
+            f"capture {root.name}",
+            expected=f"a scan scans/scan_{number}.ply",
+            received=f"scans of {', '.join(have[:5]) or 'no frame'}",
+            remedy="choose another frame with --frame, or build with --scan, --params and --labels",
+        )
+    if params is not None:
+        params_file, row = Path(params), frame
+        if not params_file.is_file() and (root / "params" / params_file.name).is_file():
+            params_file = root / "params" / params_file.name
+    else:
+        single = root / "params" / f"{number}.npz"
+        params_file, row = (single, 0) if single.is_file() else (root / "params" / "params.npz", frame)
+    if not params_file.is_file():
+        raise InputError(
+            f"capture {root.name}",
+            expected=f"params/{number}.npz or params/params.npz",
+            received="neither" if params is None else str(params_file),
+            remedy="convert your fit with `smplxpp params convert`",
+        )
+    pattern = re.compile(rf"^(?P<camera>.+)_label{number}\.(png|npy)$")
+    maps = {}
+    for path in sorted((root / "labels").glob(f"*/*_label{number}.*")):
+        if match := pattern.match(path.name):
+            maps[match["camera"]] = path
+    return ReferenceFrame(
+        subject=root.resolve().name,
+        frame=frame,
+        scan=scan,
+        params=params_file,
+        params_frame=row,
+        scan_labels=_first(root / "scans", [f"scan_{number}_labels.npz"]),
+        label_maps=maps,
+        cameras_file=_first(root, ["cameras.json", "calibration.csv"]),
+    )
+
+
+def _first(folder: Path, names: list[str]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_file()), None)
