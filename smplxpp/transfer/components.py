@@ -1,0 +1,62 @@
+"""Connected components, and what happens to one that nothing matched."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import scipy.sparse as sp
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.transfer.config import TransferConfig
+
+
+def vertex_components(mesh: TriangleMesh) -> tuple[np.ndarray, int]:
+    """(N,) int32 component of every vertex, numbered by their lowest vertex, and their number."""
+    n, e = mesh.vertex_count, mesh.edges
+    graph = sp.coo_matrix((np.ones(len(e), dtype=np.int8), (e[:, 0], e[:, 1])), shape=(n, n))
+    count, labels = sp.csgraph.connected_components(graph, directed=False)
+    return labels.astype(np.int32), int(count)
+
+
+def settle_unmatched(
+    component: np.ndarray,
+    matched: np.ndarray,
+    weights: np.ndarray,
+    config: TransferConfig,
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Give every component without a match its stated policy.
+
+    Args:
+        component: (N,) ids 0..P-1.
+        matched: (N,) bool.
+        weights: (N, J) of the closest source points.
+
+    Returns:
+        (N,) bool rows settled here, (N, J) weights with those rows set, (P,) the policy of each component.
+
+    Raises:
+        InputError: a component without a match under the policy "raise".
+    """
+    count = int(component.max(initial=-1)) + 1
+    lost = np.bincount(component, matched, minlength=count) == 0
+    policies = tuple(np.where(lost, config.unmatched, "matched").tolist())
+    rows = lost[component]
+    if not rows.any():
+        return rows, weights, policies
+    message = f"{int(lost.sum())} of {count} components ({int(rows.sum())} of {len(rows)} vertices) have no match"
+    if config.unmatched == "raise":
+        raise InputError(
+            "target mesh",
+            expected="a matched vertex in every component",
+            received=f"{message}, first at vertex {int(np.argmax(rows))}",
+            remedy="choose the policy TransferConfig(unmatched='nearest') or 'rigid:JOINT', or remove those pieces",
+        )
+    if config.unmatched == "nearest":
+        warnings.warn(f"skin weights: {message}; they take the nearest weights", GeometryWarning, stacklevel=3)
+        return rows, weights, policies
+    out = weights.copy()
+    out[rows] = 0.0
+    out[rows, config.joint_index(config.unmatched.removeprefix("rigid:"), weights.shape[1])] = 1.0
+    return rows, out, policies

@@ -1,0 +1,75 @@
+"""Where each vertex of the target meets the source, and whether that is believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+
+from smplxpp.core.mesh import TriangleMesh, normalize_rows
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """The closest point of the source for each of N target vertices.
+
+    Attributes:
+        face: (N,) source face.
+        barycentric: (N, 3) weights of its corners, none negative, rows sum to 1.
+        distance: (N,) metres.
+        angle: (N,) radians between the normals, NaN where a normal is missing.
+    """
+
+    face: np.ndarray
+    barycentric: np.ndarray
+    distance: np.ndarray
+    angle: np.ndarray
+
+    def interpolate(self, source: TriangleMesh, values: np.ndarray) -> np.ndarray:
+        """(V, D) values at the source's vertices -> (N, D) at the closest points."""
+        rows = np.repeat(np.arange(len(self.face)), 3)
+        corners = source.faces[self.face].ravel()
+        matrix = sp.csr_matrix((self.barycentric.ravel(), (rows, corners)), (len(self.face), source.vertex_count))
+        return matrix @ values
+
+    def matched(self, *, max_distance: float, max_angle: float) -> np.ndarray:
+        """(N,) bool: near enough (metres) and facing the same way (radians)."""
+        return (self.distance <= max_distance) & (self.angle <= max_angle)
+
+
+def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence:
+    """Closest point of `source` for every vertex of `target`, in float64.
+
+    Normals are weighted by angle on both meshes and interpolated on the source. Where several source points are as close,
+    as at the coincident borders of two layers, the first that the tree finds is taken.
+    """
+    points = np.ascontiguousarray(target.vertices)
+    squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces)
+    corners = source.faces[face]
+    barycentric = _barycentric(closest, *(source.vertices[corners[:, k]] for k in range(3)))
+    found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))
+    ours, theirs = target.vertex_normals, normalize_rows(found.interpolate(source, source.vertex_normals))
+    # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
+    angle = np.arctan2(np.linalg.norm(np.cross(ours, theirs), axis=1), np.einsum("ij,ij->i", ours, theirs))
+    missing = ~(ours.any(axis=1) & theirs.any(axis=1))
+    angle[missing] = np.nan
+    return Correspondence(face, barycentric, np.sqrt(squared), angle)
+
+
+def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Weights of points on triangles (Ericson 2004, 3.4); on a triangle without area, along its longest edge."""
+    u, v, w = b - a, c - a, p - a
+    uu, uv, vv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (u, v), (v, v)))
+    wu, wv = np.einsum("ij,ij->i", w, u), np.einsum("ij,ij->i", w, v)
+    det = uu * vv - uv * uv
+    flat = det <= 1e-14 * np.maximum(uu, vv) ** 2
+    safe = np.where(flat, 1.0, det)
+    beta, gamma = (vv * wu - uv * wv) / safe, (uu * wv - uv * wu) / safe
+    along_u = flat & (uu >= vv)
+    along_v = flat & ~along_u
+    beta = np.where(flat, np.where(along_u, wu / np.where(uu > 0, uu, 1.0), 0.0), beta)
+    gamma = np.where(flat, np.where(along_v, wv / np.where(vv > 0, vv, 1.0), 0.0), gamma)
+    weights = np.clip(np.stack([1.0 - beta - gamma, beta, gamma], axis=1), 0.0, None)
+    return weights / weights.sum(axis=1, keepdims=True)
