@@ -1,1 +1,46 @@
-""""""
+"""Every stage measured: distances between surfaces, mesh quality, weights, stretch, penetration. No torch."""
+
+from smplxpp.metrics.conventions import Convention, presets
+from smplxpp.metrics.distance import (
+    CompareConfig,
+    DirectedDistances,
+    DirectionStats,
+    MeshComparison,
+    compare,
+    directed_distances,
+    point_to_surface,
+)
+from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
+from smplxpp.metrics.quality import MeshQuality, mesh_quality
+from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
+from smplxpp.metrics.self_intersection import self_intersections
+from smplxpp.metrics.stretch import StretchReport, edge_stretch, flipped_faces, stretch_report
+from smplxpp.metrics.weights import VariationStats, WeightReport, total_variation, weight_report
+
+__all__ = [
+    "CompareConfig",
+    "Convention",
+    "DirectedDistances",
+    "DirectionStats",
+    "MeshComparison",
+    "MeshQuality",
+    "PenetrationReport",
+    "StretchReport",
+    "SurfaceSamples",
+    "VariationStats",
+    "WeightReport",
+    "compare",
+    "directed_distances",
+    "edge_stretch",
+    "flipped_faces",
+    "mesh_quality",
+    "penetration",
+    "point_to_surface",
+    "presets",
+    "sample_surface",
+    "self_intersections",
+    "signed_distance",
+    "stretch_report",
+    "total_variation",
+    "weight_report",
+]

@@ -1,0 +1,165 @@
+"""Quality of a mesh: manifoldness, borders, winding, components, shape of its faces, self-intersections."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import igl
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.metrics.sampling import require_surface
+from smplxpp.metrics.self_intersection import self_intersections
+
+
+@dataclass(frozen=True)
+class MeshQuality:
+    """What `mesh_quality` found.
+
+    Attributes:
+        vertices, faces: counts. unreferenced_vertices: in no face.
+        duplicate_faces: faces with the corners of an earlier one, in any order.
+        components: pieces that share no vertex.
+        euler: V - E + F over referenced vertices (2 for one closed piece, less 1 a border, less 2 a handle).
+        nonmanifold_edges: edges with three or more faces. nonmanifold_vertices: whose faces form more than one fan.
+        inconsistent_edges: edges with two faces that run along them in the same direction (one is wound the wrong way).
+        flipped_faces: faces to turn so that each orientable patch is consistent, its majority kept.
+        border_edges: with one face. border_loops: connected pieces of border. border_lengths_mm: longest first.
+        zero_area_faces: with no area at all.
+        aspect_p50, aspect_p95, aspect_p99, aspect_max: circumradius over twice the inradius (1 for an equilateral
+            triangle), of the faces with area.
+        edge_length_mean_mm: over edges.
+        area_m2: of the surface.
+        self_intersections: pairs of faces that cut each other; None when not asked for.
+    """
+
+    vertices: int
+    faces: int
+    unreferenced_vertices: int
+    duplicate_faces: int
+    components: int
+    euler: int
+    nonmanifold_edges: int
+    nonmanifold_vertices: int
+    inconsistent_edges: int
+    flipped_faces: int
+    border_edges: int
+    border_loops: int
+    border_lengths_mm: tuple[float, ...]
+    zero_area_faces: int
+    aspect_p50: float
+    aspect_p95: float
+    aspect_p99: float
+    aspect_max: float
+    edge_length_mean_mm: float
+    area_m2: float
+    self_intersections: int | None = None
+
+    @property
+    def manifold(self) -> bool:
+        """No edge with three faces, no vertex with two fans."""
+        return not self.nonmanifold_edges and not self.nonmanifold_vertices
+
+    @property
+    def closed(self) -> bool:
+        """No border."""
+        return not self.border_edges
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return {**asdict(self), "manifold": self.manifold, "closed": self.closed}
+
+
+def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> MeshQuality:
+    """Measure the quality of a mesh; `self_intersection` adds the slowest test.
+
+    Raises:
+        InputError: no faces, or no area.
+    """
+    require_surface(mesh, "mesh")
+    edges, counts = mesh.edges_with_counts
+    used = np.unique(mesh.faces)
+    length = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
+    borders = border_loop_lengths(mesh)
+    aspect = aspect_ratios(mesh)
+    aspect = aspect[np.isfinite(aspect)]
+    p50, p95, p99 = np.percentile(aspect, (50, 95, 99))
+    return MeshQuality(
+        vertices=mesh.vertex_count,
+        faces=mesh.face_count,
+        unreferenced_vertices=mesh.vertex_count - len(used),
+        duplicate_faces=_duplicate_face_count(mesh),
+        components=_components(edges, mesh.vertex_count)[0] - (mesh.vertex_count - len(used)),
+        euler=len(used) - len(edges) + mesh.face_count,
+        nonmanifold_edges=int((counts > 2).sum()),
+        nonmanifold_vertices=int((~igl.is_vertex_manifold(mesh.faces)[used]).sum()),
+        inconsistent_edges=int(inconsistent_edges(mesh).sum()),
+        flipped_faces=int(flipped_against_majority(mesh).sum()),
+        border_edges=len(mesh.border_edges),
+        border_loops=len(borders),
+        border_lengths_mm=tuple((np.sort(borders)[::-1] * 1e3).tolist()),
+        zero_area_faces=int((mesh.face_areas == 0).sum()),
+        aspect_p50=float(p50),
+        aspect_p95=float(p95),
+        aspect_p99=float(p99),
+        aspect_max=float(aspect.max()),
+        edge_length_mean_mm=float(length.mean() * 1e3),
+        area_m2=float(mesh.face_areas.sum()),
+        self_intersections=len(self_intersections(mesh)) if self_intersection else None,
+    )
+
+
+def aspect_ratios(mesh: TriangleMesh) -> np.ndarray:
+    """(M,) circumradius / (2 inradius) = abc (a + b + c) / (16 A^2): 1 for an equilateral face, inf without area."""
+    t = mesh.triangles
+    a, b, c = (np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3))
+    return np.divide(
+        a * b * c * (a + b + c), 16.0 * mesh.face_areas**2, out=np.full(len(t), np.inf), where=mesh.face_areas > 0
+    )
+
+
+def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
+    """(L,) metres: length of each connected piece of border (a loop, where the mesh is manifold)."""
+    border = mesh.border_edges
+    if not len(border):
+        return np.zeros(0)
+    nodes, local = np.unique(border, return_inverse=True)
+    local = local.reshape(border.shape)
+    piece = _components(local, len(nodes))[1][local[:, 0]]
+    length = np.linalg.norm(mesh.vertices[border[:, 1]] - mesh.vertices[border[:, 0]], axis=1)
+    return np.bincount(piece, length)
+
+
+def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:
+    """(E,) bool, in the order of `mesh.edges`: two faces run along the edge in the same direction."""
+    edges, counts = mesh.edges_with_counts
+    f, n = mesh.faces, mesh.vertex_count
+    directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+    index = np.searchsorted(edges[:, 0] * n + edges[:, 1], directed.min(axis=1) * n + directed.max(axis=1))
+    direction = np.where(directed[:, 0] < directed[:, 1], 1, -1)
+    return (counts == 2) & (np.bincount(index, direction, minlength=len(edges)) != 0)
+
+
+def flipped_against_majority(mesh: TriangleMesh) -> np.ndarray:
+    """(M,) bool: faces wound against the majority of their orientable patch (libigl's `bfs_orient`)."""
+    oriented, patch = igl.bfs_orient(mesh.faces)
+    # The same cyclic order means that the face was kept; faces with a repeated corner have no orientation.
+    kept = np.zeros(mesh.face_count, dtype=bool)
+    for shift in range(3):
+        kept |= (np.roll(oriented, shift, axis=1) == mesh.faces).all(axis=1)
+    turned = ~kept
+    minority_is_kept = np.bincount(patch, turned) > 0.5 * np.bincount(patch)
+    return np.where(minority_is_kept[patch], kept, turned)
+
+
+def _duplicate_face_count(mesh: TriangleMesh) -> int:
+    corners = np.sort(mesh.faces, axis=1)
+    corners = corners[np.lexsort(corners.T)]
+    return int((corners[1:] == corners[:-1]).all(axis=1).sum())
+
+
+def _components(edges: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)

@@ -1,0 +1,104 @@
+"""Points on a surface: area-weighted samples, vertices, and the labels they carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples:
+    """P points on a mesh.
+
+    Attributes:
+        points: (P, 3) float64 metres.
+        face: (P,) int64 the face that each point lies on.
+        normals: (P, 3) float64 unit normals: the face's for area samples, angle-weighted for vertices.
+    """
+
+    points: np.ndarray
+    face: np.ndarray
+    normals: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, mask: np.ndarray) -> SurfaceSamples:
+        """The points selected by a mask or index array."""
+        return SurfaceSamples(self.points[mask], self.face[mask], self.normals[mask])
+
+
+def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...] = 0) -> SurfaceSamples:
+    """`count` points spread over the surface in proportion to area, ordered by face.
+
+    Stratified: the i-th point falls into the i-th of `count` equal shares of the area, uniformly inside it, and
+    uniformly inside its face (`p = (1 - sqrt(a)) v0 + sqrt(a) (1 - b) v1 + sqrt(a) b v2`, Osada et al. 2002). Unbiased
+    like independent samples, with less variance; neighbouring samples are near each other, which a tree query likes.
+    The generator is PCG64, so that the same seed gives the same bits everywhere.
+
+    Raises:
+        InputError: `count` below 1, or a mesh without area.
+    """
+    if count < 1:
+        raise InputError("sample count", expected="at least 1", received=str(count))
+    require_surface(mesh, "mesh to sample")
+    rng = np.random.Generator(np.random.PCG64(seed))
+    cumulative = np.cumsum(mesh.face_areas)
+    share = (np.arange(count) + rng.random(count)) / count
+    face = np.searchsorted(cumulative, share * cumulative[-1], side="right")
+    # A share that rounds up to the whole area would fall behind the last face that has any.
+    face = np.minimum(face, np.flatnonzero(mesh.face_areas)[-1])
+    a, b = np.sqrt(rng.random(count)), rng.random(count)
+    weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
+    return SurfaceSamples(np.einsum("pk,pkd->pd", weights, mesh.triangles[face]), face, mesh.face_normals[face])
+
+
+def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
+    """Every referenced vertex once, with one of its faces and its angle-weighted normal."""
+    require_surface(mesh, "mesh to sample")
+    vertex, first = np.unique(mesh.faces.ravel(), return_index=True)
+    return SurfaceSamples(mesh.vertices[vertex], first // 3, mesh.vertex_normals[vertex])
+
+
+def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarray:
+    """Labels of faces (M,) or vertices (N,) as int64.
+
+    Raises:
+        InputError: not integers, or a length that fits neither or both.
+    """
+    labels = np.asarray(labels)
+    fits = (labels.shape == (mesh.face_count,)) + (labels.shape == (mesh.vertex_count,))
+    if not np.issubdtype(labels.dtype, np.integer) or fits != 1:
+        raise InputError(
+            name,
+            expected=f"integers, one a face ({mesh.face_count}) or one a vertex ({mesh.vertex_count})",
+            received=f"{labels.dtype} of shape {labels.shape}",
+            remedy="give labels a face where a mesh has as many faces as vertices" if fits == 2 else "",
+        )
+    return labels.astype(np.int64)
+
+
+def labels_at(mesh: TriangleMesh, labels: np.ndarray, face: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(P,) labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
+    if len(labels) == mesh.face_count:
+        return labels[face]
+    corner = np.linalg.norm(mesh.triangles[face] - points[:, None], axis=2).argmin(axis=1)
+    return labels[mesh.faces[face, corner]]
+
+
+def require_surface(mesh: TriangleMesh, name: str) -> None:
+    """Refuse a mesh on which nothing can be measured.
+
+    Raises:
+        InputError: no faces, or no area.
+    """
+    if not mesh.face_count or not mesh.face_areas.any():
+        raise InputError(
+            name,
+            expected="a surface with some area",
+            received=f"{mesh.vertex_count} vertices, {mesh.face_count} faces, area 0",
+        )

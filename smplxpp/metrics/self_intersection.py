@@ -1,0 +1,106 @@
+"""Pairs of faces of one mesh that cut through each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from smplxpp.core.mesh import TriangleMesh
+
+# A crossing nearer to an edge or a plane than this share of the triangle's size is touching, not cutting.
+TOLERANCE = 1e-9
+PAIRS_AT_ONCE = 500_000
+
+
+def self_intersections(mesh: TriangleMesh) -> np.ndarray:
+    """(P, 2) pairs of faces, lower index first, sorted, where an edge of one passes through the inside of the other.
+
+    Faces that share an edge are neighbours and never a pair; touching and overlap in one plane are not counted.
+    Candidates come from a uniform grid over the faces' boxes; the test is that of edges against triangles.
+    """
+    triangles = mesh.triangles
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    for pairs in _candidate_pairs(triangles):
+        shared = (mesh.faces[pairs[:, 0]][:, :, None] == mesh.faces[pairs[:, 1]][:, None, :]).sum(axis=(1, 2))
+        pairs = pairs[shared < 2]
+        cut = np.zeros(len(pairs), dtype=bool)
+        for a, b in ((0, 1), (1, 0)):
+            for k in range(3):
+                start, end = triangles[pairs[:, a], k], triangles[pairs[:, a], (k + 1) % 3]
+                cut |= _edge_cuts_triangle(start, end, triangles[pairs[:, b]])
+        found.append(pairs[cut])
+    pairs = np.concatenate(found)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+
+def _edge_cuts_triangle(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """(P,) bool: edge from `start` to `end` (P, 3) crosses the interior of `triangle` (P, 3, 3)."""
+    u, v = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
+    normal = np.cross(u, v)
+    direction = end - start
+    from_corner = start - triangle[:, 0]
+    area2 = np.einsum("ij,ij->i", normal, normal)
+    slope = np.einsum("ij,ij->i", direction, normal)
+    height = np.einsum("ij,ij->i", from_corner, normal)
+    # Moeller and Trumbore 1997, with the edge's own parameter held inside (0, 1).
+    q = np.cross(from_corner, direction)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = -height / slope
+        beta = -np.einsum("ij,ij->i", v, q) / slope
+        gamma = np.einsum("ij,ij->i", u, q) / slope
+        inside = (beta > TOLERANCE) & (gamma > TOLERANCE) & (beta + gamma < 1 - TOLERANCE)
+    steep = np.abs(slope) > TOLERANCE * np.sqrt(area2) * np.linalg.norm(direction, axis=1)
+    return steep & inside & (t > TOLERANCE) & (t < 1 - TOLERANCE)
+
+
+def _candidate_pairs(triangles: np.ndarray) -> Iterator[np.ndarray]:
+    """Chunks of (P, 2) pairs of faces whose boxes overlap, lower index first, each pair once."""
+    if len(triangles) < 2:
+        return
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+    face, cell, size, origin = _faces_in_cells(low, high)
+    order = np.argsort(cell, kind="stable")
+    face, cell = face[order], cell[order]
+    _, start, count = np.unique(cell, return_index=True, return_counts=True)
+    # Each entry is paired with those behind it in its cell.
+    behind = np.repeat(start + count, count) - np.arange(len(face)) - 1
+    ends = np.cumsum(behind)
+    inner = np.searchsorted(ends, np.arange(PAIRS_AT_ONCE, ends[-1], PAIRS_AT_ONCE))
+    for first, last in pairwise([0, *inner.tolist(), len(face)]):
+        entries = np.arange(first, last)
+        n = behind[entries]
+        left = np.repeat(entries, n)
+        right = left + 1 + np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        i, j = face[left], face[right]
+        corner = np.maximum(low[i], low[j])
+        overlap = (corner <= np.minimum(high[i], high[j])).all(axis=1)
+        # Of all the cells that two boxes share, the one that holds the low corner of their overlap reports the pair.
+        own = _cell_key(np.floor((corner - origin) / size).astype(np.int64)) == cell[left]
+        keep = overlap & own
+        yield np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)[keep]
+
+
+def _faces_in_cells(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """(K,) face and cell of every cell that a face's box touches; the cells' size and the grid's origin."""
+    origin = low.min(axis=0)
+    extent = float((high.max(axis=0) - origin).max())
+    size = max(2.0 * float((high - low).max(axis=1).mean()), extent / 2**19, np.finfo(float).tiny)
+    while True:
+        first = np.floor((low - origin) / size).astype(np.int64)
+        span = np.floor((high - origin) / size).astype(np.int64) - first + 1
+        cells = span.prod(axis=1)
+        # A few huge faces among many small ones would fill the grid alone.
+        if cells.sum() <= 32 * len(low):
+            break
+        size *= 2.0
+    face = np.repeat(np.arange(len(low)), cells)
+    local = np.arange(len(face)) - np.repeat(np.cumsum(cells) - cells, cells)
+    sx, sy = span[face, 0], span[face, 1]
+    offset = np.stack([local % sx, local // sx % sy, local // (sx * sy)], axis=1)
+    return face, _cell_key(first[face] + offset), size, origin
+
+
+def _cell_key(ijk: np.ndarray) -> np.ndarray:
+    return (ijk[:, 0] << 42) | (ijk[:, 1] << 21) | ijk[:, 2]

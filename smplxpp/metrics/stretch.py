@@ -1,0 +1,124 @@
+"""Stretch between two poses of one topology: edges that tear, faces that turn over."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class StretchReport:
+    """Edge length ratios `posed / rest` and turned faces.
+
+    Attributes:
+        edge_count: edges measured. degenerate_edges: left out, without length at rest.
+        p50, p99, p999, max, min: of the ratio.
+        limit: of the flag. flagged_edges: edges longer than `limit` times their rest length.
+        flipped_faces: see `flipped_faces`.
+    """
+
+    edge_count: int
+    degenerate_edges: int
+    p50: float
+    p99: float
+    p999: float
+    max: float
+    min: float
+    limit: float
+    flagged_edges: int
+    flipped_faces: int
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return asdict(self)
+
+
+def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
+    """(E,) length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
+
+    Raises:
+        InputError: the meshes differ in faces or number of vertices, or have no faces.
+    """
+    _check_same_topology(rest, posed)
+    length = [
+        np.linalg.norm(m.vertices[rest.edges[:, 1]] - m.vertices[rest.edges[:, 0]], axis=1) for m in (rest, posed)
+    ]
+    return np.divide(length[1], length[0], out=np.full(len(length[0]), np.nan), where=length[0] > 0)
+
+
+def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
+    """(M,) bool: faces that agree with their edge neighbours at rest and oppose them in the pose.
+
+    A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors. Relative
+    to the neighbours, so that the pose's own rotation does not count.
+
+    Raises:
+        InputError: as `edge_stretch`.
+    """
+    _check_same_topology(rest, posed)
+    pairs = adjacent_faces(rest)
+
+    def agreement(mesh: TriangleMesh) -> np.ndarray:
+        around = np.zeros((mesh.face_count, 3))
+        for axis in range(3):
+            for own, other in ((0, 1), (1, 0)):
+                around[:, axis] += np.bincount(
+                    pairs[:, own], mesh.face_cross[pairs[:, other], axis], minlength=mesh.face_count
+                )
+        return np.einsum("ij,ij->i", mesh.face_cross, around)
+
+    return (agreement(rest) > 0) & (agreement(posed) < 0)
+
+
+def stretch_report(rest: TriangleMesh, posed: TriangleMesh, *, limit: float = 3.0) -> StretchReport:
+    """Edge stretch and turned faces from `rest` to `posed`.
+
+    Raises:
+        InputError: as `edge_stretch`, a limit that is not positive, or no edge with a length.
+    """
+    if not 0 < limit < np.inf:
+        raise InputError("stretch limit", expected="above 0", received=str(limit))
+    ratio = edge_stretch(rest, posed)
+    known = ratio[np.isfinite(ratio)]
+    if not len(known):
+        raise InputError("rest mesh", expected="edges with a length", received="none")
+    p50, p99, p999 = np.percentile(known, (50, 99, 99.9))
+    return StretchReport(
+        edge_count=len(known),
+        degenerate_edges=len(ratio) - len(known),
+        p50=float(p50),
+        p99=float(p99),
+        p999=float(p999),
+        max=float(known.max()),
+        min=float(known.min()),
+        limit=limit,
+        flagged_edges=int((known > limit).sum()),
+        flipped_faces=int(flipped_faces(rest, posed).sum()),
+    )
+
+
+def adjacent_faces(mesh: TriangleMesh) -> np.ndarray:
+    """(A, 2) pairs of faces at an edge that has exactly two."""
+    f = mesh.faces
+    directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+    key = directed[:, 0] * mesh.vertex_count + directed[:, 1]
+    order = np.argsort(key, kind="stable")
+    _, start, count = np.unique(key[order], return_index=True, return_counts=True)
+    two = start[count == 2]
+    return np.stack([order[two], order[two + 1]], axis=1) % mesh.face_count
+
+
+def _check_same_topology(rest: TriangleMesh, posed: TriangleMesh) -> None:
+    if rest.vertex_count != posed.vertex_count or not np.array_equal(rest.faces, posed.faces):
+        raise InputError(
+            "posed mesh",
+            expected=f"the {rest.vertex_count} vertices and {rest.face_count} faces of the rest mesh",
+            received=f"{posed.vertex_count} vertices and {posed.face_count} faces, or other indices",
+            remedy="pose the same mesh: rest.with_vertices(...)",
+        )
+    if not rest.face_count:
+        raise InputError("rest mesh", expected="faces", received="none")
