@@ -1,0 +1,22 @@
+"""Nested dictionaries of arrays in one npz file, without pickle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+
+def save_arrays(path: Path, groups: dict[str, dict[str, np.ndarray]]) -> None:
+    """Write `{group: {name: array}}` as `group/name`."""
+    np.savez(path, **{f"{group}/{name}": array for group, arrays in groups.items() for name, array in arrays.items()})
+
+
+def load_arrays(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Read what `save_arrays` wrote, groups in their order."""
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    with np.load(path, allow_pickle=False) as data:
+        for key in data.files:
+            group, name = key.split("/", 1)
+            groups.setdefault(group, {})[name] = data[key]
+    return groups

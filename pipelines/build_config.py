@@ -1,0 +1,75 @@
+"""What a build takes: its inputs and every choice that changes its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from smplxpp.core.labels import LABELS
+
+STAGES: tuple[str, ...] = (
+    "00_capture",
+    "10_register",
+    "20_segment",
+    "30_clean",
+    "40_transfer",
+    "50_unpose",
+    "60_assemble",
+    "65_validate",
+)
+
+
+def _default_budgets() -> dict[str, int]:
+    return {label.name: label.face_budget for label in LABELS if label.face_budget}
+
+
+@dataclass(frozen=True)
+class BuildInputs:
+    """Files of one build.
+
+    Attributes:
+        subject: name used in the report.
+        scan: clothed scan of the reference frame.
+        params: body parameters; row `frame` of a stacked file.
+        labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them or
+            views do.
+        label_maps: label image by camera name, with `cameras` their camera file.
+        label_set: name of the label set that labels and label maps use, or a JSON mapping file.
+        motion: parameters of the capture's own frames, for validation and the report; may be None.
+        body: SMPL-X-layout body file, None for the open body.
+    """
+
+    subject: str
+    scan: Path
+    params: Path
+    frame: int = 0
+    labels: Path | None = None
+    label_maps: dict[str, Path] = field(default_factory=dict)
+    cameras: Path | None = None
+    label_set: str = "4d-dress"
+    motion: Path | None = None
+    body: Path | None = None
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """Choices of one build; part of every stage's key.
+
+    Attributes:
+        units, up: how the scan file is written; it is converted to metres, +Y up.
+        budgets: faces kept by part name.
+        clearance_mm: how far outer layers are kept from inner ones.
+        max_influences: joints a vertex.
+        method: "ours", or "paper" for robust transfer exactly as published.
+        samples: surface samples of the validation.
+        seed: of the samples.
+    """
+
+    units: str = "m"
+    up: str = "y"
+    budgets: dict[str, int] = field(default_factory=_default_budgets)
+    clearance_mm: float = 1.0
+    max_influences: int = 8
+    method: str = "ours"
+    samples: int = 100_000
+    seed: int = 0
