@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
 
 # Pose blocks in SMPL-X joint order, with their number of joints.
@@ -20,6 +21,8 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
     ("left_hand_pose", 15),
     ("right_hand_pose", 15),
 )
+# Every array of BodyParams, in the order of its fields.
+ARRAY_NAMES: tuple[str, ...] = (*(name for name, _ in POSE_BLOCKS), "betas", "expression", "transl")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +36,11 @@ class BodyParams:
         left_hand_pose, right_hand_pose: (T, 45) axis-angle, or (T, P) PCA coefficients with P < 45.
         betas: (T, B) shape. expression: (T, E). transl: (T, 3), added last.
         fps: frames a second where the source says so.
+        flat_hand_mean: the hands are complete as they stand; a body model does not add its mean hand to them
+            (AMASS, AvatarReX). False: the mean hand of the model is added, after the PCA, as SMPL-X does by default.
+
+    Raises:
+        InputError: wrong widths, unequal numbers of frames (one frame stands for all), NaN or infinity.
     """
 
     global_orient: np.ndarray
@@ -46,39 +54,36 @@ class BodyParams:
     expression: np.ndarray
     transl: np.ndarray
     fps: float | None = None
+    flat_hand_mean: bool = False
 
     def __post_init__(self) -> None:
         width = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
         frames = np.atleast_2d(np.asarray(self.global_orient)).shape[0]
-        for field in fields(self):
-            if field.name == "fps":
-                continue
-            value = np.array(np.atleast_2d(getattr(self, field.name)), dtype=np.float64)
-            expected = width.get(field.name)
-            hand = field.name.endswith("hand_pose")
+        for name in ARRAY_NAMES:
+            value = _numbers(name, getattr(self, name))
+            expected = width.get(name)
+            hand = name.endswith("hand_pose")
             if value.ndim != 2 or (
                 expected and value.shape[1] != expected and not (hand and value.shape[1] < expected)
             ):
                 raise InputError(
-                    f"parameter {field.name}",
+                    f"parameter {name}",
                     expected=f"shape (T, {expected or 'any'})",
                     received=f"shape {value.shape}",
                 )
             if value.shape[0] == 1 and frames > 1:
                 value = np.repeat(value, frames, axis=0)
             if value.shape[0] != frames:
-                raise InputError(
-                    f"parameter {field.name}", expected=f"{frames} frames", received=f"{value.shape[0]} frames"
-                )
+                raise InputError(f"parameter {name}", expected=f"{frames} frames", received=f"{value.shape[0]} frames")
             bad = ~np.isfinite(value).all(axis=1)
             if bad.any():
                 raise InputError(
-                    f"parameter {field.name}",
+                    f"parameter {name}",
                     expected="finite values",
                     received=f"NaN or infinity in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}",
                 )
             value.setflags(write=False)
-            object.__setattr__(self, field.name, value)
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.global_orient)
@@ -96,7 +101,28 @@ class BodyParams:
 
     def select(self, indices) -> BodyParams:
         """The frames named by an index array or slice."""
-        return replace(self, **{f.name: getattr(self, f.name)[indices] for f in fields(self) if f.name != "fps"})
+        return replace(self, **{name: getattr(self, name)[indices] for name in ARRAY_NAMES})
+
+    @staticmethod
+    def concatenate(parts: Sequence[BodyParams]) -> BodyParams:
+        """Frames of several BodyParams in order; widths, `fps` and `flat_hand_mean` must agree.
+
+        Raises:
+            InputError: nothing to join, or parts that do not fit.
+        """
+        if not parts:
+            raise InputError("parameters to join", expected="at least one part", received="none")
+        for index, part in enumerate(parts):
+            for name in (*ARRAY_NAMES, "fps", "flat_hand_mean"):
+                first, other = getattr(parts[0], name), getattr(part, name)
+                if name in ARRAY_NAMES:
+                    first, other = f"width {first.shape[1]}", f"width {other.shape[1]}"
+                if first != other:
+                    raise InputError(
+                        f"parameter {name} of part {index}", expected=f"{first}, as in part 0", received=str(other)
+                    )
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAY_NAMES}
+        return replace(parts[0], **joined)
 
     @staticmethod
     def rest(*, betas: np.ndarray | int = 10, expressions: int = 10) -> BodyParams:
@@ -114,9 +140,13 @@ class BodyParams:
         return BodyParams(**blocks, **others)
 
     def as_dict(self) -> dict[str, np.ndarray]:
-        """Arrays by name (fps left out when unknown)."""
-        out = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "fps"}
-        return out if self.fps is None else {**out, "fps": np.float64(self.fps)}
+        """Arrays by name, with `fps` where known and `flat_hand_mean` where true."""
+        out = {name: getattr(self, name) for name in ARRAY_NAMES}
+        if self.fps is not None:
+            out["fps"] = np.float64(self.fps)
+        if self.flat_hand_mean:
+            out["flat_hand_mean"] = np.bool_(True)
+        return out
 
     @staticmethod
     def from_mapping(values: Mapping[str, np.ndarray], *, source: str = "parameters") -> BodyParams:
@@ -129,11 +159,19 @@ class BodyParams:
                 remedy="see `smplxpp params convert --help` for the layouts that are read",
             )  # fmt: skip
         zeros = {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS} | {"expression": np.zeros(10)}
-        known = {f.name for f in fields(BodyParams)} - {"fps"}
-        arrays = zeros | {name: values[name] for name in values if name in known}
+        arrays = zeros | {name: values[name] for name in ARRAY_NAMES if name in values}
         fps = float(values["fps"]) if "fps" in values else None
-        return BodyParams(**arrays, fps=fps)
+        return BodyParams(**arrays, fps=fps, flat_hand_mean=bool(values.get("flat_hand_mean", False)))
 
     def save(self, path: str | Path) -> None:
-        """Write our npz layout (SMPL-X names, stacked frames)."""
-        np.savez_compressed(path, **self.as_dict())
+        """Write our npz layout (SMPL-X names, stacked frames), whole or not at all."""
+        with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+            np.savez_compressed(stream, **self.as_dict())
+
+
+def _numbers(name: str, value) -> np.ndarray:
+    """A (T, width) float64 copy."""
+    try:
+        return np.array(np.atleast_2d(value), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"parameter {name}", expected="numbers of shape (T, width)", received=str(error)) from error

@@ -1,0 +1,202 @@
+"""Reading body model files: SMPL-X, SMPL-H and SMPL as npz or pickle, and the embedded open body."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.body.layout import HAND_WIDTH, JOINT_NAMES
+from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import InputError
+from smplxpp.core.safe_pickle import dense_array, safe_load, safe_npz
+
+_REQUIRED = ("v_template", "f", "shapedirs", "weights", "J_regressor", "kintree_table")
+_OPTIONAL = (
+    "posedirs",
+    "hands_componentsl",
+    "hands_componentsr",
+    "hands_meanl",
+    "hands_meanr",
+    "num_betas",
+    "num_expressions",
+    "joint_names",
+    "vertex_labels",
+    "vertex_label_names",
+)
+# SMPL-X's own files: from this many directions on, the first 300 are shape and the rest expression; shorter ones
+# hold 10 and 10.
+_LONG_BASIS, _LONG_SHAPE, _SHORT_SHAPE, _SHORT_EXPRESSION = 400, 300, 10, 10
+# Weights come as float16 or float32: rows within this of 1 are rounding, beyond it another file.
+_WEIGHT_SUM_TOLERANCE = 1e-3
+
+
+def load_body(
+    path: str | Path | None = None, *, num_betas: int | None = None, num_expressions: int | None = None
+) -> BodyModel:
+    """Read a body model.
+
+    Args:
+        path: an npz or pkl file in the layout of SMPL-X (55 joints), SMPL-H (52) or SMPL (24), told apart by their
+            joints. None: the open body that comes with the package (55 joints, 20 betas, 52 expressions).
+            Pickles are read without executing anything from them.
+        num_betas, num_expressions: keep the first so many directions; None keeps all.
+
+    Raises:
+        InputError: a missing key, a wrong shape, weights that do not sum to 1, more directions asked than there are.
+    """
+    if path is None:
+        with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as embedded:
+            return load_body(embedded, num_betas=num_betas, num_expressions=num_expressions)
+    path = Path(path)
+    raw = _read(path)
+    missing = [key for key in _REQUIRED if key not in raw]
+    if missing:
+        raise InputError(
+            f"body file {path}",
+            expected=f"the keys {', '.join(_REQUIRED)}",
+            received=f"a file without {', '.join(missing)}",
+            remedy="give a model file of SMPL-X, SMPL-H or SMPL, not a file of parameters",
+        )
+    return _Builder(path, raw).build(num_betas, num_expressions)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    keys = (*_REQUIRED, *_OPTIONAL)
+    if path.suffix.lower() == ".npz":
+        return safe_npz(path, keys=keys)
+    if path.suffix.lower() not in (".pkl", ".pickle"):
+        raise InputError(f"body file {path}", expected="an .npz or .pkl file", received=f"suffix {path.suffix!r}")
+    content = safe_load(path)
+    if not isinstance(content, dict):
+        raise InputError(f"body file {path}", expected="a pickled dict", received=type(content).__name__)
+    return {key: content[key] for key in keys if key in content}
+
+
+class _Builder:
+    """One file's raw values on their way to a BodyModel."""
+
+    def __init__(self, path: Path, raw: dict[str, Any]) -> None:
+        self.path, self.raw = path, raw
+
+    def build(self, num_betas: int | None, num_expressions: int | None) -> BodyModel:
+        weights = self._array("weights", (None, None))
+        vertex_count, joint_count = weights.shape
+        if joint_count not in JOINT_NAMES:
+            raise self._error(
+                "weights", f"{sorted(JOINT_NAMES)} joints (SMPL, SMPL-H, SMPL-X)", f"{joint_count} columns"
+            )
+        shapedirs, exprdirs = self._bases(vertex_count, joint_count)
+        names = self._names("joint_names", joint_count) or JOINT_NAMES[joint_count]
+        weights = self._normalised(weights)
+        labels, label_names = self._part_labels(weights, names)
+        arrays = {
+            "v_template": self._array("v_template", (vertex_count, 3)),
+            "faces": self._faces(vertex_count),
+            "shapedirs": self._first(shapedirs, num_betas, "betas"),
+            "exprdirs": self._first(exprdirs, num_expressions, "expressions"),
+            "posedirs": self._posedirs(vertex_count, joint_count),
+            "joint_regressor": self._array("J_regressor", (joint_count, vertex_count)),
+            "parents": self._parents(joint_count),
+            "weights": weights,
+            "part_labels": labels,
+        }
+        for side in ("left", "right"):
+            arrays[f"{side}_hand_components"] = self._optional(f"hands_components{side[0]}", (None, HAND_WIDTH))
+            arrays[f"{side}_hand_mean"] = self._optional(f"hands_mean{side[0]}", (HAND_WIDTH,))
+        for value in arrays.values():
+            if value is not None:
+                value.setflags(write=False)
+        return BodyModel(name=self.path.stem, joint_names=names, part_label_names=label_names, **arrays)
+
+    def _error(self, key: str, expected: str, received: str, remedy: str = "") -> InputError:
+        return InputError(f"body file {self.path}: {key}", expected=expected, received=received, remedy=remedy)
+
+    def _array(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+        value = dense_array(self.raw[key], subject=f"body file {self.path}: {key}")
+        if key == "hands_meanl" or key == "hands_meanr":
+            value = value.reshape(-1)
+        if value.dtype.kind not in "biuf":
+            raise self._error(key, "numbers", f"values of type {value.dtype}")
+        value = np.array(value, dtype=np.float64, order="C")
+        if value.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True)):
+            wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+            raise self._error(key, f"shape {wanted}", f"shape {value.shape}", "the file mixes models or is damaged")
+        if not np.isfinite(value).all():
+            raise self._error(key, "finite values", "NaN or infinity")
+        return value
+
+    def _optional(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray | None:
+        return self._array(key, shape) if key in self.raw else None
+
+    def _names(self, key: str, count: int) -> tuple[str, ...] | None:
+        if key not in self.raw:
+            return None
+        names = tuple(str(name) for name in np.ravel(self.raw[key]))
+        if len(names) != count:
+            raise self._error(key, f"{count} names", f"{len(names)}")
+        return names
+
+    def _bases(self, vertex_count: int, joint_count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Shape and expression directions: by the file's own counts, else by SMPL-X's convention."""
+        basis = self._array("shapedirs", (vertex_count, 3, None))
+        width = basis.shape[2]
+        if "num_betas" in self.raw:
+            shape = int(np.asarray(self.raw["num_betas"]))
+            expression = int(np.asarray(self.raw.get("num_expressions", width - shape)))
+        elif joint_count != max(JOINT_NAMES):
+            shape, expression = width, 0
+        elif width >= _LONG_BASIS:
+            shape, expression = _LONG_SHAPE, width - _LONG_SHAPE
+        else:
+            shape, expression = _SHORT_SHAPE, _SHORT_EXPRESSION
+        if shape + expression > width:
+            raise self._error("shapedirs", f"{shape} shape and {expression} expression directions", f"{width}")
+        return basis[..., :shape], basis[..., shape : shape + expression]
+
+    def _first(self, basis: np.ndarray, count: int | None, what: str) -> np.ndarray:
+        if count is not None and not 0 <= count <= basis.shape[2]:
+            raise self._error("shapedirs", f"at most {basis.shape[2]} {what}", f"{count} asked for")
+        return np.ascontiguousarray(basis[..., :count])
+
+    def _posedirs(self, vertex_count: int, joint_count: int) -> np.ndarray | None:
+        value = self._optional("posedirs", (vertex_count, 3, 9 * (joint_count - 1)))
+        return value if value is not None and value.any() else None
+
+    def _faces(self, vertex_count: int) -> np.ndarray:
+        faces = self._array("f", (None, 3)).astype(np.int64)
+        if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
+            raise self._error("f", f"indices in [0, {vertex_count})", f"[{faces.min()}, {faces.max()}]")
+        return faces
+
+    def _parents(self, joint_count: int) -> np.ndarray:
+        # The root's parent is stored as -1 or as 2^32 - 1.
+        parents = self._array("kintree_table", (2, joint_count))[0].astype(np.int64)
+        parents[(parents < 0) | (parents >= joint_count)] = -1
+        if not (parents[0] == -1 and (parents[1:] >= 0).all() and (parents[1:] < np.arange(1, joint_count)).all()):
+            raise self._error("kintree_table", "one root first, every parent before its children", str(parents))
+        return parents
+
+    def _normalised(self, weights: np.ndarray) -> np.ndarray:
+        """Rows that sum to 1 in float64, so that a translation within the transforms is exact."""
+        total = weights.sum(axis=1)
+        worst = int(np.argmax(np.abs(total - 1.0)))
+        if weights.min() < 0 or abs(total[worst] - 1.0) > _WEIGHT_SUM_TOLERANCE:
+            raise self._error(
+                "weights",
+                "non-negative rows that sum to 1",
+                f"minimum {weights.min():.3g}, row {worst} sums to {total[worst]:.6g}",
+                "normalise the rows of the file's weights",
+            )
+        return weights / total[:, None]
+
+    def _part_labels(self, weights: np.ndarray, joint_names: tuple[str, ...]) -> tuple[np.ndarray, tuple[str, ...]]:
+        if "vertex_labels" not in self.raw or "vertex_label_names" not in self.raw:
+            return weights.argmax(axis=1), joint_names
+        labels = self._array("vertex_labels", (len(weights),)).astype(np.int64)
+        names = tuple(str(name) for name in np.ravel(self.raw["vertex_label_names"]))
+        if labels.min() < 0 or labels.max() >= len(names):
+            raise self._error("vertex_labels", f"labels in [0, {len(names)})", f"[{labels.min()}, {labels.max()}]")
+        return labels, names

@@ -1,0 +1,252 @@
+"""BodyModel: a body of the SMPL family, posed in numpy or, differentiably, in torch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
+from smplxpp.body.skinning import forward_kinematics, skin
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
+from smplxpp.core.rotations import array_namespace, matrix_from_rotvec
+
+_WIDTHS = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBody:
+    """A body in T poses; numpy float64, or torch tensors where the parameters were.
+
+    `vertices = skin(rest_vertices, weights, posed_from_rest)` exactly: the translation is in the transforms, the
+    pose correctives are in the rest vertices.
+
+    Attributes:
+        vertices: (T, V, 3) metres.
+        joints: (T, J, 3) posed joints.
+        rest_vertices: (T, V, 3) with shape, expression and pose correctives.
+        rest_joints: (T, J, 3) joints of the shaped body, before posing.
+        posed_from_rest: (T, J, 4, 4).
+        pose_offsets: (T, V, 3) the pose correctives within `rest_vertices`; None where the model has none.
+    """
+
+    vertices: Any
+    joints: Any
+    rest_vertices: Any
+    rest_joints: Any
+    posed_from_rest: Any
+    pose_offsets: Any | None
+
+    def __len__(self) -> int:
+        return self.vertices.shape[0]
+
+    def frame(self, index: int) -> PosedBody:
+        """One frame, its arrays without the leading axis."""
+        if not -len(self) <= index < len(self):
+            raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return PosedBody(**{name: None if value is None else value[index] for name, value in values.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class BodyModel:
+    """A body of the SMPL family (Loper et al. 2015, Pavlakos et al. 2019); float64, metres. Made by `load_body`.
+
+    Attributes:
+        name: of the file.
+        v_template: (V, 3) mean shape in the rest pose.
+        faces: (F, 3) int64.
+        shapedirs: (V, 3, B) metres a unit of beta.
+        exprdirs: (V, 3, E) metres a unit of expression; E = 0 where the model has none.
+        posedirs: (V, 3, P) pose correctives, P = 9 (J - 1); None where absent or zero.
+        joint_regressor: (J, V).
+        parents: (J,) int64, -1 at the root.
+        joint_names: J names.
+        weights: (V, J), rows sum to 1.
+        left_hand_components, right_hand_components: (K, 45) rows are principal components; None where absent.
+        left_hand_mean, right_hand_mean: (45,) axis-angle; None where absent.
+        part_labels: (V,) int64 indices into `part_label_names`: the file's own labels, else the joint of most weight.
+        part_label_names: names of the parts.
+    """
+
+    name: str
+    v_template: np.ndarray
+    faces: np.ndarray
+    shapedirs: np.ndarray
+    exprdirs: np.ndarray
+    posedirs: np.ndarray | None
+    joint_regressor: np.ndarray
+    parents: np.ndarray
+    joint_names: tuple[str, ...]
+    weights: np.ndarray
+    left_hand_components: np.ndarray | None
+    right_hand_components: np.ndarray | None
+    left_hand_mean: np.ndarray | None
+    right_hand_mean: np.ndarray | None
+    part_labels: np.ndarray
+    part_label_names: tuple[str, ...]
+    # Tensors of the arrays above, by (name, dtype, device).
+    _tensors: dict = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.v_template)
+
+    @property
+    def joint_count(self) -> int:
+        return len(self.parents)
+
+    @property
+    def num_betas(self) -> int:
+        return self.shapedirs.shape[2]
+
+    @property
+    def num_expressions(self) -> int:
+        return self.exprdirs.shape[2]
+
+    def mesh(self, vertices: np.ndarray | None = None) -> TriangleMesh:
+        """The body's faces on the given (V, 3) vertices, or on the mean shape."""
+        return TriangleMesh(self.v_template if vertices is None else vertices, self.faces)
+
+    def forward(self, params: BodyParams | Mapping[str, Any], *, flat_hand_mean: bool | None = None) -> PosedBody:
+        """Pose the body.
+
+        `v = v_template + shapedirs betas + exprdirs expression`, `J = joint_regressor v`,
+        `rest = v + posedirs vec(R_1.. - I)`, `x = sum_j w_j G_j(J, R) rest + transl`; the root turns about `J_0`.
+        Hands narrower than 45 numbers are PCA coefficients of the first components. Parameters of joints that the
+        model lacks are ignored (face for SMPL-H; face and fingers for SMPL).
+
+        Args:
+            params: T frames (numpy, float64), or a mapping of torch tensors (T, width) or (1, width) with the same
+                names, missing ones zero; the result has their dtype and device and is differentiable.
+            flat_hand_mean: do not add the model's mean hand. None: as the parameters say (`flat_hand_mean` of
+                BodyParams; the key of a mapping; otherwise False).
+
+        Returns:
+            The posed body of T frames.
+
+        Raises:
+            InputError: more betas or expressions than the model has, hand PCA for a model without it, wrong shapes.
+        """
+        if flat_hand_mean is None:
+            flat_hand_mean = (
+                params.flat_hand_mean if isinstance(params, BodyParams) else bool(params.get("flat_hand_mean", False))
+            )
+        arrays = _checked_arrays(params)
+        rotations = matrix_from_rotvec(self._axis_angles(arrays, flat_hand_mean))
+        shaped, rest_joints = self._shaped(arrays)
+        offsets = self._pose_offsets(rotations)
+        rest = shaped if offsets is None else shaped + offsets
+        posed_from_rest, joints = forward_kinematics(rest_joints, self.parents, rotations, transl=arrays["transl"])
+        vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
+        return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
+
+    def rest_joints(self, params: BodyParams | Mapping[str, Any]) -> Any:
+        """(T, J, 3) joints of the shaped body before posing."""
+        return self._shaped(_checked_arrays(params))[1]
+
+    def _shaped(self, arrays: Mapping[str, Any]) -> tuple[Any, Any]:
+        betas, expression = arrays["betas"], arrays["expression"]
+        vertices = self._constant("v_template", betas) + self._blend("shapedirs", betas, "betas")
+        if self.num_expressions:
+            vertices = vertices + self._blend("exprdirs", expression, "expression")
+        return vertices, self._constant("joint_regressor", vertices) @ vertices
+
+    def _blend(self, basis_name: str, coefficients: Any, subject: str) -> Any:
+        """(T, n) coefficients of the first n directions -> (T, V, 3) offsets."""
+        basis = self._constant(basis_name, coefficients)
+        used, known = coefficients.shape[-1], basis.shape[-1]
+        if used > known:
+            raise InputError(
+                f"parameter {subject}",
+                expected=f"at most {known} numbers for the body {self.name!r}",
+                received=f"{used}",
+                remedy="use the body that the parameters were fitted with, or cut the parameters",
+            )
+        flat = basis.reshape(-1, known)[:, :used]
+        return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
+
+    def _pose_offsets(self, rotations: Any) -> Any | None:
+        if self.posedirs is None:
+            return None
+        identity = matrix_from_rotvec(_zeros(rotations, (3,)))  # of the rotations' kind, type and device
+        feature = rotations[:, 1:] - identity
+        return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
+
+    def _axis_angles(self, arrays: Mapping[str, Any], flat_hand_mean: bool) -> Any:
+        """(T, J, 3) axis-angle vectors of all joints."""
+        blocks = []
+        for name in POSE_NAMES[self.joint_count]:
+            value = arrays[name]
+            blocks.append(self._full_hand(name, value, flat_hand_mean) if name.endswith("hand_pose") else value)
+        full = array_namespace(blocks[0]).concatenate(blocks, -1).reshape(len(blocks[0]), -1, 3)
+        missing = self.joint_count - full.shape[1]
+        if missing:
+            full = array_namespace(full).concatenate([full, _zeros(full, (len(full), missing, 3))], 1)
+        return full
+
+    def _full_hand(self, name: str, value: Any, flat_hand_mean: bool) -> Any:
+        side = name.removesuffix("_pose")
+        width = value.shape[-1]
+        if width < HAND_WIDTH:
+            components = self._constant(f"{side}_components", value)
+            if components is None or width > len(components):
+                raise InputError(
+                    f"parameter {name}",
+                    expected=f"{HAND_WIDTH} axis-angle numbers: the body {self.name!r} has "
+                    + ("no hand PCA" if components is None else f"{len(components)} hand components"),
+                    received=f"{width} PCA coefficients",
+                    remedy="load the body model that the parameters were fitted with",
+                )
+            value = value @ components[:width]
+        mean = None if flat_hand_mean else self._constant(f"{side}_mean", value)
+        return value if mean is None else value + mean
+
+    def _constant(self, name: str, like: Any) -> Any:
+        """A field as an array of the kind, type and device of `like`."""
+        value = getattr(self, name)
+        if value is None or isinstance(like, np.ndarray):
+            return value
+        key = (name, like.dtype, like.device)
+        if key not in self._tensors:
+            torch = sys.modules["torch"]
+            # A constant made under inference_mode could not take part in autograd later.
+            with torch.inference_mode(False):
+                self._tensors[key] = torch.tensor(value, dtype=like.dtype, device=like.device)
+        return self._tensors[key]
+
+
+def _checked_arrays(params: BodyParams | Mapping[str, Any]) -> dict[str, Any]:
+    """Every array by name with T rows, missing ones zero."""
+    if isinstance(params, BodyParams):
+        return {name: getattr(params, name) for name in ARRAY_NAMES}
+    given = {name: params[name] for name in ARRAY_NAMES if name in params}
+    if not given:
+        raise InputError(
+            "parameters", expected=f"some of {', '.join(ARRAY_NAMES)}", received=f"keys {sorted(map(str, params))}"
+        )
+    for name, value in given.items():
+        width = _WIDTHS.get(name)
+        hand = name.endswith("hand_pose")
+        if value.ndim != 2 or (width and value.shape[1] != width and not (hand and value.shape[1] < width)):
+            raise InputError(
+                f"parameter {name}", expected=f"shape (T, {width or 'any'})", received=f"shape {tuple(value.shape)}"
+            )
+    frames = max(value.shape[0] for value in given.values())
+    like = next(iter(given.values()))
+    xp, out = array_namespace(like), {}
+    for name in ARRAY_NAMES:
+        value = given[name] if name in given else _zeros(like, (1, _WIDTHS.get(name, 0)))
+        if value.shape[0] not in (1, frames):
+            raise InputError(f"parameter {name}", expected=f"1 or {frames} frames", received=f"{value.shape[0]}")
+        out[name] = xp.broadcast_to(value, (frames, value.shape[1]))
+    return out
+
+
+def _zeros(like: Any, shape: tuple[int, ...]) -> Any:
+    return np.zeros(shape) if isinstance(like, np.ndarray) else like.new_zeros(shape)

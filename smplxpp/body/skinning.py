@@ -1,0 +1,94 @@
+"""Forward kinematics and linear blend skinning, written once for numpy arrays and torch tensors.
+
+The kind of the result is the kind of the arguments; in torch everything is differentiable.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from smplxpp.core.rotations import array_namespace
+
+
+def forward_kinematics(
+    rest_joints: Any, parents: np.ndarray, rotations: Any, *, transl: Any | None = None
+) -> tuple[Any, Any]:
+    """Transforms of a skeleton whose joints turn about themselves.
+
+    With `L_j = [R_j, J_j - J_parent; 0, 1]` (the root's offset being `J_root + transl`) and `G_j = G_parent L_j`,
+    the returned transform is `G_j [I, -J_j; 0, 1]`: it takes a point of the rest pose to the posed one (Loper et al.
+    2015, equations 3 and 4). The root turns about its own joint; the translation comes last.
+
+    Args:
+        rest_joints: (..., J, 3) metres.
+        parents: (J,) integers, -1 at the root; the order of the joints is free.
+        rotations: (..., J, 3, 3), each relative to its parent's frame.
+        transl: (..., 3) metres, moves the whole body.
+
+    Returns:
+        posed_from_rest: (..., J, 4, 4).
+        joints: (..., J, 3) posed joints.
+    """
+    xp = array_namespace(rotations)
+    parents = np.asarray(parents)
+    levels = _levels(parents)
+    offsets = rest_joints - rest_joints[..., np.maximum(parents, 0), :]
+    root = levels[0]
+    root_position = rest_joints[..., root, :]
+    if transl is not None:
+        root_position = root_position + transl[..., None, :]
+    # One batched product a level of the tree; the results are put back in joint order at the end.
+    turned, moved = [rotations[..., root, :, :]], [root_position]
+    for above, level in pairwise(levels):
+        parent = [above.index(parents[j]) for j in level]
+        parent_turned = turned[-1][..., parent, :, :]
+        turned.append(parent_turned @ rotations[..., level, :, :])
+        moved.append(moved[-1][..., parent, :] + (parent_turned @ offsets[..., level, :, None])[..., 0])
+    back = np.argsort([j for level in levels for j in level])
+    turned = xp.concatenate(turned, -3)[..., back, :, :]
+    joints = xp.concatenate(moved, -2)[..., back, :]
+    shift = joints - (turned @ rest_joints[..., None])[..., 0]
+    upper = xp.concatenate([turned, shift[..., None]], -1)
+    last = xp.zeros_like(upper[..., :1, :])
+    last[..., 3] = 1.0
+    return xp.concatenate([upper, last], -2), joints
+
+
+def blend_transforms(weights: Any, posed_from_rest: Any) -> Any:
+    """Weighted sums of the joints' transforms: (N, J) weights, (..., J, 4, 4) -> (..., N, 4, 4)."""
+    flat = posed_from_rest.reshape(posed_from_rest.shape[:-2] + (16,))
+    return (weights @ flat).reshape(flat.shape[:-2] + (weights.shape[0], 4, 4))
+
+
+def skin(vertices: Any, weights: Any, posed_from_rest: Any) -> Any:
+    """Linear blend skinning, `x = sum_j w_j G_j x_rest`.
+
+    Args:
+        vertices: (..., V, 3) rest positions.
+        weights: (V, J), rows sum to 1.
+        posed_from_rest: (..., J, 4, 4).
+
+    Returns:
+        (..., V, 3) posed positions.
+    """
+    xp = array_namespace(posed_from_rest)
+    batch, joint_count = tuple(posed_from_rest.shape[:-3]), posed_from_rest.shape[-3]
+    # Twelve numbers a joint, blended for all frames in one product, vertices last so that the sums run along memory.
+    rows = xp.moveaxis(posed_from_rest[..., :3, :], -3, -1).reshape(-1, joint_count)
+    blended = (rows @ weights.T).reshape((*batch, 3, 4, weights.shape[0]))
+    x, y, z = (vertices[..., axis] for axis in range(3))
+    posed = [b[..., 0, :] * x + b[..., 1, :] * y + b[..., 2, :] * z + b[..., 3, :] for b in xp.moveaxis(blended, -3, 0)]
+    return xp.stack(posed, -1)
+
+
+def _levels(parents: np.ndarray) -> list[list[int]]:
+    """The joints by distance from the root."""
+    levels = [[int(j) for j in np.flatnonzero(parents < 0)]]
+    while sum(map(len, levels)) < len(parents):
+        level = [int(j) for j in np.flatnonzero(np.isin(parents, levels[-1]))]
+        assert level, "the joints do not form a tree"
+        levels.append(level)
+    return levels

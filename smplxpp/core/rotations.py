@@ -1,0 +1,64 @@
+"""Rotations as axis-angle vectors and as matrices, on numpy arrays and torch tensors alike."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# Below this squared angle the series of sin(x)/x is exact to float64's last bit (next term: angle^6 / 5040 < 2e-16).
+_SMALL_SQUARED_ANGLE = 1e-4
+
+
+def array_namespace(array: Any) -> ModuleType:
+    """numpy, or torch when `array` is a torch tensor. Never imports torch by itself."""
+    return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
+
+
+def matrix_from_rotvec(rotvec: Any) -> Any:
+    """Rotation matrices of axis-angle vectors (Rodrigues), smooth and differentiable at zero.
+
+    `R = I + a K + b K^2` with K the cross-product matrix of the vector, `a = sin(t) / t` and
+    `b = (1 - cos t) / t^2 = (sin(t/2) / (t/2))^2 / 2`, the latter form without cancellation.
+
+    Args:
+        rotvec: (..., 3) radians, numpy or torch.
+
+    Returns:
+        (..., 3, 3) of the same kind, type and device.
+    """
+    xp = array_namespace(rotvec)
+    squared = (rotvec * rotvec).sum(-1)
+    a = _sinc(xp, squared)
+    b = 0.5 * _sinc(xp, 0.25 * squared) ** 2
+    x, y, z = rotvec[..., 0], rotvec[..., 1], rotvec[..., 2]
+    c = 1.0 - b * squared
+    rows = (
+        (c + b * x * x, b * x * y - a * z, b * x * z + a * y),
+        (b * x * y + a * z, c + b * y * y, b * y * z - a * x),
+        (b * x * z - a * y, b * y * z + a * x, c + b * z * z),
+    )
+    return xp.stack([xp.stack(row, -1) for row in rows], -2)
+
+
+def rotvec_from_matrix(matrix: np.ndarray) -> np.ndarray:
+    """Axis-angle vectors of rotation matrices, accurate near 0 and near pi (through quaternions).
+
+    Args:
+        matrix: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 3) float64, of length at most pi.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
+
+
+def _sinc(xp: ModuleType, squared: Any) -> Any:
+    """sin(t) / t as a function of t^2; both branches stay finite, so that gradients are clean at zero."""
+    small = squared < _SMALL_SQUARED_ANGLE
+    angle = xp.sqrt(xp.where(small, xp.ones_like(squared), squared))
+    return xp.where(small, 1.0 - squared / 6.0 * (1.0 - squared / 20.0), xp.sin(angle) / angle)
