@@ -1,0 +1,88 @@
+"""`smplxpp params convert`: body parameters of any known layout to ours."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from smplxpp.body import load_body
+from smplxpp.body.importers import LayoutName, detect_layout, load_params
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ParamsConvert:
+    """Options of the command."""
+
+    input: tyro.conf.Positional[Path]
+    """npz, json or pkl file, or a folder of numbered frames."""
+    out: Path
+    """npz file to write: SMPL-X names, stacked frames."""
+    layout: LayoutName = "auto"
+    """Layout of the input; auto tells it by its keys. 4D-Dress is smplx, THuman4 is avatarrex."""
+    body: Path | None = None
+    """Body model file that the parameters will pose; EasyMocap and TalkBody4D need its root joint (None: open body)."""
+    frames: str | None = None
+    """Frames to keep, as START:STOP or START:STOP:STEP (None: all)."""
+    person: int | None = None
+    """Id of the person, for files with several."""
+    up: Literal["y", "z"] = "y"
+    """Axis that points up in the input (AMASS: z); the output has y up."""
+    flat_hand_mean: bool | None = None
+    """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Convert and return a summary."""
+        if self.out.suffix.lower() != ".npz":
+            raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
+        kept = _parse_frames(self.frames)
+        layout = detect_layout(self.input) if self.layout == "auto" else self.layout
+        params = load_params(
+            self.input,
+            layout=layout,
+            body=None if self.body is None else load_body(self.body),
+            person=self.person,
+            up=self.up,
+            flat_hand_mean=self.flat_hand_mean,
+        ).select(kept)
+        if not len(params):
+            raise InputError("--frames", expected="a range that holds frames", received=str(self.frames))
+        params.save(self.out)
+        log.info("%s (%s, %d frames) -> %s", self.input, layout, len(params), self.out)
+        return _summary(self, layout, params)
+
+
+def _parse_frames(text: str | None) -> slice:
+    if text is None:
+        return slice(None)
+    try:
+        numbers = [int(part) if part.strip() else None for part in text.split(":")]
+        if len(numbers) not in (2, 3) or numbers[2:] == [0]:
+            raise ValueError
+    except ValueError:
+        raise InputError("--frames", expected="START:STOP or START:STOP:STEP", received=text) from None
+    return slice(*numbers)
+
+
+def _summary(command: ParamsConvert, layout: str, params: BodyParams) -> dict:
+    return {
+        "input": str(command.input),
+        "out": str(command.out),
+        "layout": layout,
+        "body": str(command.body) if command.body else "open body",
+        "frames": len(params),
+        "fps": params.fps,
+        "betas": params.betas.shape[1],
+        "expressions": params.expression.shape[1],
+        "hand_numbers": params.left_hand_pose.shape[1],
+        "flat_hand_mean": params.flat_hand_mean,
+    }

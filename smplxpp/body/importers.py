@@ -1,0 +1,160 @@
+"""Body parameters from files of others: `load_params`."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from smplxpp.body.loader import load_body
+from smplxpp.body.model import BodyModel
+from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.safe_pickle import safe_load, safe_npz
+
+LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
+_SUFFIXES = (".npz", ".json", ".pkl")
+# Turns z up into y up: (x, y, z) -> (x, z, -y).
+_Y_UP_FROM_Z_UP = np.array([-np.pi / 2, 0.0, 0.0])
+
+
+def load_params(
+    path: str | Path,
+    *,
+    layout: LayoutName = "auto",
+    body: BodyModel | None = None,
+    person: int | None = None,
+    up: Literal["y", "z"] = "y",
+    flat_hand_mean: bool | None = None,
+) -> BodyParams:
+    """Read body parameters of any known layout.
+
+    Layouts, told apart by their keys: `smplx` (SMPL-X names in npz or pickle: our own files, 4D-Dress), `amass`
+    (SMPL+H and SMPL-X), `easymocap`, `avatarrex` (and THuman4), `talkbody4d`. A folder is read as one frame (or more)
+    a file: all files whose names differ in their numbers alone, in the order of these; others are left aside.
+
+    EasyMocap and TalkBody4D turn and move the posed body about the origin, `x = R(Rh) X + Th`, SMPL-X about its root
+    joint J0. With the inner pose (R_g, t): `global_orient = R(Rh) R_g`, `transl = R(Rh) (J0 + t) + Th - J0`.
+
+    Args:
+        path: a file or a folder.
+        layout: name of the layout, or "auto".
+        body: the body that the parameters will pose; gives J0 where it is needed. None: the open body.
+        person: id of the person, for files with several.
+        up: the axis that points up in the file; "z" is turned to our y.
+        flat_hand_mean: overrides what the layout implies (see `BodyParams`).
+
+    Raises:
+        InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes.
+
+    Warns:
+        GeometryWarning: frames without the chosen person, which are left out.
+    """
+    path = Path(path)
+    files = _frame_files(path)
+    name = detect_layout(path) if layout == "auto" else layout
+    if name not in LAYOUTS:
+        raise InputError("layout", expected=f"auto, {', '.join(LAYOUTS)}", received=name)
+    parts: list[Frames] = []
+    absent: list[str] = []
+    for file in files:
+        frames = _read_file(file, name, person)
+        parts += [frames] if frames else []
+        absent += [] if frames else [file.name]
+    if not parts:
+        raise InputError(f"{path}", expected=f"frames of person {person}", received="none")
+    if absent:
+        warnings.warn(
+            f"{path}: person {person} is missing in {len(absent)} of {len(files)} frames, left out "
+            f"(first {absent[0]})", GeometryWarning, stacklevel=2,
+        )  # fmt: skip
+    params = BodyParams.concatenate([part.params for part in parts])
+    outer = [part.outer for part in parts if part.outer]
+    if outer or up == "z":
+        body = body or load_body()
+    if outer:
+        params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
+    if up == "z":
+        params = _moved(params, body, _Y_UP_FROM_Z_UP, np.zeros(3))
+    return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
+
+
+def detect_layout(path: str | Path) -> str:
+    """The layout of a file, or of the first file of a folder (its other files must have the same).
+
+    Raises:
+        InputError: nothing readable, an unknown or ambiguous layout.
+    """
+    file = _frame_files(Path(path))[0]
+    return recognise(_content(file), source=f"file {file}")
+
+
+def _moved(params: BodyParams, body: BodyModel, rotvec: np.ndarray, shift: np.ndarray) -> BodyParams:
+    """Parameters of the posed body after `x -> R x + t` about the origin."""
+    rotation = matrix_from_rotvec(rotvec)
+    root = body.rest_joints(params)[:, 0]
+    turned = (rotation @ (root + params.transl)[..., None])[..., 0]
+    return replace(
+        params,
+        global_orient=rotvec_from_matrix(rotation @ matrix_from_rotvec(params.global_orient)),
+        transl=turned + shift - root,
+    )
+
+
+def _read_file(path: Path, layout: str, person: int | None) -> Frames | None:
+    content = _content(path)
+    try:
+        return LAYOUTS[layout].read(content, person)
+    except InputError as error:
+        raise InputError(
+            f"file {path}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
+        ) from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"file {path}", expected=f"the layout {layout}", received=f"{type(error).__name__}: {error}",
+            remedy="see the layouts in `smplxpp params convert --help`",
+        ) from error  # fmt: skip
+
+
+def _content(path: Path) -> Any:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return safe_npz(path)
+    if suffix == ".pkl":
+        return safe_load(path)
+    if suffix != ".json":
+        raise InputError(f"file {path}", expected=f"one of {', '.join(_SUFFIXES)}", received=f"suffix {suffix!r}")
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"file {path}", expected="a readable file", received=error.strerror or str(error)) from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"file {path}", expected="JSON", received=str(error)) from error
+
+
+def _frame_files(path: Path) -> list[Path]:
+    """The file itself, or the numbered files of a folder in order."""
+    if not path.is_dir():
+        return [path]
+    series: dict[str, list[Path]] = {}
+    others = 0
+    for file in path.iterdir():
+        if file.suffix.lower() in _SUFFIXES and re.search(r"\d", file.stem):
+            series.setdefault(re.sub(r"\d+", "#", file.name), []).append(file)
+        else:
+            others += 1
+    if len(series) != 1:
+        raise InputError(
+            f"folder {path}",
+            expected=f"one series of numbered {', '.join(_SUFFIXES)} files",
+            received=f"{', '.join(sorted(series)) or 'no such file'} ({others} other entries)",
+            remedy="give one file, or a folder that holds the frames alone",
+        )
+    return sorted(next(iter(series.values())), key=lambda f: [int(n) for n in re.findall(r"\d+", f.stem)])

@@ -1,0 +1,209 @@
+"""The layouts in which others write body parameters: how each is recognised and what its numbers mean.
+
+A reader turns the content of one file into `Frames`: parameters as SMPL-X understands them and, where the source
+moves the posed body as a whole, that outer motion, still to be composed (it needs the body's root joint).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
+
+_JOINTS = dict(POSE_BLOCKS)
+_EASYMOCAP_HAND_PCA = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What a reader returns.
+
+    Attributes:
+        params: T frames.
+        outer: (T, 3) axis-angle and (T, 3) metres of `x_world = R x + t` about the origin, applied to the posed
+            body; None where the layout has none.
+    """
+
+    params: BodyParams
+    outer: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A known layout.
+
+    Attributes:
+        name: what the user calls it.
+        recognises: by the keys of a record; `is_list` tells a list of records.
+        read: content, chosen person -> frames; None where the person is not in the file.
+    """
+
+    name: str
+    recognises: Callable[[set[str], bool], bool]
+    read: Callable[[Any, int | None], Frames | None]
+
+
+def _read_smplx(content: Mapping[str, Any], person: int | None) -> Frames:
+    """SMPL-X names: our own files, per-frame files, 4D-Dress."""
+    values = {name: _flat_joints(name, content[name]) for name in ARRAY_NAMES if name in content}
+    extras = {name: content[name] for name in ("fps", "flat_hand_mean") if name in content}
+    return Frames(BodyParams.from_mapping(values | extras))
+
+
+def _read_avatarrex(content: Mapping[str, Any], person: int | None) -> Frames:
+    """AvatarReX, THuman4: SMPL-X names, one row of betas, no eyes, hands without the mean hand."""
+    return _read_smplx({**content, "flat_hand_mean": content.get("flat_hand_mean", True)}, person)
+
+
+def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
+    """TalkBody4D: SMPL-X names, then `verts R(Rh)^T + Th` about the origin; its readers take the hands as complete."""
+    return Frames(_read_avatarrex(content, person).params, _outer(content))
+
+
+def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
+    """AMASS: `poses` of SMPL+H (156) or of SMPL-X (165); complete hands."""
+    poses = np.atleast_2d(np.asarray(content["poses"], dtype=np.float64))
+    if poses.shape[-1] not in (156, 165):
+        raise InputError("poses", expected="shape (T, 156) or (T, 165)", received=f"shape {poses.shape}")
+    rate = content.get("mocap_framerate", content.get("mocap_frame_rate"))
+    blocks = _split(poses, face_first=True)
+    params = BodyParams.from_mapping(
+        {**blocks, "betas": content["betas"], "transl": content["trans"], "flat_hand_mean": True}
+        | ({} if rate is None else {"fps": rate})
+    )
+    return Frames(params)
+
+
+def _read_easymocap(content: Any, person: int | None) -> Frames | None:
+    """EasyMocap: one record a person, `V = R(Rh) X + Th` about the origin, hands as 6 PCA numbers before the face."""
+    records = content if isinstance(content, list) else content.get("annots", [content])
+    ids = [record.get("id", 0) for record in records]
+    if person is None and len(records) != 1:
+        raise InputError(
+            "people", expected="one person", received=f"ids {ids}", remedy="choose one by its id: person, --person"
+        )
+    if person is not None and person not in ids:
+        return None
+    record = records[0 if person is None else ids.index(person)]
+    poses = np.asarray(record["poses"], dtype=np.float64).reshape(1, -1)
+    full = poses.shape[1] == 165
+    if full:
+        blocks = _split(poses, face_first=True)
+    elif poses.shape[1] == 72:
+        # SMPL: its two hand joints have no counterpart.
+        if poses[:, 66:].any():
+            warnings.warn(
+                "EasyMocap: the rotations of SMPL's two hand joints are dropped", GeometryWarning, stacklevel=2
+            )
+        blocks = _split(poses[:, :66], face_first=False)
+    elif poses.shape[1] in (66 + 2 * _EASYMOCAP_HAND_PCA, 75 + 2 * _EASYMOCAP_HAND_PCA):
+        blocks = _split(poses, face_first=False)
+    else:
+        raise InputError("poses", expected="72, 78, 87 or 165 numbers", received=f"{poses.shape[1]}")
+    for name, key in (("left_hand_pose", "handl"), ("right_hand_pose", "handr")):
+        if key in record:
+            blocks[name] = record[key]
+    values = {**blocks, "betas": record["shapes"], "transl": np.zeros(3), "flat_hand_mean": full}
+    if "expression" in record:
+        values["expression"] = record["expression"]
+    return Frames(BodyParams.from_mapping(values), _outer(record))
+
+
+LAYOUTS: dict[str, Layout] = {
+    layout.name: layout
+    for layout in (
+        Layout(
+            "smplx",
+            lambda keys, is_list: (
+                {"global_orient", "body_pose", "betas", "transl"} <= keys
+                and not {"Rh", "Th"} & keys
+                and not ("jaw_pose" in keys and "leye_pose" not in keys)
+            ),
+            _read_smplx,
+        ),
+        Layout(
+            "avatarrex",
+            lambda keys, is_list: (
+                {"global_orient", "body_pose", "betas", "transl", "jaw_pose"} <= keys
+                and not {"Rh", "Th", "leye_pose"} & keys
+            ),
+            _read_avatarrex,
+        ),
+        Layout(
+            "talkbody4d",
+            lambda keys, is_list: {"body_pose", "betas", "Rh", "Th"} <= keys and not is_list,
+            _read_talkbody4d,
+        ),
+        Layout("amass", lambda keys, is_list: {"poses", "trans", "betas"} <= keys and not is_list, _read_amass),
+        Layout(
+            "easymocap",
+            lambda keys, is_list: {"poses", "shapes", "Rh", "Th"} <= keys or "annots" in keys,
+            _read_easymocap,
+        ),
+    )
+}
+
+
+def recognise(content: Any, *, source: str) -> str:
+    """The name of the one layout that fits a file's content.
+
+    Raises:
+        InputError: none fits, or several.
+    """
+    is_list = isinstance(content, list)
+    record = next(iter(content), {}) if is_list else content
+    keys = set(map(str, record)) if isinstance(record, Mapping) else set()
+    fitting = [layout.name for layout in LAYOUTS.values() if layout.recognises(keys, is_list)]
+    # An EasyMocap frame in which nobody was seen is an empty list.
+    if is_list and not content:
+        fitting = ["easymocap"]
+    if len(fitting) != 1:
+        seen = f"keys {', '.join(sorted(keys)) or 'none'}" + (" in a list" if is_list else "")
+        raise InputError(
+            source,
+            expected=f"the keys of one of the layouts {', '.join(LAYOUTS)}",
+            received=f"{seen}, which fit {' and '.join(fitting) or 'none'}",
+            remedy="name the layout with --layout" if fitting else "check that this is a file of body parameters",
+        )
+    return fitting[0]
+
+
+def _split(poses: np.ndarray, *, face_first: bool) -> dict[str, np.ndarray]:
+    """Rows of concatenated joints to blocks: root, body, then face and hands in either order, as far as they go.
+
+    Hands share what the face leaves: 45 axis-angle numbers each, or PCA coefficients. 156 = no face.
+    """
+    blocks = {"global_orient": poses[:, :3], "body_pose": poses[:, 3:66]}
+    rest = poses[:, 66:]
+    # SMPL-X rows end in (165) or hold (87) nine face numbers; the others have none.
+    face_width = 9 if poses.shape[1] in (165, 75 + 2 * _EASYMOCAP_HAND_PCA) else 0
+    face, hands = (
+        (rest[:, :face_width], rest[:, face_width:])
+        if face_first
+        else (rest[:, rest.shape[1] - face_width :], rest[:, : rest.shape[1] - face_width])
+    )
+    if face_width:
+        blocks |= {"jaw_pose": face[:, :3], "leye_pose": face[:, 3:6], "reye_pose": face[:, 6:]}
+    if hands.shape[1]:
+        blocks["left_hand_pose"], blocks["right_hand_pose"] = np.split(hands, 2, axis=1)
+    return blocks
+
+
+def _outer(record: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    rotvec, shift = (np.asarray(record[key], dtype=np.float64).reshape(-1, 3) for key in ("Rh", "Th"))
+    return rotvec, shift
+
+
+def _flat_joints(name: str, value: Any) -> np.ndarray:
+    """(..., joints, 3) or (..., 1, 3) blocks to one row a frame."""
+    value = np.asarray(value)
+    joints = _JOINTS.get(name)
+    if joints and value.ndim >= 2 and value.shape[-2:] == (joints, 3) and (joints > 1 or value.ndim == 3):
+        return value.reshape(-1, 3 * joints)
+    return value
