@@ -11,10 +11,12 @@ from scipy.spatial import cKDTree
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import barycentric_coordinates
 from smplxpp.metrics.conventions import DEFAULT, Convention, convention_named
 from smplxpp.metrics.sampling import (
     SurfaceSamples,
     check_labels,
+    interpolated_normals,
     labels_at,
     require_surface,
     sample_surface,
@@ -158,7 +160,8 @@ def directed_distances(
             )
     if convention.target == "surface":
         distance, closest, face = point_to_surface(points.points, target)
-        normals = target.face_normals[face]
+        barycentric = barycentric_coordinates(closest, target.triangles[face])
+        normals = interpolated_normals(target, face, barycentric)
     else:
         # A stream of its own: two samplings of the same mesh must not coincide.
         cloud = sample_surface(target, samples, seed=(seed, 1))

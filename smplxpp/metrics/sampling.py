@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, normalize_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class SurfaceSamples:
     Attributes:
         points: (P, 3) float64 metres.
         face: (P,) int64 the face that each point lies on.
-        normals: (P, 3) float64 unit normals: the face's for area samples, angle-weighted for vertices.
+        normals: (P, 3) float64 unit normals, see `interpolated_normals`.
     """
 
     points: np.ndarray
@@ -54,7 +54,8 @@ def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...
     face = np.minimum(face, np.flatnonzero(mesh.face_areas)[-1])
     a, b = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
-    return SurfaceSamples(np.einsum("pk,pkd->pd", weights, mesh.triangles[face]), face, mesh.face_normals[face])
+    points = np.einsum("pk,pkd->pd", weights, mesh.triangles[face])
+    return SurfaceSamples(points, face, interpolated_normals(mesh, face, weights))
 
 
 def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
@@ -62,6 +63,15 @@ def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
     require_surface(mesh, "mesh to sample")
     vertex, first = np.unique(mesh.faces.ravel(), return_index=True)
     return SurfaceSamples(mesh.vertices[vertex], first // 3, mesh.vertex_normals[vertex])
+
+
+def interpolated_normals(mesh: TriangleMesh, face: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    """(P, 3) unit normals at barycentric coordinates (P, 3) of faces (P,), from the angle-weighted vertex normals.
+
+    Not the faces' own normals: the closest point of a convex surface often lies on an edge or a vertex, where the
+    choice of the face, and so the angle, would be left to rounding.
+    """
+    return normalize_rows(np.einsum("pk,pkd->pd", barycentric, mesh.vertex_normals[mesh.faces[face]]))
 
 
 def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarray:

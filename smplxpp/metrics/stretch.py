@@ -44,17 +44,16 @@ def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
         InputError: the meshes differ in faces or number of vertices, or have no faces.
     """
     _check_same_topology(rest, posed)
-    length = [
-        np.linalg.norm(m.vertices[rest.edges[:, 1]] - m.vertices[rest.edges[:, 0]], axis=1) for m in (rest, posed)
-    ]
-    return np.divide(length[1], length[0], out=np.full(len(length[0]), np.nan), where=length[0] > 0)
+    i, j = rest.edges.T
+    before, after = (np.linalg.norm(m.vertices[j] - m.vertices[i], axis=1) for m in (rest, posed))
+    return np.divide(after, before, out=np.full(len(before), np.nan), where=before > 0)
 
 
 def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
     """(M,) bool: faces that agree with their edge neighbours at rest and oppose them in the pose.
 
-    A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors. Relative
-    to the neighbours, so that the pose's own rotation does not count.
+    A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors.
+    Relative to the neighbours, so that the pose's own rotation does not count.
 
     Raises:
         InputError: as `edge_stretch`.

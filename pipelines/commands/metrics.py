@@ -1,0 +1,310 @@
+"""`smplxpp metrics A B`: distances between two meshes, or between two folders of frames, one row a frame."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json as json_format
+import re
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh_io import MeshFile, read_mesh
+from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
+
+# A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.
+FRAME_SUFFIXES = ((".ply", ".obj", ".glb", ".gltf", ".stl", ".off"), (".pkl",), (".npz",))
+LABEL_KEYS = ("face_labels", "vertex_labels", "labels", "label")
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+PLAUSIBLE_METRES = 20.0
+Preset = Literal["smplxpp", "pifuhd-cm", "icon-cm", "now-mm", "occnet-l1", "occnet-l2", "pytorch3d"]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Distances between a predicted and a true surface: P2S, Chamfer, p95, Hausdorff, normals, F-score, per label."""
+
+    a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
+    """The predicted mesh, or a folder of frames."""
+    b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
+    """The true mesh, or a folder of frames, matched with those of A by name or else by frame number."""
+    samples: int = 100_000
+    """Points taken of each mesh, area-weighted."""
+    seed: int = 0
+    """Of the points: the same seed gives the same numbers, bit for bit."""
+    preset: Preset = "smplxpp"
+    """Whose definition of P2S and Chamfer; the output states it. Everything else is in mm."""
+    visible_only: bool = False
+    """Measure from the outer surface of each mesh alone: skin hidden under clothes is left out."""
+    threshold_mm: float = 5.0
+    """Of precision, recall and F-score."""
+    units: Literal["m", "cm", "mm"] = "m"
+    """Of both meshes' coordinates."""
+    labels_a: Path | None = None
+    """Labels of A's faces or vertices (.npy, or .npz with face_labels, vertex_labels, labels or label), 0 skin, 1 hair,
+    2 shoe, 3 upper, 4 lower, 5 outer; or a folder of such files. Without it, a PLY property `label` counts."""
+    labels_b: Path | None = None
+    """The same for B."""
+    out: Path | None = None
+    """Write the result there as well: .json (all of it) or .csv (a row a frame)."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the result as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Compare, print a table unless `json`, write `out`; returns what the JSON holds.
+
+        Raises:
+            InputError: missing paths, a file against a folder, no frame that could be compared.
+        """
+        if self.out is not None and self.out.suffix.lower() not in (".json", ".csv"):
+            raise InputError("output file", expected=".json or .csv", received=str(self.out))
+        pairs, skipped = pair_frames(self.a, self.b)
+        frames = []
+        console = Console(stderr=True)
+        hidden = self.json or len(pairs) == 1
+        for name, a, b in track(pairs, "comparing", console=console, transient=True, disable=hidden):
+            try:
+                start = time.perf_counter()
+                result = self._compare(a, b)
+            except (InputError, OSError) as error:
+                # One bad frame among thousands is named and left out; a single pair is the user's whole question.
+                if not self.a.is_dir():
+                    raise
+                skipped.append({"frame": name, "reason": str(error)})
+                continue
+            seconds = time.perf_counter() - start
+            frames.append({"frame": name, "a": str(a), "b": str(b), "seconds": seconds, **result.as_dict()})
+        if not frames:
+            raise InputError(
+                f"folders {self.a} and {self.b}",
+                expected="at least one frame that can be compared",
+                received="; ".join(f"{s['frame']}: {s['reason']}" for s in skipped[:3]) or "no frames",
+            )
+        report = self._report(frames, skipped)
+        if self.out is not None:
+            as_csv = self.out.suffix.lower() == ".csv"
+            atomic_write_text(self.out, _csv(frames) if as_csv else json_format.dumps(report, indent=1) + "\n")
+        if not self.json:
+            _print(report, Console())
+        return report
+
+    def _compare(self, path_a: Path, path_b: Path) -> MeshComparison:
+        meshes, labels = [], []
+        for path, given in ((path_a, self.labels_a), (path_b, self.labels_b)):
+            file = read_mesh(path)
+            mesh = file.mesh.with_vertices(file.mesh.vertices * METRES[self.units])
+            if mesh.bbox_diagonal > PLAUSIBLE_METRES:
+                warnings.warn(
+                    f"{path} is {mesh.bbox_diagonal:.0f} m across: are its units {self.units}? See --units",
+                    GeometryWarning,
+                    stacklevel=2,
+                )
+            meshes.append(mesh)
+            labels.append(_labels(file, given, path))
+        return compare(
+            *meshes,
+            samples=self.samples,
+            seed=self.seed,
+            preset=self.preset,
+            pred_labels=labels[0],
+            gt_labels=labels[1],
+            config=CompareConfig(threshold_mm=self.threshold_mm, visible_only=self.visible_only),
+        )
+
+    def _report(self, frames: list[dict], skipped: list[dict]) -> dict[str, Any]:
+        convention = presets()[self.preset]
+        rows = [flat_row(frame) for frame in frames]
+        keys = dict.fromkeys(key for row in rows for key in row)
+        known = {key: [row[key] for row in rows if row.get(key) is not None] for key in keys}
+        spread = {
+            key: {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)}
+            for key, values in known.items()
+            if values and key != "frame"
+        }
+        return {
+            "preset": convention.name,
+            "unit": convention.unit,
+            "definition": convention.definition,
+            "source": convention.source,
+            "samples": self.samples,
+            "seed": self.seed,
+            "threshold_mm": self.threshold_mm,
+            "visible_only": self.visible_only,
+            "frames": frames,
+            "over_frames": spread,
+            "skipped": skipped,
+        }
+
+
+def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[dict[str, str]]]:
+    """Pairs (name, file of A, file of B) and the frames without a partner, as {"frame", "reason"}.
+
+    Two files are one pair. Two folders pair files of the same stem, or, where no stem occurs in both, files whose names
+    end in the same number.
+
+    Raises:
+        InputError: a path does not exist, one is a file and the other a folder, or two files of a folder collide.
+    """
+    for path in (a, b):
+        if not path.exists():
+            raise InputError("input", expected="an existing file or folder", received=str(path))
+    if a.is_dir() != b.is_dir():
+        raise InputError("inputs", expected="two files or two folders", received=f"{a} and {b}")
+    if not a.is_dir():
+        return [(a.stem, a, b)], []
+    files = [_frames(a), _frames(b)]
+    stems = [{f.stem for f in found} for found in files]
+    key = _stem if stems[0] & stems[1] else frame_number
+    keyed = [_by_key(found, key, folder) for found, folder in zip(files, (a, b), strict=True)]
+    common = sorted(keyed[0].keys() & keyed[1].keys())
+    pairs = [(keyed[0][k].stem, keyed[0][k], keyed[1][k]) for k in common]
+    skipped = [
+        {"frame": path.name, "reason": f"no partner in {other}"}
+        for own, theirs, other in ((0, 1, b), (1, 0, a))
+        for k, path in sorted(keyed[own].items())
+        if k not in keyed[theirs]
+    ]
+    return pairs, skipped
+
+
+def frame_number(path: Path) -> str:
+    """The last run of digits in a file's stem without leading zeros, or the stem where it has none."""
+    digits = re.findall(r"\d+", path.stem)
+    return str(int(digits[-1])).zfill(12) if digits else path.stem
+
+
+def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
+    """One frame's numbers by flat name: `p2s`, `pred_to_gt.p95`, `upper.chamfer`, ..."""
+    row = {"frame": frame["frame"]}
+    for prefix, result in [("", frame), *((f"{name}.", r) for name, r in frame["labels"].items())]:
+        for key in ("p2s", "chamfer", "hausdorff", "precision", "recall", "fscore"):
+            row[prefix + key] = result[key]
+        for way in ("pred_to_gt", "gt_to_pred"):
+            for key, value in (result[way] or {}).items():
+                row[f"{prefix}{way}.{key}"] = value
+    return row
+
+
+def _stem(path: Path) -> str:
+    return path.stem
+
+
+def _frames(folder: Path) -> list[Path]:
+    for suffixes in FRAME_SUFFIXES:
+        found = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in suffixes)
+        if found:
+            return found
+    raise InputError(f"folder {folder}", expected="mesh files", received="none")
+
+
+def _by_key(files: list[Path], key: Any, folder: Path) -> dict[str, Path]:
+    keyed: dict[str, Path] = {}
+    for path in files:
+        other = keyed.setdefault(key(path), path)
+        if other is not path:
+            raise InputError(
+                f"folder {folder}", expected="one file a frame", received=f"{other.name} and {path.name}",
+                remedy="give the files of both folders the same names",
+            )  # fmt: skip
+    return keyed
+
+
+def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> np.ndarray | None:
+    if given is None:
+        properties = {**file.vertex_properties, **file.face_properties}
+        name = next((k for k in ("label", "labels") if k in properties), None)
+        # PLY files often store labels as floats.
+        whole = name is not None and np.array_equal(properties[name], np.round(properties[name]))
+        return properties[name].astype(np.int64) if whole else None
+    if given.is_dir():
+        same = [
+            p
+            for p in sorted(given.iterdir())
+            if p.suffix in (".npz", ".npy") and frame_number(p) == frame_number(mesh_path)
+        ]
+        if len(same) != 1:
+            raise InputError(
+                f"labels of {mesh_path.name}", expected=f"one .npz or .npy in {given}", received=f"{len(same)}"
+            )
+        given = same[0]
+    try:
+        data = np.load(given, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"label file {given}", expected=".npy or .npz of plain arrays", received=str(error)) from None
+    if isinstance(data, np.ndarray):
+        return data
+    with data:
+        key = next((k for k in LABEL_KEYS if k in data), None)
+        if key is None:
+            raise InputError(f"label file {given}", expected=f"a key of {LABEL_KEYS}", received=str(sorted(data)))
+        return data[key]
+
+
+def _csv(frames: list[dict]) -> str:
+    rows = [flat_row(frame) for frame in frames]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(dict.fromkeys(k for row in rows for k in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _print(report: dict[str, Any], console: Console) -> None:
+    unit, frames = report["unit"], report["frames"]
+    single = len(frames) == 1
+    columns = {
+        f"P2S\n{unit}": "p2s",
+        f"Chamfer\n{unit}": "chamfer",
+        "A->B\nmean": "pred_to_gt.mean",
+        "A->B\np95": "pred_to_gt.p95",
+        "B->A\nmean": "gt_to_pred.mean",
+        "B->A\np95": "gt_to_pred.p95",
+        "both\nmax": "hausdorff",
+        "A->B\ndeg": "pred_to_gt.normal_angle_deg",
+        "B->A\ndeg": "gt_to_pred.normal_angle_deg",
+        f"F\n{report['threshold_mm']:g} mm": "fscore",
+    }
+    table = Table(
+        title=f"{report['preset']}: {report['definition']}",
+        title_justify="left",
+        caption="A->B: from A to the surface of B, mm; deg: angle of the normals; F: F-score at the threshold",
+        caption_justify="left",
+        padding=(0, 0),
+    )
+    table.add_column("frame", no_wrap=True, min_width=9)
+    for column in columns:
+        table.add_column(column, justify="right")
+
+    def add(name: str, values: dict[str, Any], **style: Any) -> None:
+        cells = ["-" if values.get(key) is None else f"{values[key]:.4g}" for key in columns.values()]
+        table.add_row(name, *cells, **style)
+
+    for frame in frames:
+        row = flat_row(frame)
+        add(frame["frame"], row, end_section=frame is frames[-1])
+        if single:
+            for label in frame["labels"]:
+                add(f"  {label}", {k.removeprefix(f"{label}."): v for k, v in row.items() if k.startswith(f"{label}.")})
+    if not single:
+        labels = list(dict.fromkeys(label for frame in frames for label in frame["labels"]))
+        for statistic in ("mean", "std"):
+            values = {key: s[statistic] for key, s in report["over_frames"].items()}
+            add(statistic, values, style="bold")
+            if statistic == "mean":
+                for label in labels:
+                    start = f"{label}."
+                    add(f"  {label}", {k.removeprefix(start): v for k, v in values.items() if k.startswith(start)})
+    console.print(table)
+    for entry in report["skipped"]:
+        console.print(f"[yellow]skipped[/] {entry['frame']}: {entry['reason']}", soft_wrap=True)
