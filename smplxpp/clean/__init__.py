@@ -1,1 +1,25 @@
-""""""
+"""Cleaning: raw scans to manifold meshes, labelled scans to loose parts within a face budget."""
+
+from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
+from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
+from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
+from smplxpp.clean.simplify import Simplified, simplify
+from smplxpp.clean.units import METRES_PER_UNIT, check_human_scale, convert_points
+
+__all__ = [
+    "METRES_PER_UNIT",
+    "CleanReport",
+    "CleanedPart",
+    "PartReport",
+    "PartsConfig",
+    "Sanitized",
+    "Simplified",
+    "check_human_scale",
+    "clean_parts",
+    "convert_points",
+    "drop_specks",
+    "fill_pinholes",
+    "loop_lengths",
+    "sanitize",
+    "simplify",
+]

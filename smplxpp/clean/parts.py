@@ -1,0 +1,158 @@
+"""Loose parts of a labelled scan: cut out, without specks and pinholes, simplified to a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import igl
+import numpy as np
+
+from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
+from smplxpp.clean.simplify import simplify
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LABEL_BY_NAME, LABELS, SKIN
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
+
+
+@dataclass(frozen=True)
+class PartsConfig:
+    """Options of `clean_parts`.
+
+    Attributes:
+        face_budgets: faces of a part by label name; `Label.face_budget` where a name is missing.
+        speck_area: components below this fraction of the part's area go.
+        pinhole_length: border loops with a perimeter below this many metres are closed.
+    """
+
+    face_budgets: Mapping[str, int] = field(default_factory=dict)
+    speck_area: float = 1e-3
+    pinhole_length: float = 0.04
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.face_budgets) - set(LABEL_BY_NAME))
+        if unknown:
+            raise InputError("face budgets", expected=f"names among {sorted(LABEL_BY_NAME)}", received=str(unknown))
+
+
+@dataclass(frozen=True)
+class PartReport:
+    """What cleaning did to a part; distances in metres from the part's faces before simplification to it.
+
+    `opening_lengths` are the perimeters that remain, longest first.
+    """
+
+    faces_before: int
+    faces_after: int
+    speck_faces: int
+    filled_pinholes: int
+    components: int
+    opening_lengths: tuple[float, ...]
+    non_manifold_edges: int
+    flipped_faces: int
+    restored_faces: int
+    distance_mean: float
+    distance_p95: float
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedPart:
+    """A loose part, ready for skin weights.
+
+    Attributes:
+        mesh: manifold, in the scan's frame.
+        label: the id of its label.
+        source_vertex: (n,) the scan's vertex that each vertex stands for.
+        vertex_colors: (n, 3) uint8 from there, or None.
+        report: the changes.
+    """
+
+    mesh: TriangleMesh
+    label: int
+    source_vertex: np.ndarray
+    vertex_colors: np.ndarray | None
+    report: PartReport
+
+
+def clean_parts(
+    mesh: TriangleMesh,
+    face_labels: np.ndarray,
+    *,
+    config: PartsConfig | None = None,
+    vertex_colors: np.ndarray | None = None,
+) -> dict[str, CleanedPart]:
+    """Cut a labelled scan into its loose parts and clean each.
+
+    Skin makes no part (the body model takes its place), nor does the background (-1). A part may have several
+    components (two shoes). Any per-vertex attribute of the scan goes along as `attribute[part.source_vertex]`.
+
+    Args:
+        mesh: the scan, sanitized. face_labels: (M,) label ids. vertex_colors: (N, 3) uint8.
+
+    Raises:
+        InputError: labels of another length or unknown, or no loose part at all.
+    """
+    config = config or PartsConfig()
+    face_labels = np.asarray(face_labels)
+    if face_labels.shape != (mesh.face_count,):
+        raise InputError("face labels", expected=f"shape ({mesh.face_count},)", received=f"shape {face_labels.shape}")
+    if vertex_colors is not None and len(vertex_colors) != mesh.vertex_count:
+        raise InputError("vertex colours", expected=f"{mesh.vertex_count} rows", received=f"{len(vertex_colors)}")
+    unknown = np.setdiff1d(face_labels, [-1] + [label.id for label in LABELS])
+    if len(unknown):
+        raise InputError("face labels", expected="label ids -1 to 5", received=f"{unknown.tolist()}")
+    parts = {}
+    for label in LABELS:
+        selected = face_labels == label.id
+        if label is SKIN or not selected.any():
+            continue
+        budget = config.face_budgets.get(label.name, label.face_budget)
+        part, source, report = _clean_part(mesh, selected, budget=budget, config=config)
+        colors = None if vertex_colors is None else np.asarray(vertex_colors)[source]
+        parts[label.name] = CleanedPart(part, label.id, source, colors, report)
+    if not parts:
+        raise InputError(
+            "face labels",
+            expected="at least one of hair, shoe, upper, lower, outer",
+            received="only skin and background",
+            remedy="check that the label set is the right one",
+        )
+    return parts
+
+
+def _clean_part(
+    scan: TriangleMesh, selected: np.ndarray, *, budget: int, config: PartsConfig
+) -> tuple[TriangleMesh, np.ndarray, PartReport]:
+    part, source = scan.submesh(selected)
+    kept = drop_specks(part, area_fraction=config.speck_area)
+    part, of_part = part.submesh(kept)
+    faces, of_kept = manifold_corners(part.faces)
+    part = TriangleMesh(part.vertices[of_kept], faces)
+    source = source[of_part][of_kept]
+    loops = len(border_loops(part.faces))
+    part, of_cut = fill_pinholes(part, max_length=config.pinhole_length)
+    source = source[of_cut]
+    small = simplify(part, budget)
+    tree = igl.AABB()
+    tree.init(small.mesh.vertices, small.mesh.faces)
+    distance = np.sqrt(tree.squared_distance(small.mesh.vertices, small.mesh.faces, part.vertices)[0])
+    openings = border_loops(small.mesh.faces)
+    lengths = sorted(loop_lengths(small.mesh, openings).tolist(), reverse=True)
+    return (
+        small.mesh,
+        source[small.source_vertex],
+        PartReport(
+            faces_before=int(selected.sum()),
+            faces_after=small.mesh.face_count,
+            speck_faces=int((~kept).sum()),
+            filled_pinholes=loops - len(border_loops(part.faces)),
+            components=int(face_components(small.mesh.faces).max()) + 1,
+            opening_lengths=tuple(lengths),
+            non_manifold_edges=int((edge_groups(small.mesh.faces)[2] > 2).sum()),
+            flipped_faces=small.flipped_faces,
+            restored_faces=small.restored_faces,
+            distance_mean=float(distance.mean()),
+            distance_p95=float(np.percentile(distance, 95)),
+        ),
+    )

@@ -1,0 +1,186 @@
+"""Raw arrays of a scan to a mesh that the next stages can trust; every change is counted."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import component_labels, half_edges, manifold_corners, paired_half_edges
+
+# A face is without area below this fraction of the squared bounding-box diagonal (2 um x 2 um on an adult).
+_ZERO_AREA = 1e-12
+# An open sheet is turned over only when it is clearly inside out: flux below this fraction of area x radius.
+_INSIDE_OUT = 0.05
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """How many elements each repair touched.
+
+    Attributes:
+        nonfinite_vertices: vertices with NaN or infinity, dropped with their faces.
+        welded_vertices: vertices merged into another one.
+        zero_area_faces, duplicate_faces: faces dropped.
+        flipped_faces: faces turned over for consistent, outward winding.
+        split_vertices: vertices added where the surface was not manifold.
+        unreferenced_vertices: vertices dropped because no face uses them.
+    """
+
+    nonfinite_vertices: int = 0
+    welded_vertices: int = 0
+    zero_area_faces: int = 0
+    duplicate_faces: int = 0
+    flipped_faces: int = 0
+    split_vertices: int = 0
+    unreferenced_vertices: int = 0
+
+    @property
+    def is_clean(self) -> bool:
+        """Nothing had to be changed."""
+        return not any(getattr(self, f.name) for f in fields(self))
+
+    def __str__(self) -> str:
+        counts = [f"{getattr(self, f.name)} {f.name.replace('_', ' ')}" for f in fields(self) if getattr(self, f.name)]
+        return ", ".join(counts) or "nothing to repair"
+
+
+@dataclass(frozen=True, eq=False)
+class Sanitized:
+    """A repaired mesh and where its elements came from.
+
+    Attributes:
+        mesh: two-manifold (with borders), every vertex referenced, winding consistent in each component.
+        source_vertex: (n,) index into the raw vertices. source_face: (m,) index into the raw faces.
+        report: the changes.
+    """
+
+    mesh: TriangleMesh
+    source_vertex: np.ndarray
+    source_face: np.ndarray
+    report: CleanReport
+
+
+def sanitize(vertices: np.ndarray, faces: np.ndarray, *, weld_tolerance: float | None = None) -> Sanitized:
+    """Repair raw arrays: NaN, duplicates, faces without area, winding, non-manifold places.
+
+    In this order: vertices that are not finite go with their faces; vertices closer than `weld_tolerance` merge into
+    the one of lowest index (the default is 1e-6 of the bounding box's diagonal); faces without area and repeated faces
+    go; winding is made consistent in each component, and outward; the surface is cut at edges with more than two faces
+    and at vertices where fans meet; unreferenced vertices go. Sanitising the result again changes nothing but the same
+    cuts. Warns when something was changed.
+
+    Args:
+        vertices: (N, 3). faces: (M, 3) integers.
+
+    Raises:
+        InputError: wrong shapes, indices out of range, or nothing left.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise InputError("mesh vertices", expected="shape (N, 3)", received=f"shape {vertices.shape}")
+    finite = np.isfinite(vertices).all(axis=1)
+    # The checks of shapes and indices are the mesh's own.
+    faces = TriangleMesh(np.where(finite[:, None], vertices, 0.0), faces).faces
+    kept = np.flatnonzero(finite[faces].all(axis=1))
+    faces = faces[kept]
+    referenced = np.unique(faces)
+    if not len(referenced):
+        raise InputError(
+            "mesh", expected="faces with finite corners", received=f"{int(finite.sum())} finite vertices and no such face"
+        )
+    diagonal = float(np.linalg.norm(np.ptp(vertices[referenced], axis=0)))
+    tolerance = 1e-6 * diagonal if weld_tolerance is None else weld_tolerance
+    target = _weld(vertices, referenced, tolerance)
+    faces = target[faces]
+
+    edge = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    solid = 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > _ZERO_AREA * diagonal**2
+    faces, kept = faces[solid], kept[solid]
+    unique = _first_of_each(faces)
+    duplicates = len(faces) - len(unique)
+    faces, kept = faces[unique], kept[unique]
+    if not len(faces):
+        raise InputError("mesh", expected="faces with area", received="only faces without area", remedy="check the units")
+
+    flipped = _inconsistent_faces(vertices, faces)
+    faces = np.where(flipped[:, None], faces[:, ::-1], faces)
+    new_faces, source_vertex = manifold_corners(faces)
+    merged = int((target[referenced] != referenced).sum())
+    used = len(np.unique(source_vertex))
+    report = CleanReport(
+        nonfinite_vertices=int((~finite).sum()),
+        welded_vertices=merged,
+        zero_area_faces=int((~solid).sum()),
+        duplicate_faces=duplicates,
+        flipped_faces=int(flipped.sum()),
+        split_vertices=len(source_vertex) - used,
+        unreferenced_vertices=int(finite.sum()) - merged - used,
+    )
+    if not report.is_clean:
+        warnings.warn(f"mesh repaired: {report}", GeometryWarning, stacklevel=2)
+    return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report)
+
+
+def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.ndarray:
+    """(N,) for every vertex the one of lowest index that it merges into (chains of near vertices merge whole)."""
+    target = np.arange(len(vertices))
+    pairs = cKDTree(vertices[referenced]).query_pairs(tolerance, output_type="ndarray")
+    if len(pairs):
+        group = component_labels(pairs, len(referenced))
+        _, first = np.unique(group, return_index=True)
+        target[referenced] = referenced[first[group]]
+    return target
+
+
+def _first_of_each(faces: np.ndarray) -> np.ndarray:
+    """Increasing indices of the first face of every set of three vertices."""
+    low, middle, high = np.sort(faces, axis=1).T
+    order = np.lexsort((high, middle, low))
+    key = np.stack([low, middle, high])[:, order]
+    return np.sort(order[np.append(True, (np.diff(key) != 0).any(axis=0))])
+
+
+def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(M,) bool: faces to turn over, for consistent winding in each component and then outward.
+
+    Consistency is connectivity in the double cover: every face is two nodes, as given and turned over, and each edge
+    with two faces joins the nodes that agree. A component whose two sheets join (a Moebius strip) is left as it is.
+    """
+    count = len(faces)
+    pairs = paired_half_edges(faces)
+    ends = half_edges(faces)
+    a, b = pairs[:, 0] // 3, pairs[:, 1] // 3
+    agree = ends[pairs[:, 0], 0] != ends[pairs[:, 1], 0]
+    links = np.concatenate([np.stack([a, b + count * ~agree], 1), np.stack([a + count, b + count * agree], 1)])
+    graph = coo_matrix((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(2 * count, 2 * count))
+    sheet = connected_components(graph, directed=False)[1]
+    given, turned = sheet[:count], sheet[count:]
+    orientable = given != turned
+    component = np.unique(np.minimum(given, turned), return_inverse=True)[1]
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+
+    # Turn over the smaller area of each component.
+    second = given > turned
+    area_second = np.bincount(component, area * second)
+    total = np.bincount(component, area)
+    flip = orientable & np.where(area_second[component] > 0.5 * total[component], ~second, second)
+
+    # Then whole components that face inward, by the flux of (x - centroid) through them (three times the volume).
+    sign = np.where(flip, -1.0, 1.0)
+    center = corners.mean(axis=1)
+    centroid = np.stack([np.bincount(component, area * center[:, k]) for k in range(3)], 1) / total[:, None]
+    arm = center - centroid[component]
+    flux = np.bincount(component, 0.5 * sign * np.einsum("ij,ij->i", cross, arm))
+    radius = np.sqrt(np.bincount(component, area * np.einsum("ij,ij->i", arm, arm)) / total)
+    closed = np.bincount(component, minlength=len(total)) * 3 == 2 * np.bincount(component[a], minlength=len(total))
+    inside_out = flux < np.where(closed, 0.0, -_INSIDE_OUT * total * radius)
+    return flip ^ (inside_out[component] & orientable)

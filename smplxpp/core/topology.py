@@ -1,0 +1,116 @@
+"""Connectivity of triangle soups: paired half-edges, components, border loops, manifold corners.
+
+A half-edge `h = 3 f + k` runs from corner k of face f to the next corner.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+
+def half_edges(faces: np.ndarray) -> np.ndarray:
+    """(3M, 2) start and end vertex of every half-edge."""
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+
+
+def edge_groups(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Half-edges gathered by undirected edge.
+
+    Returns (3M,) half-edges sorted by edge (then by index), and for each of the E edges the start of its run and the
+    run's length.
+    """
+    ends = half_edges(faces)
+    low, high = np.minimum(*ends.T), np.maximum(*ends.T)
+    key = low * (int(faces.max(initial=0)) + 1) + high
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1)) if len(key) else np.zeros(0, np.int64)
+    return order, first, np.diff(first, append=len(key))
+
+
+def paired_half_edges(faces: np.ndarray) -> np.ndarray:
+    """(P, 2) the two half-edges of every edge that has exactly two faces, lower index first."""
+    order, first, count = edge_groups(faces)
+    start = first[count == 2]
+    return np.stack([order[start], order[start + 1]], axis=1)
+
+
+def face_adjacency(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 2) pairs of faces that share an edge, each pair once an edge, and (P, 2) that edge's vertices.
+
+    At an edge with more than two faces, faces that follow each other in index order are paired.
+    """
+    order, first, count = edge_groups(faces)
+    last = np.zeros(len(order), dtype=bool)
+    last[first + count - 1] = True
+    position = np.flatnonzero(~last)
+    pairs = np.stack([order[position], order[position + 1]], axis=1)
+    return pairs // 3, half_edges(faces)[pairs[:, 0]]
+
+
+def component_labels(pairs: np.ndarray, count: int) -> np.ndarray:
+    """(count,) component of every node of the graph with edges `pairs`, numbered by lowest node."""
+    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1]
+    first = np.full(int(labels.max(initial=-1)) + 1, count)
+    np.minimum.at(first, labels, np.arange(count))
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[labels]
+
+
+def face_components(faces: np.ndarray) -> np.ndarray:
+    """(M,) edge-connected component of every face."""
+    return component_labels(face_adjacency(faces)[0], len(faces))
+
+
+def manifold_corners(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut the surface where it is not a two-manifold, by giving corners new vertices.
+
+    Corners of a vertex stay together when a chain of edges, each with exactly two faces of opposite direction, joins
+    them: so edges with three or more faces open, and vertices where two fans meet split.
+
+    Returns (M, 3) new faces and (n,) the old vertex of every new one; the first fan of a vertex keeps its place among
+    the referenced vertices (in their order), further fans follow at the end.
+    """
+    pairs = paired_half_edges(faces)
+    ends = half_edges(faces)
+    pairs = pairs[ends[pairs[:, 0], 0] == ends[pairs[:, 1], 1]]
+    following = np.arange(3 * len(faces)).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    a, b = pairs[:, 0], pairs[:, 1]
+    links = np.concatenate([np.stack([a, following[b]], 1), np.stack([following[a], b], 1)])
+    fan = component_labels(links, 3 * len(faces))
+    _, first_corner = np.unique(fan, return_index=True)
+    vertex_of_fan = faces.ravel()[first_corner]
+    order = np.lexsort((first_corner, vertex_of_fan))
+    extra = np.zeros(len(order), dtype=bool)
+    extra[1:] = vertex_of_fan[order][1:] == vertex_of_fan[order][:-1]
+    order = np.concatenate([order[~extra], order[extra]])
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    return place[fan].reshape(-1, 3), vertex_of_fan[order]
+
+
+def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """The vertices of every border loop of a manifold surface, in the direction of its faces, from its lowest index.
+
+    Loops come in order of their lowest vertex.
+    """
+    order, first, count = edge_groups(faces)
+    start, end = half_edges(faces)[order[first[count == 1]]].T
+    if not len(start):
+        return []
+    nodes = np.sort(start)
+    following = np.searchsorted(nodes, end[np.argsort(start, kind="stable")])
+    loop = component_labels(np.stack([np.arange(len(nodes)), following], 1), len(nodes))
+    # Steps to the loop's lowest vertex by pointer doubling.
+    _, head = np.unique(loop, return_index=True)
+    jump, steps = following.copy(), np.ones(len(nodes), np.int64)
+    jump[head], steps[head] = head, 0
+    for _ in range(int(np.ceil(np.log2(len(nodes) + 1)))):
+        steps, jump = steps + steps[jump], jump[jump]
+    length = np.bincount(loop)
+    rank = np.where(steps > 0, length[loop] - steps, 0)
+    ordered = nodes[np.lexsort((rank, loop))]
+    return np.split(ordered, np.cumsum(length)[:-1])
