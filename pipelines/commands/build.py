@@ -1,0 +1,141 @@
+"""`smplxpp build`: a scan, a body fit and labels in; a template, its numbers and a report out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json as jsonlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.progress import stage_progress
+from smplxpp.capture import find_reference
+from smplxpp.core.errors import InputError
+
+StageName = Literal[STAGES]  # type: ignore[valid-type]
+
+
+@dataclass(frozen=True)
+class Build:
+    """Options of `smplxpp build`. Give --capture, or --scan with --params (and --labels unless the scan holds them)."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder of the run; stages that stand in it are not run again."""
+    capture: Path | None = None
+    """Folder of a capture: scans/scan_FFFFFF.ply, params/, labels."""
+    scan: Path | None = None
+    """Clothed scan of the reference frame (PLY, OBJ, GLB, STL, OFF, npz)."""
+    params: Path | None = None
+    """Body parameters of that frame, any layout that `smplxpp params convert` reads."""
+    labels: Path | None = None
+    """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh."""
+    label_set: str = "auto"
+    """Label set of the labels: 4d-dress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
+    auto: `capture` with --capture, else 4d-dress."""
+    label_source: Literal["auto", "scan", "views"] = "auto"
+    """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the scan's first."""
+    frame: int = 0
+    """Reference frame, near T-pose."""
+    body: Path | None = None
+    """SMPL-X-layout body file; the open body by default."""
+    units: Literal["m", "cm", "mm", "inch"] = "m"
+    """Units of the scan file."""
+    up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
+    """Upward axis of the scan file."""
+    method: Literal["ours", "paper"] = "ours"
+    """Skin-weight transfer: ours, or robust transfer exactly as published."""
+    budgets: dict[str, int] = field(default_factory=dict)
+    """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
+    clearance_mm: float = 1.0
+    """Distance kept between layers."""
+    max_influences: int = 8
+    """Joints that a vertex may follow."""
+    samples: int = 100_000
+    """Surface samples of the validation."""
+    seed: int = 0
+    """Seed of the samples."""
+    from_stage: StageName = STAGES[0]
+    """First stage to run; earlier ones must stand."""
+    until_stage: StageName = STAGES[-1]
+    """Last stage to run."""
+    report: bool = True
+    """Write report.html."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Build, write metrics.json and the report, print the summary."""
+        from pipelines.build_report import write_build_report
+        from pipelines.build_template import build
+        from pipelines.commands.inspect import Inspect
+
+        inputs, config = self.inputs(), self.config()
+        with stage_progress(len(STAGES) + int(self.report), enabled=not self.json) as step:
+            records = build(self.out, inputs, config, first=self.from_stage, last=self.until_stage, progress=step)
+            if self.report and set(records) == set(STAGES):
+                step("report", False)
+                write_build_report(self.out, inputs, config, records)
+                step("report", True)
+        if not self.json:
+            Inspect(run_folder=self.out).run()
+        metrics = jsonlib.loads((self.out / "metrics.json").read_text())
+        failed = sum(check["status"] == "fail" for check in metrics["checks"])
+        return {**metrics, "failed": failed, "exit_status": 0}
+
+    def inputs(self) -> BuildInputs:
+        """The files of this build.
+
+        Raises:
+            InputError: neither or both ways of naming the input, or files that a capture lacks.
+        """
+        if (self.capture is None) == (self.scan is None):
+            raise InputError(
+                "input", expected="either --capture, or --scan with --params",
+                received="both" if self.capture else "neither",
+            )  # fmt: skip
+        label_set = self.label_set
+        if self.capture is not None:
+            found = find_reference(self.capture, frame=self.frame, params=self.params)
+            labels = self.labels or (found.scan_labels if self.label_source != "views" else None)
+            if labels is None and not found.label_maps:
+                raise InputError(
+                    f"capture {found.subject}", expected="labels of the scan or label maps of its views",
+                    received="neither", remedy="name a file with --labels",
+                )  # fmt: skip
+            motion = self.capture / "params" / "params.npz"
+            return BuildInputs(
+                subject=found.subject, scan=found.scan, params=found.params, frame=found.params_frame, labels=labels,
+                label_maps={} if labels else found.label_maps, cameras=None if labels else found.cameras_file,
+                label_set="capture" if label_set == "auto" else label_set,
+                motion=motion if motion.is_file() else None, body=self.body,
+            )  # fmt: skip
+        if self.params is None:
+            raise InputError("input", expected="--params with --scan", received="no --params")
+        return BuildInputs(
+            subject=self.scan.stem, scan=self.scan, params=self.params, frame=self.frame, labels=self.labels,
+            label_set="4d-dress" if label_set == "auto" else label_set, body=self.body,
+        )  # fmt: skip
+
+    def config(self) -> BuildConfig:
+        """The choices of this build.
+
+        Raises:
+            InputError: a budget for an unknown part, or numbers out of range.
+        """
+        default = BuildConfig()
+        unknown = sorted(set(self.budgets) - set(default.budgets))
+        if unknown:
+            raise InputError(
+                "option budgets", expected=f"parts among {', '.join(default.budgets)}", received=", ".join(unknown)
+            )
+        for name, value, least in (
+            ("clearance-mm", self.clearance_mm, 0.0), ("max-influences", self.max_influences, 1),
+            ("samples", self.samples, 1000), ("budgets", min(self.budgets.values(), default=100), 100),
+        ):  # fmt: skip
+            if not value >= least:
+                raise InputError(f"option {name}", expected=f"at least {least:g}", received=f"{value:g}")
+        names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets"}
+        return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets)
