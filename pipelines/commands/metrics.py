@@ -280,7 +280,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
         title_justify="left",
         caption="A->B: from A to the surface of B, mm; deg: angle of the normals; F: F-score at the threshold",
         caption_justify="left",
-        padding=(0, 0),
+        padding=(0, 1 if console.width > 100 else 0),
     )
     table.add_column("frame", no_wrap=True, min_width=9)
     for column in columns:
