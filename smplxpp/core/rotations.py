@@ -53,7 +53,7 @@ def rotvec_from_matrix(matrix: np.ndarray) -> np.ndarray:
     Returns:
         (..., 3) float64, of length at most pi.
     """
-    matrix = np.asarray(matrix, dtype=np.float64)
+    matrix = np.array(matrix, dtype=np.float64)  # a copy: scipy takes no read-only arrays
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
 
 

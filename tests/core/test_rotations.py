@@ -33,6 +33,7 @@ def test_leading_axes_are_kept():
     rotvec = np.random.default_rng(0).normal(size=(2, 4, 3))
     assert matrix_from_rotvec(rotvec).shape == (2, 4, 3, 3)
     assert rotvec_from_matrix(matrix_from_rotvec(rotvec)).shape == (2, 4, 3)
+    assert not rotvec_from_matrix(np.broadcast_to(np.eye(3), (2, 3, 3))).any()
     assert matrix_from_rotvec(np.zeros((0, 3))).shape == (0, 3, 3)
 
 

@@ -1,0 +1,258 @@
+"""Each layout is written from known numbers; the parameters read from it must pose the body as its formula says."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from smplxpp.body import detect_layout, load_params
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+
+FRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def pca_body(open_body):
+    """The open body with a hand PCA and a mean hand, so that the layouts differ where they should."""
+    rng = np.random.default_rng(5)
+    hands = {f"{side}_hand_components": rng.normal(size=(45, 45)) * 0.3 for side in ("left", "right")}
+    hands |= {f"{side}_hand_mean": rng.normal(size=45) * 0.1 for side in ("left", "right")}
+    return replace(open_body, **hands)
+
+
+@pytest.fixture
+def params(moving) -> BodyParams:
+    return moving(FRAMES, betas=10, expressions=10)
+
+
+@pytest.fixture
+def outer():
+    """(T, 3) axis-angle and (T, 3) shifts of the posed body."""
+    rng = np.random.default_rng(9)
+    return rng.normal(size=(FRAMES, 3)), rng.normal(size=(FRAMES, 3))
+
+
+def assert_same(read: BodyParams, expected: BodyParams) -> None:
+    for name in ARRAY_NAMES:
+        np.testing.assert_allclose(getattr(read, name), getattr(expected, name), atol=1e-15, err_msg=name)
+
+
+def moved(vertices: np.ndarray, rotvec: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """x = R X + t about the origin."""
+    return vertices @ Rotation.from_rotvec(rotvec).as_matrix().swapaxes(1, 2) + shift[:, None]
+
+
+def write_json(path, content):
+    path.write_text(json.dumps(content, default=lambda array: np.asarray(array).tolist()))
+    return path
+
+
+def test_our_own_file(tmp_path, params):
+    params = replace(params, fps=25.0)
+    params.save(tmp_path / "params.npz")
+    read = load_params(tmp_path / "params.npz")
+    assert_same(read, params)
+    assert read.fps == 25.0 and not read.flat_hand_mean
+    assert detect_layout(tmp_path / "params.npz") == "smplx"
+
+
+def test_a_folder_of_frames_in_the_order_of_their_numbers(tmp_path, params):
+    for index, number in enumerate((2, 10, 100)):
+        arrays = {name: value[0] for name, value in params.frame(index).as_dict().items()}
+        np.savez(tmp_path / f"{number}.npz", **arrays)
+    # Neither numbered nor a file of parameters: left aside.
+    (tmp_path / "params_noisy.npz").write_bytes(b"")
+    (tmp_path / "notes1.txt").write_text("x")
+    assert_same(load_params(tmp_path), params)
+
+
+def test_4d_dress_pickles(tmp_path, params, pca_body):
+    params = replace(
+        params, left_hand_pose=params.left_hand_pose[:, :12], right_hand_pose=params.right_hand_pose[:, :12]
+    )
+    for index in range(FRAMES):
+        arrays = {name: value[0].astype(np.float32) for name, value in params.frame(index).as_dict().items()}
+        (tmp_path / f"mesh-f{index:05d}_smplx.pkl").write_bytes(pickle.dumps(arrays, protocol=4))
+    read = load_params(tmp_path)
+    expected = pca_body.forward(params, flat_hand_mean=False).vertices
+    np.testing.assert_allclose(pca_body.forward(read).vertices, expected, atol=1e-5)
+
+
+def test_blocks_by_joint_are_flattened(tmp_path, params):
+    arrays = params.as_dict()
+    arrays["body_pose"] = params.body_pose.reshape(FRAMES, 21, 3)
+    arrays["global_orient"] = params.global_orient.reshape(FRAMES, 1, 3)
+    np.savez(tmp_path / "x.npz", **arrays)
+    assert_same(load_params(tmp_path / "x.npz"), params)
+
+
+@pytest.mark.parametrize("kind", ["smplh", "smplx"])
+def test_amass(tmp_path, params, pca_body, kind):
+    face = [params.jaw_pose, params.leye_pose, params.reye_pose] if kind == "smplx" else []
+    blocks = [params.global_orient, params.body_pose, *face, params.left_hand_pose, params.right_hand_pose]
+    rate = {"mocap_frame_rate": 120.0} if face else {"mocap_framerate": 120.0}
+    np.savez(
+        tmp_path / "walk_poses.npz", poses=np.concatenate(blocks, axis=1), trans=params.transl, betas=params.betas[0],
+        gender="male", dmpls=np.zeros((FRAMES, 8)), **rate,
+    )  # fmt: skip
+    read = load_params(tmp_path / "walk_poses.npz")
+    expected = replace(params, expression=np.zeros((FRAMES, 10)), flat_hand_mean=True)
+    if not face:
+        expected = replace(expected, **{name: np.zeros((FRAMES, 3)) for name in ("jaw_pose", "leye_pose", "reye_pose")})
+    assert_same(read, expected)
+    assert read.fps == 120.0 and detect_layout(tmp_path / "walk_poses.npz") == "amass"
+    np.testing.assert_allclose(
+        pca_body.forward(read).vertices, pca_body.forward(expected, flat_hand_mean=True).vertices, atol=1e-12
+    )
+
+
+def test_z_up_becomes_y_up(tmp_path, params, pca_body):
+    params.save(tmp_path / "z.npz")
+    up_z = pca_body.forward(params).vertices
+    up_y = pca_body.forward(load_params(tmp_path / "z.npz", body=pca_body, up="z")).vertices
+    np.testing.assert_allclose(up_y, np.stack([up_z[..., 0], up_z[..., 2], -up_z[..., 1]], axis=-1), atol=1e-11)
+
+
+def test_avatarrex(tmp_path, params, pca_body):
+    arrays = {name: value for name, value in params.as_dict().items() if name not in ("leye_pose", "reye_pose")}
+    np.savez(tmp_path / "smpl_params.npz", **arrays | {"betas": params.betas[:1]})
+    read = load_params(tmp_path / "smpl_params.npz")
+    expected = replace(params, leye_pose=np.zeros((FRAMES, 3)), reye_pose=np.zeros((FRAMES, 3)))
+    assert_same(read, expected)
+    assert detect_layout(tmp_path / "smpl_params.npz") == "avatarrex"
+    np.testing.assert_allclose(
+        pca_body.forward(read).vertices, pca_body.forward(expected, flat_hand_mean=True).vertices, atol=1e-12
+    )
+    assert not load_params(tmp_path / "smpl_params.npz", flat_hand_mean=False).flat_hand_mean
+
+
+@pytest.mark.parametrize("as_folder", [True, False])
+def test_talkbody4d(tmp_path, params, outer, pca_body, as_folder):
+    for index in range(FRAMES):
+        record = {name: value for name, value in params.frame(index).as_dict().items()}
+        record |= {"Rh": outer[0][index : index + 1], "Th": outer[1][index : index + 1]}
+        write_json(tmp_path / f"{index:06d}.json", record)
+    inner = pca_body.forward(params, flat_hand_mean=True).vertices
+    expected = moved(inner, *outer)
+    assert detect_layout(tmp_path) == "talkbody4d"
+    if as_folder:
+        read = load_params(tmp_path, body=pca_body)
+    else:
+        read, expected = load_params(tmp_path / "000001.json", body=pca_body), expected[1:2]
+    np.testing.assert_allclose(pca_body.forward(read).vertices, expected, atol=1e-11)
+
+
+def easymocap_record(params: BodyParams, outer, index: int, *, person: int = 0) -> dict:
+    """SMPL-X: 3 zeros, body, hands as 6 + 6 PCA numbers, then the face."""
+    frame = params.frame(index)
+    blocks = [np.zeros((1, 3)), frame.body_pose, frame.left_hand_pose[:, :6], frame.right_hand_pose[:, :6]]
+    poses = np.concatenate([*blocks, frame.jaw_pose, frame.leye_pose, frame.reye_pose], axis=1)
+    assert poses.shape == (1, 87)
+    return {
+        "id": person, "Rh": outer[0][index : index + 1], "Th": outer[1][index : index + 1], "poses": poses,
+        "shapes": frame.betas, "expression": frame.expression,
+    }  # fmt: skip
+
+
+def easymocap_truth(params: BodyParams, outer, body) -> np.ndarray:
+    inner = replace(
+        params, global_orient=np.zeros((FRAMES, 3)), transl=np.zeros((FRAMES, 3)),
+        left_hand_pose=params.left_hand_pose[:, :6], right_hand_pose=params.right_hand_pose[:, :6],
+    )  # fmt: skip
+    return moved(body.forward(inner, flat_hand_mean=False).vertices, *outer)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_easymocap(tmp_path, params, outer, pca_body, wrapped):
+    for index in range(FRAMES):
+        records = [easymocap_record(params, outer, index)]
+        write_json(tmp_path / f"{index:06d}.json", {"annots": records} if wrapped else records)
+    assert detect_layout(tmp_path) == "easymocap"
+    read = load_params(tmp_path, body=pca_body)
+    np.testing.assert_allclose(pca_body.forward(read).vertices, easymocap_truth(params, outer, pca_body), atol=1e-11)
+    # With a zero root of its own the orientation is the outer one, whatever the body.
+    np.testing.assert_allclose(
+        matrix_from_rotvec(read.global_orient), Rotation.from_rotvec(outer[0]).as_matrix(), atol=1e-12
+    )
+
+
+def test_easymocap_of_smpl_and_of_smplh(tmp_path, params, outer, pca_body):
+    record = easymocap_record(params, outer, 1)
+    full = record["poses"]
+    del record["expression"]
+    still = {name: np.zeros((FRAMES, 3)) for name in ("jaw_pose", "leye_pose", "reye_pose")}
+    still["expression"] = np.zeros((FRAMES, 10))
+    hands = replace(params, **still)
+    record["poses"] = full[:, :78]
+    smplh = load_params(write_json(tmp_path / "h.json", [record]), body=pca_body)
+    np.testing.assert_allclose(
+        pca_body.forward(smplh).vertices[0], easymocap_truth(hands, outer, pca_body)[1], atol=1e-11
+    )
+    record["poses"] = full[:, :72]
+    with pytest.warns(GeometryWarning, match="two hand joints"):
+        smpl = load_params(write_json(tmp_path / "s.json", [record]), body=pca_body)
+    np.testing.assert_allclose(smpl.body_pose, params.body_pose[1:2], atol=1e-15)
+    record["poses"] = full[:, :70]
+    with pytest.raises(InputError, match=r"s\.json: poses.*70"):
+        load_params(write_json(tmp_path / "s.json", [record]), body=pca_body)
+
+
+def test_easymocap_with_several_people(tmp_path, params, outer, pca_body):
+    for index in range(FRAMES):
+        records = [easymocap_record(params, outer, index, person=4)]
+        if index != 1:
+            records.insert(0, easymocap_record(params, outer, 1, person=2))
+        write_json(tmp_path / f"{index:06d}.json", records)
+    with pytest.raises(InputError, match=r"000000\.json: people.*\[2, 4\].*--person"):
+        load_params(tmp_path, body=pca_body)
+    read = load_params(tmp_path, body=pca_body, person=4)
+    np.testing.assert_allclose(pca_body.forward(read).vertices, easymocap_truth(params, outer, pca_body), atol=1e-11)
+    with pytest.warns(GeometryWarning, match=r"missing in 1 of 3 frames.*000001\.json"):
+        assert len(load_params(tmp_path, body=pca_body, person=2)) == 2
+    with pytest.raises(InputError, match="person 7"):
+        load_params(tmp_path, body=pca_body, person=7)
+
+
+def test_unknown_and_ambiguous_layouts_say_what_was_seen(tmp_path, params):
+    np.savez(tmp_path / "a.npz", pose=np.zeros(72), trans=np.zeros(3))
+    with pytest.raises(InputError, match=r"a\.npz.*keys pose, trans, which fit none"):
+        load_params(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", **params.as_dict(), poses=np.zeros((FRAMES, 156)), trans=np.zeros((FRAMES, 3)))
+    with pytest.raises(InputError, match=r"smplx and amass.*--layout"):
+        load_params(tmp_path / "b.npz")
+    assert_same(load_params(tmp_path / "b.npz", layout="smplx"), params)
+    with pytest.raises(InputError, match=r"a\.npz.*layout amass.*betas"):
+        np.savez(tmp_path / "a.npz", poses=np.zeros((1, 156)), trans=np.zeros(3))
+        load_params(tmp_path / "a.npz", layout="amass")
+    with pytest.raises(InputError, match="received vhap"):
+        load_params(tmp_path / "b.npz", layout="vhap")
+
+
+def test_unreadable_inputs_are_named(tmp_path, params):
+    with pytest.raises(InputError, match=r"none\.json"):
+        load_params(tmp_path / "none.json")
+    with pytest.raises(InputError, match=r"suffix '\.bvh'"):
+        load_params(tmp_path / "walk.bvh")
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(InputError, match=r"x\.json: expected JSON"):
+        load_params(tmp_path / "x.json")
+    with pytest.raises(InputError, match="no such file"):
+        load_params(tmp_path)
+    for name in ("a1.npz", "b1.npz"):
+        params.save(tmp_path / name)
+    with pytest.raises(InputError, match=r"a#\.npz, b#\.npz"):
+        load_params(tmp_path)
+    bad = params.as_dict() | {"body_pose": np.full((FRAMES, 63), np.nan)}
+    np.savez(tmp_path / "bad.npz", **bad)
+    with pytest.raises(InputError, match=r"bad\.npz: parameter body_pose"):
+        load_params(tmp_path / "bad.npz")
+
+
+def test_the_capture_s_frames_equal_its_stacked_file(captures):
+    folder = captures / "woman_casual" / "params"
+    assert_same(load_params(folder), load_params(folder / "params.npz"))
