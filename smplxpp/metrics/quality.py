@@ -83,6 +83,7 @@ def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> Mesh
     used = np.unique(mesh.faces)
     length = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
     borders = border_loop_lengths(mesh)
+    inconsistent = int(inconsistent_edges(mesh).sum())
     aspect = aspect_ratios(mesh)
     aspect = aspect[np.isfinite(aspect)]
     p50, p95, p99 = np.percentile(aspect, (50, 95, 99))
@@ -94,9 +95,9 @@ def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> Mesh
         components=_components(edges, mesh.vertex_count)[0] - (mesh.vertex_count - len(used)),
         euler=len(used) - len(edges) + mesh.face_count,
         nonmanifold_edges=int((counts > 2).sum()),
-        nonmanifold_vertices=int((~igl.is_vertex_manifold(mesh.faces)[used]).sum()),
-        inconsistent_edges=int(inconsistent_edges(mesh).sum()),
-        flipped_faces=int(flipped_against_majority(mesh).sum()),
+        nonmanifold_vertices=int((fan_counts(mesh) > 1).sum()),
+        inconsistent_edges=inconsistent,
+        flipped_faces=int(flipped_against_majority(mesh).sum()) if inconsistent else 0,
         border_edges=len(mesh.border_edges),
         border_loops=len(borders),
         border_lengths_mm=tuple((np.sort(borders)[::-1] * 1e3).tolist()),
@@ -130,6 +131,23 @@ def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
     piece = _components(local, len(nodes))[1][local[:, 0]]
     length = np.linalg.norm(mesh.vertices[border[:, 1]] - mesh.vertices[border[:, 0]], axis=1)
     return np.bincount(piece, length)
+
+
+def fan_counts(mesh: TriangleMesh) -> np.ndarray:
+    """(N,) number of fans at each vertex: groups of its faces that hang together by edges at the vertex."""
+    f, m = mesh.faces, mesh.face_count
+    # Half-edge k of a face runs from corner k to corner k + 1; corner k of face i is node k * m + i.
+    tail, head = np.arange(3 * m), np.roll(np.arange(3 * m), -m)
+    vertex = f.T.ravel()
+    forward = vertex[tail] < vertex[head]
+    low, high = np.where(forward, tail, head), np.where(forward, head, tail)
+    order = np.argsort(vertex[low] * mesh.vertex_count + vertex[high], kind="stable")
+    low, high = low[order], high[order]
+    same = (vertex[low][1:] == vertex[low][:-1]) & (vertex[high][1:] == vertex[high][:-1])
+    links = np.concatenate([np.stack([end[:-1], end[1:]], axis=1)[same] for end in (low, high)])
+    fan = _components(links, 3 * m)[1]
+    first = np.unique(fan, return_index=True)[1]
+    return np.bincount(vertex[first], minlength=mesh.vertex_count)
 
 
 def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:

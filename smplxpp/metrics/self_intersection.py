@@ -25,6 +25,7 @@ def self_intersections(mesh: TriangleMesh) -> np.ndarray:
     for pairs in _candidate_pairs(triangles):
         shared = (mesh.faces[pairs[:, 0]][:, :, None] == mesh.faces[pairs[:, 1]][:, None, :]).sum(axis=(1, 2))
         pairs = pairs[shared < 2]
+        pairs = pairs[_straddles(triangles[pairs[:, 0]], triangles[pairs[:, 1]])]
         cut = np.zeros(len(pairs), dtype=bool)
         for a, b in ((0, 1), (1, 0)):
             for k in range(3):
@@ -33,6 +34,15 @@ def self_intersections(mesh: TriangleMesh) -> np.ndarray:
         found.append(pairs[cut])
     pairs = np.concatenate(found)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+
+def _straddles(moving: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """(P,) bool: triangle `moving` has corners on both sides of the plane of triangle `plane`, both (P, 3, 3)."""
+    normal = np.cross(plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0])
+    offset = moving - plane[:, :1]
+    height = np.einsum("pkd,pd->pk", offset, normal)
+    touching = TOLERANCE * np.sqrt(np.einsum("pd,pd->p", normal, normal) * np.einsum("pkd,pkd->p", offset, offset))
+    return (height.min(axis=1) < -touching) & (height.max(axis=1) > touching)
 
 
 def _edge_cuts_triangle(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:

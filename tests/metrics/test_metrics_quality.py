@@ -9,6 +9,7 @@ import pytest
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.metrics import mesh_quality, self_intersections
+from smplxpp.metrics.quality import fan_counts
 
 
 def test_a_sphere_is_perfect(sphere):
@@ -103,3 +104,13 @@ def test_a_huge_face_among_small_ones_is_found(sphere):
 def test_an_empty_mesh_is_refused():
     with pytest.raises(InputError, match="area"):
         mesh_quality(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
+
+
+def test_fans_agree_with_libigl_on_random_soups():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        faces = np.array([rng.choice(12, 3, replace=False) for _ in range(14)])
+        used = np.unique(faces)
+        np.testing.assert_array_equal(
+            (fan_counts(TriangleMesh(np.zeros((12, 3)), faces)) == 1)[used], igl.is_vertex_manifold(faces)[used]
+        )
