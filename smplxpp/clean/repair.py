@@ -93,7 +93,9 @@ def sanitize(vertices: np.ndarray, faces: np.ndarray, *, weld_tolerance: float |
     referenced = np.unique(faces)
     if not len(referenced):
         raise InputError(
-            "mesh", expected="faces with finite corners", received=f"{int(finite.sum())} finite vertices and no such face"
+            "mesh",
+            expected="faces with finite corners",
+            received=f"{int(finite.sum())} finite vertices and no such face",
         )
     diagonal = float(np.linalg.norm(np.ptp(vertices[referenced], axis=0)))
     tolerance = 1e-6 * diagonal if weld_tolerance is None else weld_tolerance
@@ -107,7 +109,9 @@ def sanitize(vertices: np.ndarray, faces: np.ndarray, *, weld_tolerance: float |
     duplicates = len(faces) - len(unique)
     faces, kept = faces[unique], kept[unique]
     if not len(faces):
-        raise InputError("mesh", expected="faces with area", received="only faces without area", remedy="check the units")
+        raise InputError(
+            "mesh", expected="faces with area", received="only faces without area", remedy="check the units"
+        )
 
     flipped = _inconsistent_faces(vertices, faces)
     faces = np.where(flipped[:, None], faces[:, ::-1], faces)

@@ -1,0 +1,201 @@
+"""Label sets of other data sets and parsers, mapped onto ours.
+
+Where their classes are finer or other than ours:
+
+| theirs | ours | why |
+|---|---|---|
+| socks, shoes | shoe | worn over the foot, move with it |
+| hat | hair | rigid on the head, as hair is |
+| gloves, glasses, face, limbs, feet, hands, mouth | skin | lie on the body, which the body model represents |
+| scarf, apparel | outer | worn over the upper clothes |
+| coat | outer | |
+| dress, jumpsuit | upper | one garment from the shoulders; it stays whole |
+| pants, skirt, belt | lower | |
+| bag | background | not worn: no votes, the surface takes its neighbours' label |
+| undefined background | background | |
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
+
+_OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
+
+
+@dataclass(frozen=True)
+class LabelSet:
+    """A numbering of semantic classes.
+
+    Attributes:
+        name: for options and messages.
+        classes: (their id, their name, our name) of every class.
+    """
+
+    name: str
+    classes: tuple[tuple[int, str, str], ...]
+
+    @property
+    def ours(self) -> dict[int, int]:
+        """Their id -> our id."""
+        return {number: _OURS[ours] for number, _, ours in self.classes}
+
+
+def _numbered(name: str, *classes: tuple[str, str], first: int = 0) -> LabelSet:
+    return LabelSet(name, tuple((first + k, theirs, ours) for k, (theirs, ours) in enumerate(classes)))
+
+
+_LIP = (
+    ("background", "background"),
+    ("hat", "hair"),
+    ("hair", "hair"),
+    ("glove", "skin"),
+    ("sunglasses", "skin"),
+    ("upper clothes", "upper"),
+    ("dress", "upper"),
+    ("coat", "outer"),
+    ("socks", "shoe"),
+    ("pants", "lower"),
+    ("jumpsuits", "upper"),
+    ("scarf", "outer"),
+    ("skirt", "lower"),
+    ("face", "skin"),
+    ("left arm", "skin"),
+    ("right arm", "skin"),
+    ("left leg", "skin"),
+    ("right leg", "skin"),
+    ("left shoe", "shoe"),
+    ("right shoe", "shoe"),
+)
+_SAPIENS_SIDE = (
+    ("foot", "skin"),
+    ("hand", "skin"),
+    ("lower arm", "skin"),
+    ("lower leg", "skin"),
+    ("shoe", "shoe"),
+    ("sock", "shoe"),
+    ("upper arm", "skin"),
+    ("upper leg", "skin"),
+)
+
+LABEL_SETS: dict[str, LabelSet] = {
+    label_set.name: label_set
+    for label_set in (
+        LabelSet(
+            "4ddress",
+            ((BACKGROUND, "background", "background"), *((label.id, label.name, label.name) for label in LABELS)),
+        ),
+        _numbered(
+            "capture",
+            ("background", "background"),
+            ("skin", "skin"),
+            ("hair", "hair"),
+            ("shoes", "shoe"),
+            ("upper", "upper"),
+            ("lower", "lower"),
+            ("other body", "skin"),
+        ),
+        _numbered("lip", *_LIP),
+        _numbered("cihp", *_LIP[:10], ("torso skin", "skin"), *_LIP[11:]),
+        _numbered(
+            "atr",
+            ("background", "background"),
+            ("hat", "hair"),
+            ("hair", "hair"),
+            ("sunglasses", "skin"),
+            ("upper clothes", "upper"),
+            ("skirt", "lower"),
+            ("pants", "lower"),
+            ("dress", "upper"),
+            ("belt", "lower"),
+            ("left shoe", "shoe"),
+            ("right shoe", "shoe"),
+            ("face", "skin"),
+            ("left leg", "skin"),
+            ("right leg", "skin"),
+            ("left arm", "skin"),
+            ("right arm", "skin"),
+            ("bag", "background"),
+            ("scarf", "outer"),
+        ),
+        _numbered(
+            "sapiens",
+            ("background", "background"),
+            ("apparel", "outer"),
+            ("face and neck", "skin"),
+            ("hair", "hair"),
+            *((f"left {theirs}", ours) for theirs, ours in _SAPIENS_SIDE),
+            ("lower clothing", "lower"),
+            *((f"right {theirs}", ours) for theirs, ours in _SAPIENS_SIDE),
+            ("torso", "skin"),
+            ("upper clothing", "upper"),
+            ("lower lip", "skin"),
+            ("upper lip", "skin"),
+            ("lower teeth", "skin"),
+            ("upper teeth", "skin"),
+            ("tongue", "skin"),
+        ),
+    )
+}
+
+
+def find_label_set(name: str | Path | LabelSet) -> LabelSet:
+    """A label set by name, or from a JSON file `{"<their id>": "<our name>", ...}`.
+
+    Our names: skin, hair, shoe, upper, lower, outer, background.
+
+    Raises:
+        InputError: an unknown name, or a file that is not such a mapping.
+    """
+    if isinstance(name, LabelSet):
+        return name
+    if str(name) in LABEL_SETS:
+        return LABEL_SETS[str(name)]
+    path = Path(name)
+    if path.suffix.lower() != ".json" or not path.is_file():
+        raise InputError(
+            "label set", expected=f"one of {', '.join(LABEL_SETS)}, or an existing JSON file", received=repr(str(name))
+        )
+    expected = f"a mapping of integers to names among {', '.join(_OURS)}"
+    try:
+        mapping = json.loads(path.read_text())
+        classes = tuple(sorted((int(number), str(ours), ours) for number, ours in mapping.items()))
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"label set {path}", expected=expected, received=str(error)) from None
+    unknown = sorted({str(ours) for _, _, ours in classes if not isinstance(ours, str) or ours not in _OURS})
+    if unknown or not classes:
+        raise InputError(f"label set {path}", expected=expected, received=f"{', '.join(unknown) or 'nothing'}")
+    return LabelSet(path.stem, classes)
+
+
+def map_labels(ids: np.ndarray, label_set: str | Path | LabelSet | Mapping[int, int]) -> np.ndarray:
+    """Ids of a label set, of any shape -> ours, int64 (background -1).
+
+    Args:
+        ids: integers (floats that hold integers pass). label_set: see `find_label_set`; or their id -> our id.
+
+    Raises:
+        InputError: ids that the set does not have.
+    """
+    name = "mapping" if isinstance(label_set, Mapping) else find_label_set(label_set).name
+    mapping = label_set if isinstance(label_set, Mapping) else find_label_set(label_set).ours
+    ids = np.asarray(ids)
+    if ids.dtype.kind not in "iub" and not (ids.dtype.kind == "f" and np.array_equal(ids, np.rint(ids))):
+        raise InputError("label ids", expected="integers", received=str(ids.dtype))
+    unique, inverse = np.unique(ids.astype(np.int64), return_inverse=True)
+    unknown = [int(u) for u in unique if int(u) not in mapping]
+    if unknown:
+        raise InputError(
+            f"label ids of set {name!r}",
+            expected=f"ids among {sorted(mapping)}",
+            received=f"{unknown[:10]}{' ...' if len(unknown) > 10 else ''}",
+            remedy="name the label set that the file uses, or give a JSON mapping",
+        )
+    return np.array([mapping[int(u)] for u in unique], dtype=np.int64)[inverse].reshape(ids.shape)

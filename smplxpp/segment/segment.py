@@ -1,0 +1,185 @@
+"""A labelled scan: votes or given labels, smoothed along the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import BACKGROUND, LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import component_labels, face_adjacency
+from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
+
+
+@dataclass(frozen=True)
+class SegmentConfig:
+    """Options of `segment_scan`.
+
+    Attributes:
+        smoothness: factor of the pairwise cost. floor: its least value at any edge.
+        eta_convex, eta_concave: how much a fold lowers the cost of a label change there.
+        fold: cosine deficit that counts as a fold.
+        pseudo_votes: added to every label, so that no probability is zero.
+        full_votes: sum of votes from which a face is trusted fully.
+        label_trust: weight of the labels given with the scan, as a share of full votes.
+        island_area: patches below this fraction of the surface's area take their surroundings' label.
+    """
+
+    smoothness: float = 0.8
+    floor: float = 0.05
+    eta_convex: float = 0.15
+    eta_concave: float = 1.0
+    fold: float = 0.1
+    pseudo_votes: float = 0.02
+    full_votes: float = 3.0
+    label_trust: float = 0.5
+    island_area: float = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedScan:
+    """Labels of a scan's faces.
+
+    Attributes:
+        face_labels: (M,) int64 label ids.
+        confidence: (M,) in [0, 1]: the share of the votes that the label has, times how far the votes sum up to full
+            trust; 0 where the label comes from the neighbours alone.
+        seen: (M,) bool: some vote fell on the face.
+        island_faces: faces relabelled because their patch was too small.
+        energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
+    """
+
+    face_labels: np.ndarray
+    confidence: np.ndarray
+    seen: np.ndarray
+    island_faces: int
+    energy_before: float
+    energy_after: float
+
+
+def segment_scan(
+    mesh: TriangleMesh,
+    *,
+    votes: np.ndarray | None = None,
+    vertex_labels: np.ndarray | None = None,
+    face_labels: np.ndarray | None = None,
+    config: SegmentConfig | None = None,
+) -> SegmentedScan:
+    """Label every face of a scan from one of: votes, labels of its vertices, labels of its faces.
+
+    Minimises `sum_i U_i(l_i) + sum_(i,j) w_ij [l_i != l_j]` by alpha-expansion, with
+    `U = -log p min(sum of votes, 3) / 3` and
+    `w = 0.8 (edge length / mean) exp(-eta (1 - cos dihedral) / 0.1) + 0.05`, eta 0.15 at convex edges and 1 at concave
+    ones, so that seams settle in folds. Labels given are three votes a face (one a corner), weighted by
+    `label_trust`; -1 is no vote.
+
+    Args:
+        votes: (M, L) of `vote_on_faces`. vertex_labels: (N,). face_labels: (M,). In our ids.
+
+    Raises:
+        InputError: none or several of the three, other lengths, unknown ids, or not a single label.
+    """
+    config = config or SegmentConfig()
+    given = {"votes": votes, "vertex_labels": vertex_labels, "face_labels": face_labels}
+    present = [name for name, value in given.items() if value is not None]
+    if len(present) != 1:
+        raise InputError("segment_scan", expected=f"one of {', '.join(given)}", received=", ".join(present) or "none")
+    trust = 1.0
+    if votes is None:
+        votes, trust = _votes_of_labels(mesh, vertex_labels, face_labels), config.label_trust
+    votes = np.asarray(votes, dtype=np.float64)
+    if votes.shape != (mesh.face_count, len(LABELS)) or not np.isfinite(votes).all() or (votes < 0).any():
+        raise InputError(
+            "votes",
+            expected=f"finite, none negative, shape ({mesh.face_count}, {len(LABELS)})",
+            received=f"shape {votes.shape}" if votes.ndim == 2 else f"{votes.ndim} dimensions",
+        )
+    if not votes.any():
+        raise InputError("labels", expected="at least one labelled face", received="none")
+
+    total = votes.sum(axis=1)
+    share = (votes + config.pseudo_votes) / (total + config.pseudo_votes * len(LABELS))[:, None]
+    certainty = np.minimum(total, config.full_votes) / config.full_votes
+    pairs, ends = face_adjacency(mesh.faces)
+    weights = _fold_weights(mesh, pairs, ends, config)
+    # A label that nobody voted for anywhere cannot win.
+    candidates = np.flatnonzero(votes.any(axis=0))
+    unary = (-np.log(share) * (trust * certainty)[:, None])[:, candidates]
+    problem = PottsProblem.from_costs(unary, pairs, weights)
+    before = problem.energy(unary.argmin(axis=1))
+    index, after = minimize_potts(problem)
+    cut = candidates[index]
+    labels = _absorb_islands(mesh, cut, pairs, ends, config.island_area)
+    confidence = np.where(total > 0, votes[np.arange(len(labels)), labels] / np.maximum(total, 1e-300), 0.0) * certainty
+    return SegmentedScan(
+        labels, confidence, total > 0, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE
+    )
+
+
+def _votes_of_labels(
+    mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None
+) -> np.ndarray:
+    """(M, L) three votes a face, fewer where corners are unlabelled."""
+    name, labels, count = (
+        ("vertex labels", vertex_labels, mesh.vertex_count)
+        if face_labels is None
+        else ("face labels", face_labels, mesh.face_count)
+    )
+    labels = np.asarray(labels)
+    if labels.shape != (count,):
+        raise InputError(name, expected=f"shape ({count},)", received=f"shape {labels.shape}")
+    known = (labels >= BACKGROUND) & (labels < len(LABELS))
+    if labels.dtype.kind not in "iu" or not known.all():
+        raise InputError(
+            name,
+            expected=f"integers from -1 to {len(LABELS) - 1}",
+            received=f"{labels.dtype}, {int((~known).sum())} values out of range",
+            remedy="map them with map_labels first",
+        )
+    corner = labels[mesh.faces] if face_labels is None else np.repeat(labels[:, None], 3, axis=1)
+    face, _ = np.nonzero(corner >= 0)
+    slot = face * len(LABELS) + corner[corner >= 0]
+    return np.bincount(slot, minlength=mesh.face_count * len(LABELS)).reshape(-1, len(LABELS)).astype(np.float64)
+
+
+def _fold_weights(mesh: TriangleMesh, pairs: np.ndarray, ends: np.ndarray, config: SegmentConfig) -> np.ndarray:
+    """(P,) pairwise cost of a label change across each edge."""
+    length = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
+    normal = mesh.face_normals
+    n0, n1 = normal[pairs[:, 0]], normal[pairs[:, 1]]
+    deficit = 1.0 - np.einsum("ij,ij->i", n0, n1)
+    middle = mesh.triangles.mean(axis=1)
+    # Concave: the neighbour lies on the side that the normal points to.
+    concave = np.einsum("ij,ij->i", middle[pairs[:, 1]] - middle[pairs[:, 0]], n0 - n1) > 0
+    eta = np.where(concave, config.eta_concave, config.eta_convex)
+    mean = length.mean() if len(length) else 1.0
+    return config.smoothness * length / mean * np.exp(-eta * deficit / config.fold) + config.floor
+
+
+def _absorb_islands(
+    mesh: TriangleMesh, labels: np.ndarray, pairs: np.ndarray, ends: np.ndarray, area_fraction: float
+) -> np.ndarray:
+    """Give patches below `area_fraction` of the surface the label that they share the longest border with.
+
+    Only patches that are large enough hand on their label; a small one that touches none of them stays.
+    """
+    same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
+    patch = component_labels(pairs[same], len(labels))
+    area = np.bincount(patch, mesh.face_areas)
+    small = area < area_fraction * area.sum()
+    if not small.any():
+        return labels
+    crossing = pairs[~same]
+    length = np.linalg.norm(np.diff(mesh.vertices[ends[~same]], axis=1)[:, 0], axis=1)
+    here = np.concatenate([patch[crossing[:, 0]], patch[crossing[:, 1]]])
+    there = np.concatenate([patch[crossing[:, 1]], patch[crossing[:, 0]]])
+    usable = small[here] & ~small[there]
+    label_of_patch = np.empty(len(area), dtype=np.int64)
+    label_of_patch[patch] = labels
+    border = np.zeros((len(area), len(LABELS)))
+    np.add.at(border, (here[usable], label_of_patch[there[usable]]), np.concatenate([length, length])[usable])
+    absorbed = border.any(axis=1)
+    label_of_patch[absorbed] = border[absorbed].argmax(axis=1)
+    return label_of_patch[patch]

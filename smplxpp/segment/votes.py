@@ -1,0 +1,75 @@
+"""Votes of label maps on the faces that each view sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import BACKGROUND, LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh
+
+# A pixel counts fully this far inside the silhouette, and at least by the second number.
+_SILHOUETTE_PX = 4.0
+_LEAST_WEIGHT = 0.1
+
+
+def vote_on_faces(mesh: TriangleMesh, views: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
+    """(M, L) sum over the views' pixels that show a face of `cos(view, normal) clip(d / 4, 0.1, 1)`.
+
+    d is the pixel's distance to the silhouette of the labelled foreground, in pixels. Background pixels do not vote;
+    faces that look away from the camera get nothing (the far side of an open sheet).
+
+    Args:
+        views: (camera, label map) pairs; a map is (H, W) in our ids, background -1, of its camera's size.
+
+    Raises:
+        InputError: sizes that do not agree, unknown ids, or no vote at all.
+    """
+    votes = np.zeros(mesh.face_count * len(LABELS))
+    for camera, labels in views:
+        labels = np.asarray(labels)
+        if labels.shape != (camera.height, camera.width):
+            raise InputError(
+                f"label map of camera {camera.name!r}",
+                expected=f"shape ({camera.height}, {camera.width})",
+                received=f"{labels.shape}",
+                remedy="scale the camera's intrinsics to the map's size",
+            )
+        if labels.min() < BACKGROUND or labels.max() >= len(LABELS):
+            raise InputError(
+                f"label map of camera {camera.name!r}",
+                expected=f"ids -1 to {len(LABELS) - 1}",
+                received=f"{labels.min()} to {labels.max()}",
+                remedy="map them with map_labels first",
+            )
+        face = rasterize_mesh(mesh, camera).face_id
+        foreground = labels != BACKGROUND
+        row, col = np.nonzero((face >= 0) & foreground)
+        # A border of background: the edge of the image cuts the person off like a silhouette.
+        inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
+        hit = face[row, col]
+        cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
+        weight = np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
+        votes += np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=len(votes))
+    if not votes.any():
+        raise InputError(
+            "label maps",
+            expected="views that see the scan",
+            received="no labelled pixel on any face",
+            remedy="check the cameras' convention (OpenCV, world to camera), units and the winding of the faces",
+        )
+    return votes.reshape(mesh.face_count, len(LABELS))
+
+
+def _rays(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+    """(P, 3) unit viewing directions in the world through pixel centres."""
+    if camera.orthographic:
+        return np.broadcast_to(camera.forward, (len(row), 3))
+    pixel = np.stack([col + 0.5, row + 0.5, np.ones(len(row))], axis=1)
+    ray = pixel @ np.linalg.inv(camera.K).T @ camera.cam_from_world[:3, :3]
+    return ray / np.linalg.norm(ray, axis=1, keepdims=True)
