@@ -90,7 +90,17 @@ class BodyParams:
 
     @property
     def full_pose(self) -> np.ndarray:
-        """(T, 55, 3) axis-angle in SMPL-X joint order; needs full hands."""
+        """(T, 55, 3) axis-angle in SMPL-X joint order.
+
+        Raises:
+            InputError: hands given as PCA coefficients, which only a body model can expand.
+        """
+        for name in ("left_hand_pose", "right_hand_pose"):
+            if getattr(self, name).shape[1] != 45:
+                raise InputError(
+                    f"parameter {name}", expected="45 axis-angle numbers",
+                    received=f"{getattr(self, name).shape[1]} PCA coefficients",
+                )  # fmt: skip
         return np.concatenate([getattr(self, name) for name, _ in POSE_BLOCKS], axis=1).reshape(len(self), -1, 3)
 
     def frame(self, index: int) -> BodyParams:

@@ -33,6 +33,11 @@ def test_full_pose_and_back():
         np.testing.assert_array_equal(getattr(back, name), getattr(params, name))
 
 
+def test_hand_coefficients_have_no_full_pose():
+    with pytest.raises(InputError, match="left_hand_pose: expected 45"):
+        _ = random_params(left_hand_pose=np.zeros((3, 12))).full_pose
+
+
 def test_frames_selected_and_joined_again_are_the_same():
     params = random_params(frames=5)
     joined = BodyParams.concatenate([params.frame(0), params.select(slice(1, 4)), params.frame(-1)])
