@@ -27,7 +27,7 @@ def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
     ]
 
 
-def outer_visible_faces(mesh: TriangleMesh, *, views: int = 48, resolution: int = 768) -> np.ndarray:
+def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> np.ndarray:
     """(M,) bool: faces that own a pixel in some of `views` orthographic views from outside."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     for camera in _cameras(mesh, views, resolution):
@@ -37,17 +37,19 @@ def outer_visible_faces(mesh: TriangleMesh, *, views: int = 48, resolution: int 
 
 
 def outer_visible_points(
-    mesh: TriangleMesh, points: np.ndarray, *, tolerance: float, views: int = 48, resolution: int = 768
+    mesh: TriangleMesh, points: np.ndarray, *, tolerance: float, views: int = 32, resolution: int = 640
 ) -> np.ndarray:
     """(P,) bool: points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
     for camera in _cameras(mesh, views, resolution):
         depth = rasterize_mesh(mesh, camera).depth
-        x, y, z = camera.screen_from_world(points).T[:3]
+        todo = np.flatnonzero(~seen)
+        x, y, z = camera.screen_from_world(points[todo]).T[:3]
         col, row = np.floor(x).astype(int), np.floor(y).astype(int)
         inside = (col >= 0) & (col < camera.width) & (row >= 0) & (row < camera.height)
-        front = np.full(len(points), np.inf)
+        front = np.full(len(todo), -np.inf)
         front[inside] = depth[row[inside], col[inside]]
-        seen |= z <= front + tolerance
+        # A background pixel proves nothing: it may be the rim of a face that hides the point.
+        seen[todo] = (z <= front + tolerance) & np.isfinite(front)
     return seen
