@@ -10,7 +10,7 @@ from pipelines.arrays import load_arrays, save_arrays
 from pipelines.build_config import BuildConfig, BuildInputs
 from smplxpp.body import load_body, load_params
 from smplxpp.capture import read_cameras
-from smplxpp.clean import check_human_scale, clean_parts, convert_points, sanitize
+from smplxpp.clean import PartsConfig, check_human_scale, clean_parts, convert_points, sanitize
 from smplxpp.core.artifact import Check, StageOutput
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, display_colors
@@ -19,7 +19,7 @@ from smplxpp.core.mesh_io import read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.metrics import mesh_quality, point_to_surface
-from smplxpp.segment import read_label_map, read_labels, segment_scan, vote_on_faces
+from smplxpp.segment import read_label_map, read_labels, segment_scan, vote
 
 MM = 1e3
 GREY = 180
@@ -79,7 +79,7 @@ def register(folder: Path, run: Path, inputs: BuildInputs) -> StageOutput:
     body = TriangleMesh(posed.vertices, load_body(inputs.body).faces)
     rng = np.random.default_rng(0)
     sample = scan.vertices[np.sort(rng.permutation(scan.vertex_count)[:20_000])]
-    distance = SignedDistanceField(body).query(sample).distance * MM
+    distance = SignedDistanceField(body, solid=True).query(sample).distance * MM
     inside = float(np.mean(distance < -5.0))
     overlap = float(np.mean(np.abs(distance) < 250.0))
     checks = [
@@ -115,11 +115,18 @@ def segment(folder: Path, run: Path, inputs: BuildInputs) -> StageOutput:
         ]
         result = segment_scan(scan, votes=vote_on_faces(scan, views))
     else:
-        raw_faces = load_arrays(run / "00_capture" / "scan.npz")["scan"]["source_face"]
         raw = read_raw_mesh(inputs.scan)
-        labels = read_labels(inputs.labels or inputs.scan, raw, label_set=inputs.label_set)
-        per_face = len(labels) == len(raw.faces)
-        result = segment_scan(scan, labels=labels[raw_faces if per_face else source_vertex])
+        labels = read_labels(
+            inputs.labels or inputs.scan,
+            vertex_count=len(raw.vertices),
+            face_count=len(raw.faces),
+            label_set=inputs.label_set,
+        )
+        if len(labels) == len(raw.faces):
+            source_face = load_arrays(run / "00_capture" / "scan.npz")["scan"]["source_face"]
+            result = segment_scan(scan, face_labels=labels[source_face])
+        else:
+            result = segment_scan(scan, vertex_labels=labels[source_vertex])
     np.savez(folder / "labels.npz", face_labels=result.face_labels, confidence=result.confidence, seen=result.seen)
     write_ply(
         folder / "labels.ply",
@@ -149,12 +156,7 @@ def clean(folder: Path, run: Path, config: BuildConfig) -> StageOutput:
     scan, colors, _ = load_scan(run)
     with np.load(run / "20_segment" / "labels.npz") as labels:
         face_labels = labels["face_labels"]
-    parts = clean_parts(scan, face_labels, budgets=config.budgets, vertex_colors=colors)
-    if not parts:
-        raise InputError(
-            "labels", expected="some hair, shoes or clothes", received="skin only",
-            remedy="check the labels' set with --label-set",
-        )  # fmt: skip
+    parts = clean_parts(scan, face_labels, config=PartsConfig(face_budgets=config.budgets), vertex_colors=colors)
     save_arrays(
         folder / "parts.npz",
         {
