@@ -90,15 +90,15 @@ def color_bar(
     unit: str,
     height: int,
     background: tuple[int, int, int] = WHITE,
-    size: int = 17,
 ) -> np.ndarray:
-    """A vertical colour bar with five labelled ticks: (height, about 5 size, 3) uint8."""
+    """A vertical colour bar with five labelled ticks: (height, W, 3) uint8."""
     low, high = limits
     values = np.linspace(low, high, 5)
+    size = max(14, height // 36)  # still readable when the picture is shown at half its size
     font = ImageFont.load_default(size)
     labels = [f"{value:.4g}" for value in values]
     labels[-1] = f"{labels[-1]} {unit}".strip()
-    length = max(2, min(round(0.5 * height), 360))
+    length = max(2, min(round(0.5 * height), 20 * size))
     top, bar = (height - length) // 2, size
     text_width = max(font.getlength(label) for label in labels)
     strip = Image.new("RGB", (int(bar + 22 + text_width), height), background)

@@ -1,0 +1,77 @@
+"""Lays a `Report` out as one HTML file that needs nothing else: no network, no fonts, no other files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
+from pipelines.report.model import STATUSES, CheckRow, Report, count_statuses, format_value, worst_status
+from smplxpp.core.atomic import atomic_write_text
+
+_VERDICTS = {
+    "pass": "Every check passes",
+    "warn": "Usable, with warnings",
+    "fail": "Some checks fail",
+}
+
+
+def write_report(path: str | Path, report: Report) -> Path:
+    """Write `report` to `path` as one self-contained HTML file, whole or not at all."""
+    folder = resources.files("pipelines.report")
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+    )
+    environment.filters |= {"value": format_value, "flat": _flatten, "worst": worst_status}
+    environment.tests["number"] = lambda value: (
+        isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    )
+    environment.globals |= {
+        "histogram_svg": lambda histogram: Markup(histogram_svg(histogram)),
+        "timings_svg": lambda seconds: Markup(timings_svg(seconds)),
+        "statistics": histogram_statistics,
+    }
+    worst = worst_status(report.checks)
+    html = environment.get_template("report.html.j2").render(
+        report=report,
+        counts=count_statuses(report.checks),
+        worst=worst,
+        verdict=_VERDICTS[worst] if report.checks else "No checks were made",
+        attention=sorted(
+            (check for check in report.checks if check.status != "pass"), key=lambda c: STATUSES.index(c.status)
+        ),
+        by_stage=_by_stage(report.checks),
+        total_seconds=sum(report.seconds.values()),
+    )
+    atomic_write_text(path, html)
+    return Path(path)
+
+
+def _by_stage(checks: tuple[CheckRow, ...]) -> dict[str, list[CheckRow]]:
+    out: dict[str, list[CheckRow]] = {}
+    for check in checks:
+        out.setdefault(check.stage, []).append(check)
+    return out
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested mappings as (dotted key, value) rows."""
+    rows: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        rows += _flatten(value, f"{name}.") if isinstance(value, Mapping) else [(name, value)]
+    return rows

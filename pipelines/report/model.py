@@ -1,0 +1,211 @@
+"""What a report holds. Everything is already computed: the builder only lays it out."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from smplxpp.core.artifact import Check
+from smplxpp.core.errors import InputError
+
+STATUSES = ("fail", "warn", "pass")  # worst first
+_SIGNATURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """A check as a manifest records it.
+
+    Attributes:
+        value: None where the number was not finite (JSON has none).
+        gate: the gate in words. stage: folder of the stage that made the check.
+    """
+
+    name: str
+    value: float | None
+    unit: str
+    status: str
+    gate: str
+    explanation: str = ""
+    stage: str = ""
+
+    def __post_init__(self) -> None:
+        if self.status not in STATUSES:
+            raise InputError(f"status of {self.name!r}", expected=f"one of {', '.join(STATUSES)}", received=self.status)
+
+    @staticmethod
+    def of(check: Check | Mapping[str, Any], *, stage: str = "") -> CheckRow:
+        """From a `Check`, or from its record in a manifest or in metrics.json."""
+        record = check.as_dict() if isinstance(check, Check) else check
+        missing = [key for key in ("name", "status") if key not in record]
+        if missing:
+            raise InputError("record of a check", expected="a name and a status", received=f"keys {sorted(record)}")
+        value = record.get("value")
+        finite = value is not None and math.isfinite(value)
+        return CheckRow(
+            name=str(record["name"]),
+            value=float(value) if finite else None,
+            unit=str(record.get("unit", "")),
+            status=str(record["status"]),
+            gate=str(record.get("gate", "")),
+            explanation=str(record.get("explanation", "")),
+            stage=str(record.get("stage", stage)),
+        )
+
+    @property
+    def shown(self) -> str:
+        """The value with its unit."""
+        return "not a number" if self.value is None else f"{format_value(self.value)} {self.unit}".strip()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An encoded picture (PNG or JPEG) with its caption; `alt` is read aloud (default: the caption)."""
+
+    caption: str
+    data: bytes
+    alt: str = ""
+
+    @property
+    def uri(self) -> str:
+        """The picture as a data URI."""
+        kind = next((mime for start, mime in _SIGNATURES.items() if self.data.startswith(start)), None)
+        if kind is None:
+            raise InputError(f"picture {self.caption!r}", expected="PNG or JPEG bytes", received=repr(self.data[:4]))
+        return f"data:{kind};base64,{base64.b64encode(self.data).decode()}"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two pictures of one size, laid on each other with a slider between them."""
+
+    caption: str
+    before: Picture
+    after: Picture
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text and numbers; numbers are formatted and right-aligned."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise InputError(
+                    f"table {self.caption!r}", expected=f"{len(self.header)} cells a row", received=str(len(row))
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """A distribution with its gates.
+
+    Attributes:
+        values: any shape; values that are not finite are counted and named, not drawn.
+        gates: (label, value) drawn as dashed lines.
+        upper: end of the axis; the rest is counted in the last bar. Default: the 99.5th percentile, gates included.
+    """
+
+    title: str
+    values: np.ndarray
+    unit: str = "mm"
+    gates: tuple[tuple[str, float], ...] = ()
+    upper: float | None = None
+
+
+@dataclass(frozen=True)
+class KeyNumber:
+    """A number for the head of the report, already formatted."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One stage or topic.
+
+    Attributes:
+        text: paragraphs, plain text.
+        legend: (name, sRGB) pairs for the pictures' colours.
+        checks: the section's checks, shown at its end.
+    """
+
+    title: str
+    text: tuple[str, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    comparisons: tuple[Comparison, ...] = ()
+    tables: tuple[Table, ...] = ()
+    histograms: tuple[Histogram, ...] = ()
+    legend: tuple[tuple[str, tuple[int, int, int]], ...] = ()
+    checks: tuple[CheckRow, ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A whole report.
+
+    Attributes:
+        subject: who or what the run is of. summary: one or two sentences.
+        hero: pictures beside the title.
+        checks: all checks of the run; the verdict counts them.
+        seconds: wall-clock seconds by stage, in order.
+        provenance: title -> {key: value}: configuration, versions, seeds, SHA-256 of the inputs.
+    """
+
+    subject: str
+    summary: str = ""
+    hero: tuple[Picture, ...] = ()
+    key_numbers: tuple[KeyNumber, ...] = ()
+    checks: tuple[CheckRow, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    sections: tuple[Section, ...] = ()
+    provenance: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def count_statuses(checks: Iterable[CheckRow]) -> dict[str, int]:
+    """How many checks fail, warn and pass."""
+    statuses = [check.status for check in checks]
+    return {status: statuses.count(status) for status in STATUSES}
+
+
+def worst_status(checks: Iterable[CheckRow]) -> str:
+    """`fail`, `warn` or `pass`; `pass` for no checks."""
+    present = {check.status for check in checks}
+    return next((status for status in STATUSES if status in present), "pass")
+
+
+def format_value(value: Any) -> str:
+    """A number for readers: three to four significant digits, thousands separated; other values as text."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{int(value):,}"
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if not math.isfinite(value):
+        return "not a number" if math.isnan(value) else ("∞" if value > 0 else "-∞")
+    if value == 0:
+        return "0"
+    size = abs(value)
+    if size < 1e-3 or size >= 1e7:
+        return f"{value:.2e}"
+    if size >= 1000:
+        return f"{value:,.0f}"
+    return (
+        f"{value:.{max(0, 2 - math.floor(math.log10(size)))}f}".rstrip("0").rstrip(".")
+        if size < 100
+        else f"{value:.4g}"
+    )
