@@ -1,0 +1,129 @@
+"""Attributed meshes: subdivide, cut along a level set, fair, push out of a body. What garments are made with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import igl
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags, identity
+from scipy.sparse.linalg import splu
+
+from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.signed_distance import SignedDistanceField
+
+
+@dataclass(frozen=True, eq=False)
+class ClothMesh:
+    """A mesh whose vertices carry skinning weights: (N, 3), (M, 3), (N, J)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        return TriangleMesh(self.vertices, self.faces)
+
+    def with_vertices(self, vertices: np.ndarray) -> ClothMesh:
+        return replace(self, vertices=vertices)
+
+
+def submesh(cloth: ClothMesh, face_mask: np.ndarray) -> ClothMesh:
+    """The selected faces with the vertices that they use."""
+    mesh, used = cloth.mesh.submesh(face_mask)
+    return ClothMesh(mesh.vertices, mesh.faces, cloth.weights[used])
+
+
+def loop_subdivide(cloth: ClothMesh, times: int = 1) -> ClothMesh:
+    """Loop subdivision (1987) of positions and weights alike; borders follow their own curve."""
+    stacked = np.ascontiguousarray(np.hstack([cloth.vertices, cloth.weights]))
+    values, faces = igl.loop(stacked, np.ascontiguousarray(cloth.faces, dtype=np.int64), times)
+    return ClothMesh(values[:, :3], faces, values[:, 3:])
+
+
+def clip(cloth: ClothMesh, level: np.ndarray) -> ClothMesh:
+    """The part where the piecewise linear `level` (N,) is not negative, cut exactly along its zero line."""
+    # A vertex a hair's breadth from the line goes onto its keeping side: slivers would follow otherwise.
+    level = np.where(np.abs(level) < 1e-3 * np.abs(level).max(), 1e-12, level)
+    keep = level >= 0
+    faces = cloth.faces
+    count = keep[faces].sum(axis=1)
+    # Turn each cut face so that its odd corner (the only one kept, or the only one dropped) comes first.
+    cut = faces[(count == 1) | (count == 2)]
+    odd = np.where(keep[cut].sum(axis=1) == 1, np.argmax(keep[cut], axis=1), np.argmin(keep[cut], axis=1))
+    cut = np.take_along_axis(cut, (odd[:, None] + np.arange(3)) % 3, axis=1)
+
+    ends = np.sort(np.concatenate([cut[:, [0, 1]], cut[:, [0, 2]]]), axis=1)
+    edges, crossing = np.unique(ends, axis=0, return_inverse=True)
+    crossing = crossing.reshape(2, -1) + len(level)
+    t = (level[edges[:, 0]] / (level[edges[:, 0]] - level[edges[:, 1]]))[:, None]
+
+    def extended(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, (1 - t) * values[edges[:, 0]] + t * values[edges[:, 1]]])
+
+    a, b, c, p, q = cut[:, 0], cut[:, 1], cut[:, 2], crossing[0], crossing[1]
+    corner = keep[a]
+    new_faces = np.concatenate(
+        [
+            faces[count == 3],
+            np.stack([a, p, q], axis=1)[corner],
+            np.stack([p, b, c], axis=1)[~corner],
+            np.stack([p, c, q], axis=1)[~corner],
+        ]
+    )
+    whole = ClothMesh(extended(cloth.vertices), new_faces, extended(cloth.weights))
+    return submesh(whole, np.ones(len(new_faces), dtype=bool))
+
+
+def fairing_operator(mesh: TriangleMesh) -> csr_matrix:
+    """(N, N) mean of the neighbours; a border vertex has only border neighbours, so that hems stay smooth curves."""
+    n = mesh.vertex_count
+    border = np.zeros(n, dtype=bool)
+    border[mesh.border_edges] = True
+    edges = mesh.edges
+    inner = edges[~border[edges].any(axis=1)]
+    mixed = edges[border[edges].sum(axis=1) == 1]
+    mixed = np.where(border[mixed[:, :1]], mixed[:, ::-1], mixed)  # interior end first
+    rows = np.concatenate([inner[:, 0], inner[:, 1], mixed[:, 0], *mesh.border_edges.T])
+    columns = np.concatenate([inner[:, 1], inner[:, 0], mixed[:, 1], *mesh.border_edges.T[::-1]])
+    adjacency = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    return diags(1.0 / np.maximum(degree, 1)) @ adjacency + diags((degree == 0).astype(float))
+
+
+def smooth(mesh: TriangleMesh, values: np.ndarray, *, steps: int) -> np.ndarray:
+    """`steps` half-way moves of vertex values (N, D) to the mean of their neighbours."""
+    operator = fairing_operator(mesh)
+    for _ in range(steps):
+        values = 0.5 * (values + operator @ values)
+    return values
+
+
+def diffuse(mesh: TriangleMesh, values: np.ndarray, *, radius: float) -> np.ndarray:
+    """Implicit diffusion of vertex values (N, D) over about `radius` metres: `(M + radius^2 L) x = M x0`."""
+    laplacian = -igl.cotmatrix(mesh.vertices, mesh.faces)
+    mass = igl.massmatrix(mesh.vertices, mesh.faces, igl.MASSMATRIX_TYPE_BARYCENTRIC)
+    mass = mass + 1e-12 * identity(mesh.vertex_count)
+    return splu((mass + radius**2 * laplacian).tocsc()).solve(mass @ values)
+
+
+def push_out(
+    mesh: TriangleMesh, inner: TriangleMesh, *, clearance: float, solid: bool, reach: float = 0.04
+) -> np.ndarray:
+    """(N, 3) vertices at least `clearance` metres outside `inner`; the moves are smoothed between rounds.
+
+    `inner` is a body (`solid`) or an open sheet. Vertices deeper than `reach`, or whose closest point is on a border
+    of a sheet, stay: the sign of the distance says nothing there.
+    """
+    field = SignedDistanceField(inner, solid=solid)
+    vertices = mesh.vertices
+    for smoothing in (4, 4, 4, 2, 1, 0):
+        where = field.query(vertices)
+        known = (solid | ~where.on_border) & (where.distance > -reach)
+        missing = np.where(known, np.clip(clearance - where.distance, 0.0, None), 0.0)[:, None]
+        if not missing.any():
+            break
+        spread = np.maximum(smooth(mesh, missing, steps=smoothing), missing)
+        vertices = vertices + spread * normalize_rows(smooth(mesh, where.gradient, steps=smoothing))
+    return vertices

@@ -1,0 +1,112 @@
+"""The fixture person: the open body and her clothes as layers in the T-pose, with authored weights and colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.makers import textures
+from pipelines.makers.anny_base import BaseMesh
+from pipelines.makers.garments import DressForm, make_shirt, make_shoes, make_skirt
+from pipelines.makers.hair import make_hair
+from smplxpp.body import BodyModel, skin
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+
+PART_NAMES = ("body", "upper", "lower", "shoes", "hair")
+LABEL_NAMES = ("background", "skin", "hair", "shoes", "upper", "lower", "other")
+PART_LABELS = np.array([1, 4, 5, 3, 2], dtype=np.uint8)
+_OTHER = LABEL_NAMES.index("other")
+
+# Shape of the person: an adult woman of about average height.
+PERSON_BETAS = np.array([0.35, 1.4, 0.3, 0.6] + [0.0] * 16)
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """All layers as one mesh; the body's vertices come first, in the body model's order.
+
+    Attributes:
+        tpose: V vertices, M faces; parts share no vertices.
+        weights: (V, 55) authored skinning weights.
+        vertex_part, face_part: (V,), (M,) indices into `PART_NAMES`.
+        vertex_label: (V,) indices into `LABEL_NAMES`; eyes, teeth and tongue are "other".
+        betas: (20,) of the body.
+        body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
+        brows, lips: (10, 3), (12, 3) landmarks on the T-pose, for the colours.
+    """
+
+    tpose: TriangleMesh
+    weights: np.ndarray
+    vertex_part: np.ndarray
+    face_part: np.ndarray
+    vertex_label: np.ndarray
+    betas: np.ndarray
+    body: BodyModel
+    brows: np.ndarray
+    lips: np.ndarray
+
+    def posed(self, params: BodyParams) -> np.ndarray:
+        """(T, V, 3): linear blend skinning of every layer by the body's joints."""
+        posed = self.body.forward(params)
+        rest = np.repeat(self.tpose.vertices[None], len(params), axis=0)
+        rest[:, : self.body.vertex_count] = posed.rest_vertices
+        return skin(rest, self.weights, posed.posed_from_rest)
+
+    def colors(self, points: np.ndarray, part: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """(P, 3) uint8 colours of points on the T-pose, with the part and the label of each."""
+        joints = self.body.joint_regressor @ self.tpose.vertices[: self.body.vertex_count]
+        joint = dict(zip(self.body.joint_names, joints, strict=True))
+        out = np.zeros((len(points), 3))
+        left = points[:, 0] > 0
+        eye = np.where(left[:, None], joint["left_eye_smplhf"], joint["right_eye_smplhf"])
+        for k, name in enumerate(PART_NAMES):
+            own = part == k
+            if name == "body":
+                out[own] = textures.skin_colors(points[own], self.brows, self.lips, seed=1)
+                own &= (label == _OTHER) & (np.linalg.norm(points - eye, axis=1) < 0.02)
+                out[own] = textures.eye_colors(points[own] - eye[own], np.zeros(3))
+            elif name == "upper":
+                out[own] = textures.shirt_colors(points[own], joint["left_shoulder"][0] + 0.03)
+            elif name == "lower":
+                out[own] = textures.skirt_colors(points[own], joint["pelvis"][2])
+            elif name == "shoes":
+                out[own] = textures.shoe_colors(points[own], self.tpose.vertices[:, 1].min())
+            else:
+                out[own] = textures.hair_colors(points[own], seed=2)
+        return np.clip(out, 0, 255).astype(np.uint8)
+
+
+def make_person(base: BaseMesh, body: BodyModel, *, landmarks: np.ndarray, seed: int) -> Person:
+    """Dress the body.
+
+    Args:
+        base: the base mesh that the body was made from.
+        body: the open body.
+        landmarks: (51, 3) face landmarks on the body's T-pose at `PERSON_BETAS`.
+        seed: of folds and strands.
+    """
+    form = DressForm.of(base, PERSON_BETAS)
+    skirt = make_skirt(form, seed=seed)
+    shirt = make_shirt(form, under=skirt.mesh, seed=seed + 1)
+    clothes = [shirt, skirt, make_shoes(form), make_hair(form, seed=seed + 2)]
+    rest = body.forward(BodyParams.rest(betas=PERSON_BETAS, expressions=body.num_expressions)).rest_vertices[0]
+    vertices = [rest, *(c.vertices for c in clothes)]
+    offsets = np.cumsum([0] + [len(v) for v in vertices])[:-1]
+    faces = [f + o for f, o in zip([body.faces, *(c.faces for c in clothes)], offsets, strict=True)]
+    vertex_part = np.repeat(np.arange(len(vertices)), [len(v) for v in vertices]).astype(np.uint8)
+    vertex_label = PART_LABELS[vertex_part]
+    inner = np.flatnonzero(body.part_labels != body.part_label_names.index("body"))
+    vertex_label[inner] = _OTHER
+    return Person(
+        tpose=TriangleMesh(np.concatenate(vertices), np.concatenate(faces)),
+        weights=np.concatenate([body.weights, *(c.weights for c in clothes)]),
+        vertex_part=vertex_part,
+        face_part=np.repeat(np.arange(len(faces)), [len(f) for f in faces]).astype(np.uint8),
+        vertex_label=vertex_label,
+        betas=PERSON_BETAS,
+        body=body,
+        brows=landmarks[:10],
+        lips=landmarks[31:43],
+    )
