@@ -1,1 +1,20 @@
-""""""
+"""Assembly of body and parts, and the repair of layers that cut into each other."""
+
+from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
+from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
+from smplxpp.assemble.penetration import PushConfig, push_out, turned_faces
+
+__all__ = [
+    "LAYER_ORDER",
+    "AssemblyConfig",
+    "AssemblyReport",
+    "CanonicalPart",
+    "LayerReport",
+    "Obstacle",
+    "Penetration",
+    "PushConfig",
+    "assemble_template",
+    "measure_penetration",
+    "push_out",
+    "turned_faces",
+]

@@ -47,8 +47,8 @@ class SignedDistanceField:
     overlap, eyes and teeth within the head do not disturb it. Faces that lie within the solid are no part of its
     surface and are left out, so that the gradient leads out of the union.
 
-    An open surface (`solid=False`: a garment) has a front and a back: the sign is that of (p - c) . n with c the closest
-    point and n its pseudonormal, the face's normal, the sum of both normals on an edge, the angle-weighted normal at a
+    An open surface (`solid=False`: a garment) has a front and a back: the sign is that of (p - c) . n with c the
+    closest point and n its pseudonormal, the face's normal, the sum of both normals on an edge, the angle-weighted normal at a
     vertex (Baerentzen and Aanaes, IEEE TVCG 2005). It says nothing where `on_border`.
 
     Zero-area faces are left out.

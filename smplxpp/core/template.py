@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -231,7 +231,7 @@ class Template:
         """
         from smplxpp.body.skinning import skin
 
-        posed = self.body_model.forward(_without_betas(params))
+        posed = self.body_model.forward(replace(params, betas=np.zeros((len(params), 0))))
         count = self.body_vertex_count
         parts = skin(self.vertices[count:], self._dense_weights[count:], posed.posed_from_rest)
         return np.concatenate([posed.vertices, parts], axis=1)
@@ -252,11 +252,6 @@ class Template:
         from smplxpp.core.template_file import load_template
 
         return load_template(path)
-
-
-def _without_betas(params: BodyParams) -> BodyParams:
-    values = {f.name: getattr(params, f.name) for f in fields(params)}
-    return BodyParams(**{**values, "betas": np.zeros((len(params), 0))})
 
 
 def _require(condition: bool, subject: str, expected: str, received: str) -> None:

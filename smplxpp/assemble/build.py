@@ -1,0 +1,265 @@
+"""Assembly: the naked body and the parts in the T-pose become one Template."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from importlib import metadata
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
+from smplxpp.assemble.penetration import PushConfig, push_out, turned_faces
+from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.labels import SKIN
+from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core.params import BodyParams
+from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core.template import BODY_PART, Template
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalPart:
+    """A garment, shoes or hair in the T-pose.
+
+    Attributes:
+        mesh: N vertices, metres.
+        weights: of the N vertices.
+        label: id of `smplxpp.core.labels`.
+        vertex_colors: (N, 3) uint8 sRGB.
+        scan_index: (N,) vertex of the scan that each vertex comes from, -1 for none.
+    """
+
+    mesh: TriangleMesh
+    weights: SkinWeights
+    label: int
+    vertex_colors: np.ndarray
+    scan_index: np.ndarray
+
+
+@dataclass(frozen=True)
+class AssemblyConfig:
+    """Settings of `assemble_template`.
+
+    Attributes:
+        clearance: metres between layers after the repair.
+        push: the other settings of the repair.
+        layer_order: label ids from the skin outwards.
+        skin_color: sRGB of the body's vertices.
+    """
+
+    clearance: float = 1e-3
+    push: PushConfig = field(default_factory=PushConfig)
+    layer_order: tuple[int, ...] = LAYER_ORDER
+    skin_color: tuple[int, int, int] = (205, 170, 150)
+
+
+@dataclass(frozen=True)
+class LayerReport:
+    """What the repair found and did on one part.
+
+    Attributes:
+        before, after: penetration into each inner layer.
+        moved: vertices moved at all. max_push, mean_push: metres, the mean over those moved.
+        turned_faces: faces turned over by the repair.
+    """
+
+    before: tuple[Penetration, ...]
+    after: tuple[Penetration, ...]
+    moved: int
+    max_push: float
+    mean_push: float
+    turned_faces: int
+
+
+@dataclass(frozen=True)
+class AssemblyReport:
+    """Repairs by part, in the order in which they were made."""
+
+    parts: dict[str, LayerReport]
+
+    @property
+    def penetrating_before(self) -> int:
+        """Vertices inside an inner layer before the repair, counted once an inner layer."""
+        return sum(p.vertices for part in self.parts.values() for p in part.before)
+
+    @property
+    def penetrating_after(self) -> int:
+        """Vertices inside an inner layer after it."""
+        return sum(p.vertices for part in self.parts.values() for p in part.after)
+
+    @property
+    def max_push(self) -> float:
+        """The longest way a vertex was pushed, metres."""
+        return max((part.max_push for part in self.parts.values()), default=0.0)
+
+    def as_dict(self) -> dict:
+        """Plain numbers, for JSON; lengths in metres."""
+        totals = ("penetrating_before", "penetrating_after", "max_push")
+        return {name: getattr(self, name) for name in totals} | asdict(self)
+
+
+def assemble_template(
+    body: BodyModel,
+    params: BodyParams,
+    parts: Mapping[str, CanonicalPart],
+    *,
+    config: AssemblyConfig | None = None,
+) -> tuple[Template, AssemblyReport]:
+    """Put the shaped body and its parts together, outer layers pushed out of inner ones.
+
+    Parts are taken from the skin outwards (`config.layer_order`); each is pushed out of the body and of every part
+    further in, as that one lies after its own repair. Vertices that already keep the clearance stay where they are,
+    but for those around a push.
+
+    Args:
+        body: the model; its betas are baked in, its bases stay.
+        params: one frame; only the betas are used.
+        parts: by name, in the T-pose of `body` with these betas.
+        config: clearance and order.
+
+    Returns:
+        The template (body first, then the parts in the mapping's order) and the report of the repair.
+
+    Raises:
+        InputError: more than one frame, a part named "body", unknown label, arrays that do not fit.
+
+    Warns:
+        GeometryWarning: vertices left inside an inner layer, or faces turned over.
+    """
+    config = config or AssemblyConfig()
+    if len(params) != 1:
+        raise InputError("parameters", expected="one frame", received=f"{len(params)}", remedy="choose it with frame()")
+    for name, part in parts.items():
+        _check_part(name, part, body, config)
+    rest = body.forward(BodyParams.rest(betas=params.betas[0], expressions=0)).rest_vertices[0]
+    body_mesh = body.mesh(rest)
+    meshes, report = _separate(body_mesh, parts, config)
+    template = _template(body, params.betas[0], [body_mesh, *(meshes[name] for name in parts)], parts, config)
+    return template, report
+
+
+def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: AssemblyConfig) -> None:
+    count = part.mesh.vertex_count
+    checks = [
+        (name != BODY_PART, "another name than the body's", repr(name)),
+        (part.label in config.layer_order, f"a label of {config.layer_order}", str(part.label)),
+        (part.mesh.face_count > 0, "a mesh with faces", "none"),
+        (len(part.weights) == count, f"weights of {count} vertices", str(len(part.weights))),
+        (part.weights.joint_count == body.joint_count, f"{body.joint_count} joints", str(part.weights.joint_count)),
+        (np.shape(part.vertex_colors) == (count, 3), f"colours ({count}, 3)", str(np.shape(part.vertex_colors))),
+        (np.shape(part.scan_index) == (count,), f"scan indices ({count},)", str(np.shape(part.scan_index))),
+    ]
+    for good, expected, received in checks:
+        if not good:
+            raise InputError(f"part {name!r}", expected=expected, received=received)
+
+
+def _separate(
+    body_mesh: TriangleMesh, parts: Mapping[str, CanonicalPart], config: AssemblyConfig
+) -> tuple[dict[str, TriangleMesh], AssemblyReport]:
+    push = replace(config.push, clearance=config.clearance)
+    obstacles = [Obstacle(BODY_PART, body_mesh, solid=True, max_depth=push.max_depth)]
+    meshes, reports = {}, {}
+    # Parts of one label lie side by side, in the order they came.
+    for label in config.layer_order:
+        layer = [name for name, part in parts.items() if part.label == label]
+        for name in layer:
+            mesh = parts[name].mesh
+            meshes[name], reports[name] = _separate_part(name, mesh, obstacles, push)
+        obstacles += [Obstacle(name, meshes[name], solid=False, max_depth=push.max_depth) for name in layer]
+    return meshes, AssemblyReport(reports)
+
+
+def _separate_part(
+    name: str, mesh: TriangleMesh, obstacles: list[Obstacle], push: PushConfig
+) -> tuple[TriangleMesh, LayerReport]:
+    before = tuple(measure_penetration(mesh, obstacle) for obstacle in obstacles)
+    moved = mesh.with_vertices(push_out(mesh, obstacles, push))
+    after = tuple(measure_penetration(moved, obstacle) for obstacle in obstacles)
+    way = np.linalg.norm(moved.vertices - mesh.vertices, axis=1)
+    # A smoothed displacement never ends: less than a micrometre is none.
+    edited = way[way > 1e-6]
+    report = LayerReport(
+        before=before,
+        after=after,
+        moved=len(edited),
+        max_push=float(way.max(initial=0.0)),
+        mean_push=float(edited.mean()) if len(edited) else 0.0,
+        turned_faces=int(turned_faces(mesh, moved.vertices).sum()),
+    )
+    left = sum(p.vertices for p in after)
+    if left or report.turned_faces:
+        warnings.warn(
+            f"part {name!r}: {left} vertices stay inside an inner layer, {report.turned_faces} faces turned over; "
+            "the fit or the skin weights are far off there",
+            GeometryWarning,
+            stacklevel=4,
+        )
+    return moved, report
+
+
+def _template(
+    body: BodyModel,
+    betas: np.ndarray,
+    meshes: list[TriangleMesh],
+    parts: Mapping[str, CanonicalPart],
+    config: AssemblyConfig,
+) -> Template:
+    whole, count = concatenate_meshes(meshes), body.vertex_count
+    sizes = [mesh.vertex_count for mesh in meshes]
+    labels = [SKIN.id, *(part.label for part in parts.values())]
+    colors = [np.tile(np.array(config.skin_color, np.uint8), (count, 1)), *(p.vertex_colors for p in parts.values())]
+    scan_index = [np.full(count, -1), *(part.scan_index for part in parts.values())]
+    nearest = cKDTree(whole.vertices[:count]).query(whole.vertices[count:])[1]
+    return Template(
+        vertices=whole.vertices,
+        faces=whole.faces,
+        vertex_labels=np.repeat(labels, sizes),
+        vertex_part=np.repeat(np.arange(len(sizes)), sizes),
+        part_names=(BODY_PART, *parts),
+        vertex_colors=np.concatenate(colors),
+        weights=_stack([SkinWeights.from_dense(body.weights), *(part.weights for part in parts.values())]),
+        joint_regressor=body.joint_regressor,
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=betas,
+        shape_basis=body.shapedirs,
+        expression_basis=body.exprdirs,
+        pose_basis=body.posedirs,
+        left_hand_components=body.left_hand_components,
+        right_hand_components=body.right_hand_components,
+        left_hand_mean=body.left_hand_mean,
+        right_hand_mean=body.right_hand_mean,
+        body_labels=body.part_labels,
+        body_label_names=body.part_label_names,
+        body_index=np.concatenate([np.arange(count), nearest]),
+        scan_index=np.concatenate(scan_index),
+        metadata={"body": body.name, "smplxpp": metadata.version("smplxpp")},
+    )
+
+
+def _stack(weights: list[SkinWeights]) -> SkinWeights:
+    """All vertices in one; slots padded with joint 0 at weight 0, components numbered on."""
+    width = max(w.joint_indices.shape[1] for w in weights)
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.pad(values, ((0, 0), (0, width - values.shape[1])))
+
+    merged = {name: np.concatenate([getattr(w, name) for w in weights]) for name in ("matched", "distance", "angle")}
+    start = np.cumsum([0] + [_components(w) for w in weights])
+    return SkinWeights(
+        joint_indices=np.concatenate([padded(w.joint_indices) for w in weights]),
+        joint_weights=np.concatenate([padded(w.joint_weights) for w in weights]),
+        joint_count=weights[0].joint_count,
+        component=np.concatenate([w.component + s for w, s in zip(weights, start, strict=False)]).astype(np.int32),
+        policies=tuple(policy for w in weights for policy in (w.policies or ("given",) * _components(w))),
+        **merged,
+    )
+
+
+def _components(weights: SkinWeights) -> int:
+    return int(weights.component.max(initial=-1)) + 1

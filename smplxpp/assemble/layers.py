@@ -1,0 +1,83 @@
+"""Layers of a clothed person: who lies outside whom, and where an outer layer cuts into an inner one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.labels import HAIR, LOWER, OUTER, SHOE, UPPER
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import SignedDistance, SignedDistanceField
+
+# From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything.
+LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
+
+
+class Obstacle:
+    """An inner layer that outer ones must stay out of.
+
+    Args:
+        name: of the part.
+        mesh: its surface, outward.
+        solid: a body, with an inside; otherwise a garment, an open surface with a back.
+        max_depth: metres behind a garment up to which a point counts as having come through it; further away it
+            belongs somewhere else (the other leg, the far side of the torso).
+    """
+
+    def __init__(self, name: str, mesh: TriangleMesh, *, solid: bool, max_depth: float) -> None:
+        self.name = name
+        self._solid, self._max_depth = solid, max_depth
+        self._field = SignedDistanceField(mesh, solid=solid)
+
+    def distance(self, points: np.ndarray, normals: np.ndarray) -> SignedDistance:
+        """Signed distance of (N, 3) points with (N, 3) outward unit normals.
+
+        The answer is infinite where the question has none: beside a garment's border, further behind it than
+        `max_depth`, and where the two surfaces face different ways.
+        """
+        found = self._field.query(points)
+        if not self._solid:
+            facing = np.einsum("ij,ij->i", found.normal, normals) > 0
+            meaningful = facing & ~found.on_border & (found.distance > -self._max_depth)
+            found.distance[~meaningful] = np.inf
+        return found
+
+    def lower_bound(self, points: np.ndarray) -> np.ndarray:
+        """(N,) metres: a point that moves less than this above zero cannot come inside; infinite far behind a garment.
+
+        Unlike `distance` it answers beside borders too, where a small move may give the question an answer.
+        """
+        bound = self._field.query(points).distance
+        return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """Points of an outer layer inside an inner one.
+
+    Attributes:
+        inner: name of the inner layer.
+        vertices: vertices strictly inside. face_centers: centres of faces strictly inside.
+        depth_mean, depth_max: of those vertices, metres; 0 if none.
+    """
+
+    inner: str
+    vertices: int
+    face_centers: int
+    depth_mean: float
+    depth_max: float
+
+
+def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
+    """Count and depth of an outer layer's vertices and face centres inside an inner layer."""
+    distance = obstacle.distance(mesh.vertices, mesh.vertex_normals).distance
+    centers = obstacle.distance(mesh.triangles.mean(axis=1), mesh.face_normals).distance
+    depth = -distance[distance < 0]
+    return Penetration(
+        inner=obstacle.name,
+        vertices=len(depth),
+        face_centers=int((centers < 0).sum()),
+        depth_mean=float(depth.mean()) if len(depth) else 0.0,
+        depth_max=float(depth.max(initial=0.0)),
+    )

@@ -1,0 +1,158 @@
+"""Pushing an outer layer out of the inner ones: smoothly, and no further than needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags
+
+from smplxpp.assemble.layers import Obstacle
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class PushConfig:
+    """How `push_out` moves a layer.
+
+    Attributes:
+        clearance: metres that every vertex keeps from the inner layers.
+        damping: share of a displacement lost at each ring of vertices around a push; the smaller, the wider and
+            gentler the bulge.
+        iterations: smoothing steps.
+        max_depth: see `Obstacle`.
+    """
+
+    clearance: float = 1e-3
+    damping: float = 0.25
+    iterations: int = 20
+    max_depth: float = 0.03
+
+    def __post_init__(self) -> None:
+        good = 1e-5 <= self.clearance < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0 < self.max_depth
+        if not good:
+            raise InputError(
+                "push configuration",
+                expected="clearance >= 1e-5, damping in [0, 1], iterations >= 0, max_depth > 0",
+                received=str(self),
+            )
+
+
+# Projections alone, after the smoothing, until nothing is left inside.
+_FINAL_PROJECTIONS = 30
+# Rounds of smoothing around faces that a push has turned over, and steps in each.
+_UNFLIP_ROUNDS, _UNFLIP_STEPS = 12, 4
+# A push must not lead to the far side of a limb: the way out and the vertex's own outside make less than this angle.
+_FACING_COSINE = -0.2
+# Centres of faces keep this share of the clearance: a chord runs below its arc.
+_CENTER_SHARE = 0.5
+# Metres nearer than the clearance that need no push.
+_TOLERANCE = 1e-7
+
+
+def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None) -> np.ndarray:
+    """New vertex positions of an outer layer, out of all obstacles.
+
+    Solves an obstacle problem by projected Jacobi steps: the displacement d of each vertex goes to
+    (1 - damping) x the mean of its neighbours', then every vertex that is nearer to an obstacle than the clearance
+    moves there along the gradient of the signed distance. So vertices away from any contact keep their place, and those
+    around one follow it without a spike. Centres of faces must not be inside either; their push goes to the corners.
+
+    Args:
+        mesh: N vertices, metres.
+        obstacles: the inner layers.
+        config: clearance and smoothness.
+
+    Returns:
+        (N, 3) float64; the input where nothing is too near.
+    """
+    config = config or PushConfig()
+    walls = [_Wall(obstacle, mesh, config.clearance) for obstacle in obstacles]
+    mean = _neighbour_mean(mesh)
+    d = _project(mesh, np.zeros_like(mesh.vertices), walls, facing_only=True)
+    for _ in range(config.iterations):
+        d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls, facing_only=True)
+    d = _clear(mesh, d, walls)
+    for _ in range(_UNFLIP_ROUNDS):
+        turned = turned_faces(mesh, mesh.vertices + d)
+        if not turned.any():
+            break
+        # Two rings around the faces that turned over share their displacement, then all go out again.
+        near = np.zeros(mesh.vertex_count)
+        near[mesh.faces[turned]] = 1.0
+        near = ((mean != 0) @ ((mean != 0) @ near) + near) > 0
+        for _ in range(_UNFLIP_STEPS):
+            d = np.where(near[:, None], mean @ d, d)
+        d = _clear(mesh, d, walls)
+    return mesh.vertices + d
+
+
+def turned_faces(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
+    """(M,) bool, faces whose normal has turned by more than 90 degrees on the new (N, 3) vertices."""
+    return np.einsum("ij,ij->i", mesh.face_cross, mesh.with_vertices(vertices).face_cross) < 0
+
+
+class _Wall:
+    """One obstacle as seen from one layer: signed distance where the layer began bounds it where it is now."""
+
+    def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
+        self.obstacle, self.clearance = obstacle, clearance
+        self._vertex_start = obstacle.lower_bound(mesh.vertices)
+        self._center_start = obstacle.lower_bound(mesh.triangles.mean(axis=1))
+
+    def vertex_push(self, mesh: TriangleMesh, d: np.ndarray, facing_only: bool) -> np.ndarray:
+        """(N, 3) that brings every vertex to the clearance."""
+        return self._push(mesh.vertices + d, mesh.vertex_normals, d, self._vertex_start, self.clearance, facing_only)
+
+    def center_push(self, mesh: TriangleMesh, d: np.ndarray, facing_only: bool) -> np.ndarray:
+        """(M, 3) that brings the centre of every face clear of the surface."""
+        moved = d[mesh.faces].mean(axis=1)
+        centers = mesh.triangles.mean(axis=1) + moved
+        return self._push(
+            centers, mesh.face_normals, moved, self._center_start, _CENTER_SHARE * self.clearance, facing_only
+        )
+
+    def _push(self, points, normals, moved, start, clearance, facing_only):
+        # A signed distance changes by no more than the way travelled: the rest need not be asked again.
+        ask = np.flatnonzero(start - np.linalg.norm(moved, axis=1) < clearance)
+        found = self.obstacle.distance(points[ask], normals[ask])
+        missing = clearance - found.distance
+        near = missing > _TOLERANCE
+        if facing_only:
+            near &= np.einsum("ij,ij->i", found.gradient, normals[ask]) > _FACING_COSINE
+        push = np.zeros_like(points)
+        push[ask[near]] = missing[near, None] * found.gradient[near]
+        return push
+
+
+def _project(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing_only: bool) -> np.ndarray:
+    for wall in walls:
+        d = d + wall.vertex_push(mesh, d, facing_only)
+        face_push = wall.center_push(mesh, d, facing_only)
+        pushed = (face_push != 0).any(axis=1)
+        corners = mesh.faces[pushed].ravel()
+        count = np.bincount(corners, minlength=len(d))
+        for axis in range(3):
+            total = np.bincount(corners, np.repeat(face_push[pushed, axis], 3), minlength=len(d))
+            d[:, axis] += total / np.maximum(count, 1)
+    return d
+
+
+def _clear(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall]) -> np.ndarray:
+    for _ in range(_FINAL_PROJECTIONS):
+        moved = _project(mesh, d, walls, facing_only=False)
+        if np.array_equal(moved, d):
+            break
+        d = moved
+    return d
+
+
+def _neighbour_mean(mesh: TriangleMesh) -> csr_matrix:
+    """(N, N) rows average a vertex's neighbours; zero rows where there are none."""
+    edges = mesh.edges
+    ones = np.ones(2 * len(edges))
+    pairs = np.concatenate([edges, edges[:, ::-1]])
+    adjacency = coo_matrix((ones, pairs.T), shape=(mesh.vertex_count,) * 2).tocsr()
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    return diags(1.0 / np.maximum(degree, 1)) @ adjacency
