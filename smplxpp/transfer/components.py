@@ -12,12 +12,12 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.config import TransferConfig
 
 
-def vertex_components(mesh: TriangleMesh) -> tuple[np.ndarray, int]:
-    """(N,) int32 component of every vertex, numbered by their lowest vertex, and their number."""
+def vertex_components(mesh: TriangleMesh) -> np.ndarray:
+    """(N,) int32 component of every vertex, numbered from 0."""
     n, e = mesh.vertex_count, mesh.edges
     graph = sp.coo_matrix((np.ones(len(e), dtype=np.int8), (e[:, 0], e[:, 1])), shape=(n, n))
-    count, labels = sp.csgraph.connected_components(graph, directed=False)
-    return labels.astype(np.int32), int(count)
+    _, labels = sp.csgraph.connected_components(graph, directed=False)
+    return labels.astype(np.int32)
 
 
 def settle_unmatched(
@@ -31,7 +31,7 @@ def settle_unmatched(
     Args:
         component: (N,) ids 0..P-1.
         matched: (N,) bool.
-        weights: (N, J) of the closest source points.
+        weights: (N, J) what each vertex would take by itself.
 
     Returns:
         (N,) bool rows settled here, (N, J) weights with those rows set, (P,) the policy of each component.
@@ -43,8 +43,8 @@ def settle_unmatched(
     lost = np.bincount(component, matched, minlength=count) == 0
     policies = tuple(np.where(lost, config.unmatched, "matched").tolist())
     rows = lost[component]
-    if not rows.any():
-        return rows, weights, policies
+    if not rows.any() or config.unmatched == "extend":
+        return np.zeros_like(rows), weights, policies
     message = f"{int(lost.sum())} of {count} components ({int(rows.sum())} of {len(rows)} vertices) have no match"
     if config.unmatched == "raise":
         raise InputError(

@@ -2,52 +2,97 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from smplxpp.core.errors import InputError
+from smplxpp.transfer.regions import JOINTS_OF_LABEL, SMPLX_JOINTS
 
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """Settings of `transfer_weights`; every length is a fraction of a bounding box's diagonal, so units do not matter.
+    """Settings of `transfer_weights`; every length is a fraction of a box's diagonal, so units do not matter.
+
+    The default goes beyond the published method in three ways, each of which None or 0 turns off: `falloff`,
+    `smoothing`, and (through `for_label`) `allowed_joints`. `TransferConfig.paper()` is the published method.
 
     Attributes:
-        max_distance: a vertex is matched within this fraction of the target's bounding-box diagonal.
-        max_angle_deg: ... and if the normals differ by at most this.
-        length_scale: `l` of the inpainting energy, as a fraction of the source's bounding-box diagonal.
-        laplacian: "cotangent" as given; "intrinsic" mollified and Delaunay; "auto" the latter where a face is bad.
-        max_influences: joints kept at a vertex; None keeps all.
-        unmatched: what a connected component without any match gets: "nearest" the closest source point's weights,
-            "rigid:JOINT" (name or index) one joint, "raise" an error.
+        falloff: p of the extension of the source's weights into free space (`extend_weights`); None copies the closest
+            point's weights whatever the distance.
+        smoothing: how strongly a vertex is believed: weights are smoothed over this multiple of its distance to the
+            source. None believes matched vertices wholly and the others not at all.
+        normal_doubt: how many times wider still where the normals are perpendicular (twice as many where opposite).
         allowed_joints: names or indices of the joints that the target may follow; None allows all. The source is
             restricted to the faces that these joints own.
-        smoothing_steps: Jacobi averaging steps over unmatched vertices after inpainting.
-        smoothing_rate: how far a step goes towards the neighbours' mean.
-        joint_names: names for `allowed_joints`, `unmatched` and messages; indices are used without.
+        unmatched: what a connected component without any match gets: "extend" the extension like all others,
+            "nearest" the closest source point's weights, "rigid:JOINT" (name or index) one joint, "raise" an error.
+        max_distance: a vertex is matched within this fraction of the target's bounding-box diagonal.
+        max_angle_deg: ... and if the normals differ by at most this.
+        length_scale: `l` of the energy, as a fraction of the source's bounding-box diagonal.
+        laplacian: "cotangent" as given; "intrinsic" mollified and Delaunay; "auto" the latter where a face is bad.
+        max_influences: joints kept at a vertex; None keeps all.
+        averaging_steps: Jacobi averaging over unmatched vertices at the end (rate 0.2).
+        joint_names: names for `allowed_joints`, `unmatched` and messages.
     """
 
+    falloff: float | None = 6.0
+    smoothing: float | None = 0.4
+    normal_doubt: float = 2.0
+    allowed_joints: tuple[str | int, ...] | None = None
+    unmatched: str = "extend"
     max_distance: float = 0.05
     max_angle_deg: float = 30.0
     length_scale: float = 0.4
     laplacian: Literal["auto", "cotangent", "intrinsic"] = "auto"
     max_influences: int | None = 8
-    unmatched: str = "nearest"
-    allowed_joints: tuple[str | int, ...] | None = None
-    smoothing_steps: int = 0
-    smoothing_rate: float = 0.2
-    joint_names: tuple[str, ...] | None = None
+    averaging_steps: int = 0
+    joint_names: tuple[str, ...] = SMPLX_JOINTS
 
     def __post_init__(self) -> None:
-        for name in ("max_distance", "max_angle_deg", "length_scale"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"config {name}", expected="a positive number", received=str(getattr(self, name)))
+        for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"config {name}", expected="a positive number", received=str(value))
+        if self.falloff is not None and not self.falloff > 2:
+            raise InputError("config falloff", expected="more than 2, or None", received=str(self.falloff))
+        for name in ("normal_doubt", "averaging_steps"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"config {name}", expected="zero or more", received=str(getattr(self, name)))
         if self.max_influences is not None and self.max_influences < 1:
             raise InputError("config max_influences", expected="at least 1, or None", received=str(self.max_influences))
-        if self.unmatched not in ("nearest", "raise") and not self.unmatched.startswith("rigid:"):
+        if self.laplacian not in ("auto", "cotangent", "intrinsic"):
+            raise InputError("config laplacian", expected="auto, cotangent or intrinsic", received=repr(self.laplacian))
+        if self.unmatched not in ("extend", "nearest", "raise") and not self.unmatched.startswith("rigid:"):
             raise InputError(
-                "config unmatched", expected='"nearest", "raise" or "rigid:JOINT"', received=repr(self.unmatched)
+                "config unmatched", expected="extend, nearest, raise or rigid:JOINT", received=repr(self.unmatched)
             )
+        if self.unmatched == "extend" and (self.falloff is None or self.smoothing is None):
+            raise InputError(
+                "config unmatched",
+                expected="nearest, raise or rigid:JOINT where falloff or smoothing is None",
+                received="extend",
+            )
+
+    @staticmethod
+    def paper() -> TransferConfig:
+        """Robust skin weight transfer as published: matched vertices copied, the others inpainted.
+
+        Components that nothing matches (for which the publication says nothing) copy the closest point.
+        """
+        return TransferConfig(falloff=None, smoothing=None, normal_doubt=0.0, unmatched="nearest")
+
+    @staticmethod
+    def for_label(name: str, *, base: TransferConfig | None = None) -> TransferConfig:
+        """Settings for a part of one of `smplxpp.core.labels`: `base` with the joints that such a part can follow.
+
+        Only what is impossible is left out (`regions.JOINTS_OF_LABEL`): hair does not follow the jaw, arms and legs,
+        lower clothes not the arms, upper clothes not head, fingers and shins. A label that is not listed (skin) is not
+        restricted.
+        """
+        base = base or TransferConfig()
+        return replace(base, allowed_joints=JOINTS_OF_LABEL.get(name))
 
     def joint_index(self, joint: str | int, joint_count: int) -> int:
         """Index of a joint given by name or number.
@@ -55,13 +100,23 @@ class TransferConfig:
         Raises:
             InputError: no such joint.
         """
-        names = self.joint_names or ()
-        index = names.index(joint) if joint in names else int(joint) if str(joint).isdigit() else -1
+        if joint in self.joint_names:
+            index = self.joint_names.index(joint)
+        else:
+            index = int(joint) if str(joint).isdigit() else -1
         if not 0 <= index < joint_count:
             raise InputError(
                 f"joint {joint!r}",
-                expected=f"an index below {joint_count}" + (f" or one of {', '.join(names)}" if names else ""),
+                expected=f"an index below {joint_count}, or a name of joint_names that lies there",
                 received=repr(joint),
-                remedy="" if names else "give TransferConfig(joint_names=...) to use names",
+                remedy="give TransferConfig(joint_names=...) of the body model",
             )
         return index
+
+    def allowed_mask(self, joint_count: int) -> np.ndarray | None:
+        """(J,) bool, or None where all joints are allowed."""
+        if self.allowed_joints is None:
+            return None
+        mask = np.zeros(joint_count, dtype=bool)
+        mask[[self.joint_index(joint, joint_count) for joint in self.allowed_joints]] = True
+        return mask

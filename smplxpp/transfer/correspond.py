@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
 import scipy.sparse as sp
 
+from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
 
 
@@ -42,8 +44,8 @@ class Correspondence:
 def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence:
     """Closest point of `source` for every vertex of `target`, in float64.
 
-    Normals are weighted by angle on both meshes and interpolated on the source. Where several source points are as close,
-    as at the coincident borders of two layers, the first that the tree finds is taken.
+    Normals are weighted by angle on both meshes and interpolated on the source. Of several points
+    as close as each other (borders of two layers that coincide) the first that the tree finds is taken.
     """
     points = np.ascontiguousarray(target.vertices)
     squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces)
@@ -56,6 +58,34 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
     missing = ~(ours.any(axis=1) & theirs.any(axis=1))
     angle[missing] = np.nan
     return Correspondence(face, barycentric, np.sqrt(squared), angle)
+
+
+def face_outward(
+    found: Correspondence, target: TriangleMesh, component: np.ndarray, *, max_distance: float
+) -> tuple[Correspondence, np.ndarray]:
+    """Turn the normals of components that are inside out: most of their near vertices face against the source.
+
+    Args:
+        component: (N,) ids. max_distance: metres, which vertices are near.
+
+    Returns:
+        The correspondence with the angles turned, and (N, 3) the target's normals, turned alike.
+    """
+    near = found.distance <= max_distance
+    against = near & (found.angle > np.pi / 2)
+    count = int(component.max(initial=-1)) + 1
+    outward = np.bincount(component, near & (found.angle <= np.pi / 2), minlength=count)
+    turned = (np.bincount(component, against, minlength=count) > 2 * outward)[component]
+    if not turned.any():
+        return found, target.vertex_normals
+    warnings.warn(
+        f"target mesh: {int(turned.sum())} of {len(turned)} vertices lie in components that are inside out; "
+        "their normals are turned for matching",
+        GeometryWarning,
+        stacklevel=3,
+    )
+    angle = np.where(turned, np.pi - found.angle, found.angle)
+    return replace(found, angle=angle), np.where(turned[:, None], -1.0, 1.0) * target.vertex_normals
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -10,9 +10,19 @@ import numpy as np
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 
+_LARGEST, _SMALLEST = 3.0, 0.02  # a target's size against the source's
+_DOUBTFUL, _FARTHEST = 0.05, 0.25  # median distance of a target's vertices, against the source's size
+_AXES = (
+    ("+Z up", [0, 2, 1], (1, 1, -1)),
+    ("-Z up", [0, 2, 1], (1, -1, 1)),
+    ("+X up", [1, 0, 2], (-1, 1, 1)),
+    ("-X up", [1, 0, 2], (1, -1, 1)),
+    ("-Y up", [0, 1, 2], (-1, -1, 1)),
+)
+
 
 def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
-    """Checked (V, J) float64 weights, rows summing to exactly 1.
+    """Checked (V, J) float64 weights, rows summing to 1 (zero where no face uses the vertex).
 
     Raises:
         InputError: no faces; wrong shape; NaN; negative; a row that does not sum to 1 within 1e-4.
@@ -50,62 +60,54 @@ def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
     return out
 
 
-def check_placement(source: TriangleMesh, target: TriangleMesh, nearest: np.ndarray) -> None:
+def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.ndarray) -> None:
     """Refuse a target that plainly does not lie on the source: other units, other axes, another place.
 
     Args:
-        nearest: (N,) distance of each target vertex to the source.
+        distance: (N,) of each target vertex to the source.
 
     Raises:
         InputError: names the likely cause.
     """
     if not target.face_count:
         raise InputError("target mesh", expected="at least one face", received="none")
-    size = source.bbox_diagonal
-    ratio = target.bbox_diagonal / size
-    far = float(np.median(nearest)) / size
-    if ratio <= 3.0 and far <= 0.25:
-        return
-    low, high = (np.round(f(target.vertices[np.unique(target.faces)], axis=0), 3) for f in (np.min, np.max))
-    received = f"a target of box {low} to {high}, {ratio:.3g} times the source's size, median distance {far:.3g} of it"
-    factor = next((f for f in (1000.0, 100.0, 10.0) if ratio / f < 1.5 and ratio / f > 0.02), None)
-    if ratio > 3.0:
-        remedy = (
-            f"the units seem to differ: divide the target's coordinates by {factor:.0f}"
-            if factor
-            else "check the units"
-        )
-    else:
-        remedy = (
-            "check units, axes (+Y up) and translation of both meshes"
-            if not _fits_after_axis_swap(source, target)
-            else "the axes seem to differ (for example +Z up): rotate the target so that +Y is up"
-        )
-    raise InputError("target mesh placement", expected="a part worn by the source", received=received, remedy=remedy)
-
-
-def _fits_after_axis_swap(source: TriangleMesh, target: TriangleMesh) -> bool:
-    """Whether the target's box lies in the source's after some signed permutation that is not the identity."""
-    body = source.vertices[np.unique(source.faces)]
-    low, high = body.min(axis=0), body.max(axis=0)
-    pad = 0.1 * float(np.linalg.norm(high - low))
     points = target.vertices[np.unique(target.faces)]
-    for axes, sign in (
-        ((0, 2, 1), (1, 1, -1)),
-        ((0, 2, 1), (1, -1, 1)),
-        ((1, 0, 2), (1, -1, 1)),
-        ((1, 0, 2), (-1, 1, 1)),
-    ):
-        turned = points[:, axes] * sign
-        if (turned.min(axis=0) >= low - pad).all() and (turned.max(axis=0) <= high + pad).all():
-            return True
-    return False
+    ratio = target.bbox_diagonal / source.bbox_diagonal
+    far = float(np.median(distance)) / source.bbox_diagonal
+    remedy = ""
+    if ratio > _LARGEST or ratio < _SMALLEST:
+        # Parts are a tenth of the body to all of it: the power of ten that brings the ratio there.
+        power = int(np.floor(np.log10(ratio))) if ratio > 1 else int(np.floor(np.log10(ratio))) + 1
+        remedy = f"the units differ: multiply the target's coordinates by {10.0**-power:g}"
+    elif far > _DOUBTFUL:
+        remedy = _axes_remedy(source, points, 0.5 * float(np.median(distance)))
+        if not remedy and far > _FARTHEST:
+            remedy = "check units, axes (+Y up) and translation of both meshes"
+    if remedy:
+        low, high = (np.array2string(f(points, axis=0), precision=3) for f in (np.min, np.max))
+        raise InputError(
+            "target mesh placement",
+            expected="a part worn by the source, in its pose, unit and axes",
+            received=f"box {low} to {high}, {ratio:.2g} of the source's size, {far:.2g} of it away (median)",
+            remedy=remedy,
+        )
+
+
+def _axes_remedy(source: TriangleMesh, points: np.ndarray, better: float) -> str:
+    """What to do about the axes if some other choice brings the points nearer than `better` (median), else ""."""
+    sample = points[:: max(1, len(points) // 500)]
+    for name, axes, sign in _AXES:
+        turned = np.ascontiguousarray(sample[:, axes] * sign)
+        squared, _, _ = igl.point_mesh_squared_distance(turned, source.vertices, source.faces)
+        if np.sqrt(np.median(squared)) < better:
+            return f"the axes differ: the target seems to have {name}; both need +Y up"
+    return ""
 
 
 def consistent_winding(mesh: TriangleMesh, *, subject: str) -> TriangleMesh:
-    """The mesh with neighbouring faces wound alike; warns with the number of faces turned, keeps the majority's side.
+    """The mesh with neighbouring faces wound alike; warns with the number of faces turned (the fewer).
 
-    Two faces agree when they run along their common edge in opposite directions. Edges of three or more faces say nothing.
+    Two faces agree when they run along their common edge in opposite directions.
     """
     f = mesh.faces
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
