@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.arrays import load_arrays
-from pipelines.build_config import BuildConfig, BuildInputs
+from pipelines.build_config import STAGES, BuildConfig, BuildInputs
 from pipelines.pictures import (
     blend_joint_colors,
     body_cameras,
@@ -44,8 +44,9 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     scan, colors, _ = load_scan(run)
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
+    early = tuple(c for c in checks if c.stage in ("00_capture", "10_register", "20_segment"))
     sections = (
-        _scan_section(run, scan, colors, cameras, by_stage["00_capture"] + by_stage["10_register"] + by_stage["20_segment"]),
+        _scan_section(run, scan, colors, cameras, early),
         _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
         _weights_section(run, records["40_transfer"], cameras, by_stage["40_transfer"]),
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
@@ -65,6 +66,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber("scan to template", f"{sum(seconds.values()):.1f} s", "all stages, validation included"),
     ]
+    inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
     front = body_cameras(posed, views=("front",), height=HEIGHT)[0]
     report = Report(
         subject=inputs.subject,
@@ -78,7 +80,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         provenance={
             "configuration": jsonable(config),
             "versions": versions(),
-            "inputs (SHA-256)": {k: v for r in records.values() for k, v in r.manifest["inputs"].items() if "_" not in k[:3]},
+            "inputs (SHA-256)": {k: v for k, v in inputs_of.items() if not k.startswith(STAGES)},
             "seed": {"samples": config.seed},
         },
     )  # fmt: skip
@@ -100,8 +102,8 @@ def _scan_section(run: Path, scan: TriangleMesh, colors: np.ndarray, cameras: li
     return Section(
         title="Scan and labels",
         text=(
-            "The scan in metres, +Y up, as it enters. Every face takes the label that a graph cut finds cheapest: given "
-            "labels or votes of views, smoothed so that seams settle in folds.",
+            "The scan in metres, +Y up, as it enters. Every face takes the label that a graph cut finds cheapest: "
+            "labels given or votes of views, smoothed so that seams settle in folds.",
         ),
         pictures=(
             Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
@@ -182,8 +184,14 @@ def _template_section(template: Template, checks: tuple) -> Section:
 
 
 def _fidelity_section(
-    run: Path, template: Template, posed: TriangleMesh, scan: TriangleMesh, colors: np.ndarray, cameras: list, checks: tuple
-) -> Section:  # fmt: skip
+    run: Path,
+    template: Template,
+    posed: TriangleMesh,
+    scan: TriangleMesh,
+    colors: np.ndarray,
+    cameras: list,
+    checks: tuple,
+) -> Section:
     distance = point_to_surface(posed.vertices, scan)[0] * MM
     errors = load_arrays(run / "65_validate" / "errors.npz")
     histograms = []

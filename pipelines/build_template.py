@@ -18,7 +18,6 @@ from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
 METRICS_SCHEMA = 1
-OPEN_BODY = Path(str(resources.files("smplxpp"))) / "data" / "open_body.npz"
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,10 @@ def build(
             records[name] = require_stage(run, name)
             continue
         progress(name, False)
-        settings = {key: getattr(config, key) for key in stage.settings}
-        digests = {
-            key: digest for key in stage.files for key, digest in _file_digests(key, getattr(inputs, key)).items()
-        }
+        settings = {key: getattr(config if hasattr(config, key) else inputs, key) for key in stage.settings}
+        digests: dict[str, str] = {}
+        for key in stage.files:
+            digests |= _file_digests(key, getattr(inputs, key))
         for other in stage.needs:
             digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
         records[name] = run_stage(run, name, stage.work, config=settings, inputs=digests, seed=config.seed)
@@ -136,7 +135,10 @@ def _check_inputs(inputs: BuildInputs) -> None:
 def _file_digests(name: str, value: Any) -> dict[str, str]:
     """SHA-256 of an input file, of each file of a folder, or of each of several files; the open body for no body."""
     if value is None:
-        return {name: sha256_file(OPEN_BODY)} if name == "body" else {}
+        if name != "body":
+            return {}
+        with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as embedded:
+            return {name: sha256_file(embedded)}
     if isinstance(value, dict):
         return {f"{name}/{key}": sha256_file(path) for key, path in sorted(value.items())}
     path = Path(value)

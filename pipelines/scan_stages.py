@@ -19,7 +19,7 @@ from smplxpp.core.mesh_io import read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.metrics import mesh_quality, point_to_surface
-from smplxpp.segment import read_label_map, read_labels, segment_scan, vote
+from smplxpp.segment import read_label_map, read_labels, segment_scan, vote_on_faces
 
 MM = 1e3
 GREY = 180

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def transfer(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
             "report": report.as_dict(),
         }
         checks += [
-            Check(f"{name}: rows off partition of unity", report.row_sum_error_max, "", 1e-12, 1e-9),
+            Check(f"{name}: rows off partition of unity", report.row_sum_error, "", 1e-12, 1e-9),
             Check(f"{name}: negative weights and silent zero rows", report.negative + report.zero_rows, "", 0, 0),
         ]
     save_arrays(folder / "weights.npz", groups)
@@ -86,8 +87,8 @@ def transfer(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
 
 def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> TransferConfig:
     """What a part of this label may follow, by the build's method."""
-    common = {"joint_names": body.joint_names, "max_influences": config.max_influences}
-    return TransferConfig.paper(**common) if config.method == "paper" else TransferConfig.for_label(label, **common)
+    base = TransferConfig.paper() if config.method == "paper" else TransferConfig.for_label(label)
+    return replace(base, joint_names=body.joint_names, max_influences=config.max_influences)
 
 
 def unpose_parts(folder: Path, run: Path, inputs: BuildInputs) -> StageOutput:

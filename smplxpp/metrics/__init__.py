@@ -9,6 +9,7 @@ from smplxpp.metrics.distance import (
     compare,
     directed_distances,
     point_to_surface,
+    summarize,
 )
 from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
 from smplxpp.metrics.quality import MeshQuality, mesh_quality
@@ -41,6 +42,7 @@ __all__ = [
     "self_intersections",
     "signed_distance",
     "stretch_report",
+    "summarize",
     "total_variation",
     "weight_report",
 ]
