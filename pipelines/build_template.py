@@ -97,7 +97,7 @@ def _stages(run: Path, inputs: BuildInputs, config: BuildConfig) -> dict[str, _S
         ),
         "60_assemble": _Stage(
             lambda f: template.assemble(f, run, inputs, config),
-            (*geometry, "40_transfer", "50_unpose"), ("clearance_mm",), ("body",),
+            (*geometry, "20_segment", "40_transfer", "50_unpose"), ("clearance_mm",), ("body",),
         ),
         "65_validate": _Stage(
             lambda f: validate_stage.validate(f, run, inputs, config),

@@ -10,14 +10,15 @@ import numpy as np
 from pipelines.arrays import load_arrays, save_arrays
 from pipelines.build_config import BuildConfig, BuildInputs
 from pipelines.pictures.colors import blend_joint_colors
-from pipelines.scan_stages import MM, load_params_of_run
-from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template
+from pipelines.scan_stages import MM, load_params_of_run, load_scan
+from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template, body_colors_from_scan
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.artifact import Check, StageOutput
-from smplxpp.core.labels import LABELS
+from smplxpp.core.labels import LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core.template import Template
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.transfer import TransferConfig, transfer_weights
@@ -127,6 +128,7 @@ def assemble(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
     template, report = assemble_template(
         body, load_params_of_run(run), parts, config=AssemblyConfig(clearance=config.clearance_mm / MM)
     )
+    template = _colored_body(template, run, body)
     template.save(folder / "smplxpp.npz")
     write_glb(folder / "template.glb", template)
     write_obj(folder / "template.obj", template)
@@ -136,3 +138,19 @@ def assemble(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
         Check("largest push of the repair", report.max_push * MM, "mm", 15.0, 60.0),
     ]  # fmt: skip
     return StageOutput(checks, report.as_dict())
+
+
+def _colored_body(template: Template, run: Path, body: BodyModel) -> Template:
+    """The template with the scan's colours on the skin that the scan shows."""
+    scan, colors, source_vertex = load_scan(run)
+    with np.load(run / "20_segment" / "labels.npz") as labels:
+        skin = labels["face_labels"] == SKIN.id
+    posed, _ = load_posed_body(run, body)
+    body_colors, body_index = body_colors_from_scan(posed, scan, colors, skin)
+    count = body.vertex_count
+    scan_index = np.where(body_index >= 0, source_vertex[body_index], -1)
+    return replace(
+        template,
+        vertex_colors=np.concatenate([body_colors, template.vertex_colors[count:]]),
+        scan_index=np.concatenate([scan_index, template.scan_index[count:]]),
+    )

@@ -1,5 +1,6 @@
 """Assembly of body and parts, and the repair of layers that cut into each other."""
 
+from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
 from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
 from smplxpp.assemble.penetration import PushConfig, push_out, turned_faces
@@ -14,6 +15,7 @@ __all__ = [
     "Penetration",
     "PushConfig",
     "assemble_template",
+    "body_colors_from_scan",
     "measure_penetration",
     "push_out",
     "turned_faces",

@@ -1,0 +1,58 @@
+"""Colours of the body's skin from the scan."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+def body_colors_from_scan(
+    posed_body: TriangleMesh,
+    scan: TriangleMesh,
+    scan_colors: np.ndarray,
+    skin_faces: np.ndarray,
+    *,
+    max_distance: float = 0.015,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colour every body vertex that the scan shows bare; the others take the median of the skin seen.
+
+    A vertex is shown where its closest point on the scan's skin is near and faces the same way.
+
+    Args:
+        posed_body: the body in the scan's pose. scan_colors: (N, 3) uint8 of the scan's vertices.
+        skin_faces: (M,) bool, faces of the scan that are skin.
+        max_distance: metres.
+
+    Returns:
+        colors: (V, 3) uint8.
+        scan_index: (V,) the scan's vertex that gave the colour, or -1.
+
+    Raises:
+        InputError: arrays that do not fit the scan.
+    """
+    if np.shape(scan_colors) != (scan.vertex_count, 3) or np.shape(skin_faces) != (scan.face_count,):
+        raise InputError(
+            "scan colours and skin faces",
+            expected=f"({scan.vertex_count}, 3) and ({scan.face_count},)",
+            received=f"{np.shape(scan_colors)} and {np.shape(skin_faces)}",
+        )
+    colors = np.full((posed_body.vertex_count, 3), 180, dtype=np.uint8)
+    scan_index = np.full(posed_body.vertex_count, -1, dtype=np.int64)
+    if not skin_faces.any():
+        return colors, scan_index
+    skin, used = scan.submesh(skin_faces)
+    tree = igl.AABB()
+    tree.init(skin.vertices, skin.faces)
+    squared, face, closest = tree.squared_distance(skin.vertices, skin.faces, posed_body.vertices)
+    squared, face = np.asarray(squared).reshape(-1), np.asarray(face).reshape(-1)
+    facing = np.einsum("ij,ij->i", posed_body.vertex_normals, skin.face_normals[face]) > 0
+    shown = (squared <= max_distance**2) & facing
+    corner = np.linalg.norm(skin.triangles[face] - closest[:, None], axis=2).argmin(axis=1)
+    source = used[skin.faces[face, corner]]
+    scan_index[shown] = source[shown]
+    colors[:] = np.median(np.asarray(scan_colors)[used], axis=0)
+    colors[shown] = np.asarray(scan_colors)[source[shown]]
+    return colors, scan_index
