@@ -16,7 +16,7 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 
 if TYPE_CHECKING:
-    from smplxpp.body.model import BodyModel
+    from smplxpp.body.model import BodyModel, PosedBody
 
 # The name of the part that comes first.
 BODY_PART = "body"
@@ -231,10 +231,17 @@ class Template:
         """
         from smplxpp.body.skinning import skin
 
-        posed = self.body_model.forward(replace(params, betas=np.zeros((len(params), 0))))
+        posed = self._posed_body(params)
         count = self.body_vertex_count
         parts = skin(self.vertices[count:], self._dense_weights[count:], posed.posed_from_rest)
         return np.concatenate([posed.vertices, parts], axis=1)
+
+    def posed_from_rest(self, params: BodyParams) -> np.ndarray:
+        """(T, J, 4, 4) transforms of the joints in T poses, as `pose` applies them."""
+        return self._posed_body(params).posed_from_rest
+
+    def _posed_body(self, params: BodyParams) -> PosedBody:
+        return self.body_model.forward(replace(params, betas=np.zeros((len(params), 0))))
 
     def save(self, path: str | Path) -> None:
         """Write an npz without pickled objects, whole or not at all; the same template gives the same bytes."""

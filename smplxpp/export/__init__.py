@@ -1,1 +1,6 @@
-""""""
+"""Writers of templates for other programs."""
+
+from smplxpp.export.gltf import write_glb
+from smplxpp.export.obj import write_obj
+
+__all__ = ["write_glb", "write_obj"]
