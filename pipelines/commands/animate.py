@@ -1,0 +1,169 @@
+"""`smplxpp animate`: a finished template moving, as a film, pictures or an animated GLB."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from pipelines.film import FRAME_FOLDER, SUFFIXES, write_film
+from pipelines.pictures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import display_colors
+from smplxpp.core.params import BodyParams
+from smplxpp.core.template import Template
+
+TEMPLATE_FILE = Path("60_assemble") / "smplxpp.npz"
+DEFAULT_FPS = 20.0
+_FRAMING_POSES = 24  # poses that the camera is fitted to
+_BLOCK = 16  # frames posed at a time
+
+
+@dataclass(frozen=True)
+class Animate:
+    """Options of `smplxpp animate`."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `smplxpp build` wrote."""
+    params: Path
+    """Body parameters, any layout that `smplxpp params convert` reads. Their shape is ignored: the template has one."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
+    fps: float | None = None
+    """Frames a second; by default those of the parameters (or 20) over --step, so that the speed is true."""
+    view: Literal["front", "side", "back", "three-quarter", "turntable"] = "front"
+    """Where the camera stands; turntable: once around over the whole film."""
+    colors: Literal["scan", "labels", "semantic", "weights", "none"] = "scan"
+    """Colours of the surface (pictures only; a GLB has those of the scan)."""
+    height: int = 720
+    """Height of the picture in pixels."""
+    width: int | None = None
+    """Width of the picture; by default as wide as the motion needs."""
+    start: int = 0
+    """First frame."""
+    stop: int | None = None
+    """Frame after the last."""
+    step: int = 1
+    """Take every step-th frame."""
+    json: bool = False
+    """Print what was written as JSON."""
+
+    def run(self) -> dict:
+        """Pose the template frame by frame and write the result, whole or not at all."""
+        suffix = self.out.suffix.lower()
+        self._check_options(suffix)
+        template = Template.load(self._template_file())
+        params = self._load_params(template)
+        if suffix == ".glb":
+            from smplxpp.export import write_glb
+
+            write_glb(self.out, template, animation=params)
+        else:
+            posed = _pose_blocks(template, params)
+            # The first block is posed before any file is touched: parameters of another body are refused here.
+            first = next(posed)
+            cameras = self._cameras(template, params)
+            frames = self._frames(template, _chain(first, posed), cameras)
+            write_film(self.out, frames, fps=params.fps, size=(cameras[0].width, cameras[0].height))
+        if not self.json:
+            Console().print(f"{self.out}: {len(params)} frames at {params.fps:g} a second")
+        return {"out": str(self.out), "frames": len(params), "fps": params.fps}
+
+    def _check_options(self, suffix: str) -> None:
+        if suffix not in (*SUFFIXES, ".glb"):
+            raise InputError(
+                f"output {self.out}",
+                expected=".mp4, .gif, .glb, or no suffix for a folder of PNG pictures",
+                received=suffix,
+            )
+        smallest = 16
+        for name, value, least in (
+            ("height", self.height, smallest),
+            ("width", self.width if self.width is not None else smallest, smallest),
+            ("step", self.step, 1),
+        ):
+            if value < least:
+                raise InputError(f"option {name}", expected=f"at least {least}", received=str(value))
+        if self.fps is not None and not self.fps > 0:
+            raise InputError("option fps", expected="more than 0", received=str(self.fps))
+        if suffix == FRAME_FOLDER and self.out.exists():
+            # The folder is replaced as a whole: it must not hold anything but an earlier film.
+            names = [p.name for p in self.out.iterdir()] if self.out.is_dir() else ["(a file)"]
+            foreign = [name for name in names if not name.startswith("frame_")]
+            if foreign:
+                raise InputError(
+                    f"output {self.out}",
+                    expected="a new folder, or one that holds frames alone",
+                    received=f"{foreign[0]} in it" if self.out.is_dir() else "a file",
+                )
+
+    def _template_file(self) -> Path:
+        path = self.run_folder / TEMPLATE_FILE
+        if not path.is_file():
+            raise InputError(
+                f"run {self.run_folder}",
+                expected=f"a finished template in {TEMPLATE_FILE}",
+                received="no such folder" if not self.run_folder.is_dir() else "a run without it",
+                remedy="make it with `smplxpp build`; `smplxpp inspect RUN` tells which stages stand",
+            )
+        return path
+
+    def _load_params(self, template: Template) -> BodyParams:
+        from smplxpp.body import load_params
+
+        # Layouts that turn the body about the origin need its root joint. The identity is in the template already:
+        # without shape directions the betas of the file do not move that joint a second time.
+        body = template.body_model
+        params = load_params(self.params, body=replace(body, shapedirs=np.zeros_like(body.shapedirs)))
+        count = len(params)
+        chosen = range(count)[self.start : self.stop : self.step]
+        if not len(chosen):
+            raise InputError(
+                "frames", expected=f"some of the {count} frames of {self.params.name}",
+                received=f"--start {self.start} --stop {self.stop} --step {self.step}",
+            )  # fmt: skip
+        fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
+        return replace(params.select(list(chosen)), fps=fps)
+
+    def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
+        """A camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
+        some = np.unique(np.linspace(0, len(params) - 1, min(_FRAMING_POSES, len(params))).round().astype(int))
+        points = template.pose(params.select(some)).reshape(-1, 3)
+        height = self.height + self.height % 2  # h264 with 4:2:0 colour takes even sizes
+        width = None if self.width is None else self.width + self.width % 2
+        if self.view == "turntable":
+            return turntable_cameras(points, count=len(params), height=height, width=width)
+        return fit_cameras(points, directions=[VIEWS[self.view]], height=height, width=width) * len(params)
+
+    def _frames(self, template: Template, posed: Iterator[np.ndarray], cameras: list[Camera]) -> Iterator[np.ndarray]:
+        colors = {
+            "scan": lambda: template.vertex_colors,
+            "labels": lambda: display_colors(template.vertex_labels),
+            "semantic": lambda: template.semantic_colors,
+            "weights": lambda: blend_joint_colors(template.weights),
+            "none": lambda: None,
+        }[self.colors]()
+        pairs = zip(posed, cameras, strict=True)
+        for vertices, camera in track(
+            pairs, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json
+        ):
+            yield render_shaded(template.mesh.with_vertices(vertices), camera, vertex_colors=colors)
+
+
+def _pose_blocks(template: Template, params: BodyParams) -> Iterator[np.ndarray]:
+    """(t, V, 3) blocks of at most `_BLOCK` frames, so that long motions fit in memory."""
+    for begin in range(0, len(params), _BLOCK):
+        yield template.pose(params.select(slice(begin, begin + _BLOCK)))
+
+
+def _chain(first: np.ndarray, rest: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    yield from first
+    for block in rest:
+        yield from block

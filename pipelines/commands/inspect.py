@@ -1,0 +1,173 @@
+"""`smplxpp inspect`: what a run holds, how long it took, and its numbers against their gates."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipelines.build_config import STAGES
+from pipelines.report.model import CheckRow, count_statuses, worst_status
+from smplxpp.core.artifact import read_manifest
+from smplxpp.core.errors import InputError
+
+_STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
+_STATES = {"done": "green", "missing": "yellow", "incomplete": "red", "unreadable": "red"}
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Options of `smplxpp inspect`."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `smplxpp build` wrote."""
+    all: bool = False
+    """List every check; by default those that pass are only counted."""
+    strict: bool = False
+    """Exit with status 1 when a check fails."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Summarise the run; prints tables unless `json`."""
+        summary, checks = summarise_run(self.run_folder)
+        if not self.json:
+            _print_summary(summary, checks, show_all=self.all)
+        failed = summary["counts"]["fail"] > 0
+        return {**summary, "exit_status": int(self.strict and failed)}
+
+
+def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
+    """The stages of a run, finished or not, as JSON values, and all of its checks.
+
+    Raises:
+        InputError: the folder holds no run.
+    """
+    run = Path(run)
+    others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(STAGES))
+    stages = [_stage(run, name) for name in sorted([*STAGES, *others])]
+    metrics = _read_json(run / "metrics.json")
+    if not metrics and all(stage["state"] == "missing" for stage in stages):
+        raise InputError(
+            "run folder",
+            expected="a folder with stages or a metrics.json",
+            received=f"{run} with neither" if run.is_dir() else f"{run}, which does not exist",
+            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+        )
+    checks = [CheckRow.of(record, stage=stage["stage"]) for stage in stages for record in stage.pop("records")]
+    if not checks:
+        checks = [CheckRow.of(record) for record in metrics.get("checks", [])]
+    unfinished = [stage["stage"] for stage in stages if stage["state"] != "done"]
+    report = run / "report.html"
+    summary = {
+        "run": str(run),
+        "subject": metrics.get("subject"),
+        "verdict": worst_status(checks) if checks else None,
+        "counts": count_statuses(checks),
+        "seconds": round(sum(stage["seconds"] or 0.0 for stage in stages), 3),
+        "stages": stages,
+        "unfinished": unfinished,
+        "remedy": f"smplxpp build --out {run} --from-stage {unfinished[0]} (with the build's options)"
+        if unfinished
+        else None,
+        "report": str(report) if report.is_file() else None,
+        "checks": [check.__dict__ for check in checks],
+    }
+    return summary, checks
+
+
+def _stage(run: Path, name: str) -> dict[str, Any]:
+    folder = run / name
+    manifest = read_manifest(folder) or {}
+    files = manifest.get("files", {})
+    present = [folder / file for file in files if (folder / file).is_file()]
+    if not manifest:
+        state = "unreadable" if (folder / "manifest.json").exists() else "missing"
+    else:
+        state = "done" if len(present) == len(files) else "incomplete"
+    records = manifest.get("checks", [])
+    return {
+        "stage": name,
+        "state": state,
+        "seconds": manifest.get("seconds"),
+        "bytes": sum(path.stat().st_size for path in present),
+        "files": len(present),
+        "counts": count_statuses([CheckRow.of(record) for record in records]),
+        "records": records,
+    }
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file; empty when it is missing or damaged, which a summary survives."""
+    try:
+        content = jsonlib.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all: bool) -> None:
+    console = Console()
+    title = Text(str(summary["subject"] or Path(summary["run"]).name), style="bold")
+    console.print(title + Text(f"  {summary['run']}", style="dim"))
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("stage")
+    table.add_column("state")
+    for name in ("seconds", "size", "files"):
+        table.add_column(name, justify="right")
+    table.add_column("checks")
+    for stage in summary["stages"]:
+        done = stage["seconds"] is not None
+        table.add_row(
+            stage["stage"],
+            Text(stage["state"], style=_STATES[stage["state"]]),
+            f"{stage['seconds']:.2f}" if done else "",
+            _size(stage["bytes"]) if done else "",
+            str(stage["files"]) if done else "",
+            _counts(stage["counts"]),
+        )
+    table.add_row(
+        "all", "", f"{summary['seconds']:.2f}", _size(sum(s["bytes"] for s in summary["stages"])), style="bold"
+    )
+    console.print(table)
+    shown = [check for check in checks if show_all or check.status != "pass"]
+    if shown:
+        console.print(_check_table(shown))
+    verdict = Text("no checks", style="dim") if not checks else _counts(summary["counts"], zeros=True)
+    console.print(Text("\nchecks  ") + verdict)
+    if summary["unfinished"]:
+        console.print(Text("missing ", style="yellow") + Text(", ".join(summary["unfinished"])))
+        console.print(Text("make it ", style="yellow") + Text(summary["remedy"]), soft_wrap=True)
+    if summary["report"]:
+        console.print(Text("report  ") + Text(summary["report"]), soft_wrap=True)
+    else:
+        console.print(Text("report  ") + Text("none yet; a finished build writes it", style="dim"))
+
+
+def _check_table(checks: list[CheckRow]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(1, 2, 0, 0), header_style="dim", collapse_padding=True)
+    table.add_column("status")
+    table.add_column("stage", style="dim")
+    table.add_column("check")
+    table.add_column("value", justify="right")
+    table.add_column("gate", style="dim")
+    for check in checks:
+        table.add_row(Text(check.status, style=_STYLES[check.status]), check.stage, check.name, check.shown, check.gate)
+    return table
+
+
+def _counts(counts: dict[str, int], *, zeros: bool = False) -> Text:
+    parts = [
+        Text(f"{counts[status]} {status}", style=style) for status, style in _STYLES.items() if zeros or counts[status]
+    ]
+    return Text("  ").join(parts)
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

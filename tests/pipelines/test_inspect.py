@@ -1,0 +1,96 @@
+"""`smplxpp inspect` on whole, partial and damaged runs."""
+
+import json
+
+import pytest
+
+from pipelines.build_config import STAGES
+from pipelines.cli import main
+from pipelines.commands.inspect import Inspect, summarise_run
+from smplxpp.core.artifact import Check, StageOutput, run_stage
+from smplxpp.core.errors import InputError
+
+
+def add_stage(run, name, checks=()):
+    def work(folder):
+        (folder / "data.bin").write_bytes(bytes(1000))
+        return StageOutput(checks=list(checks))
+
+    return run_stage(run, name, work, config={}, inputs={})
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = tmp_path / "dancer"
+    good, doubtful = Check("mean error", 0.5, "mm", 1, 2), Check("p95 error", 4.0, "mm", 3, 6)
+    for name in STAGES:
+        add_stage(folder, name, [good, doubtful] if name == STAGES[-1] else [])
+    (folder / "metrics.json").write_text(json.dumps({"schema": 1, "subject": "Dancer"}))
+    (folder / "report.html").write_text("<!doctype html>")
+    return folder
+
+
+def test_a_whole_run(run):
+    summary, checks = summarise_run(run)
+    assert summary["subject"] == "Dancer" and summary["verdict"] == "warn"
+    assert summary["counts"] == {"pass": 1, "warn": 1, "fail": 0}
+    assert [stage["stage"] for stage in summary["stages"]] == list(STAGES)
+    assert all(stage["state"] == "done" and stage["bytes"] == 1000 for stage in summary["stages"])
+    assert summary["unfinished"] == [] and summary["remedy"] is None
+    assert summary["report"] == str(run / "report.html")
+    assert [check.stage for check in checks] == [STAGES[-1]] * 2
+
+
+def test_a_run_under_way_names_what_is_missing_and_how_to_make_it(tmp_path, capsys):
+    add_stage(tmp_path, STAGES[0])
+    result = Inspect(tmp_path).run()
+    assert result["unfinished"] == list(STAGES[1:]) and STAGES[1] in result["remedy"]
+    printed = capsys.readouterr().out
+    assert "missing" in printed and f"--from-stage {STAGES[1]}" in printed and "none yet" in printed
+
+
+def test_damage_is_seen(run):
+    (run / STAGES[2] / "data.bin").unlink()
+    (run / STAGES[3] / "manifest.json").write_text("{broken")
+    (run / "metrics.json").write_text("[]")
+    summary, _ = summarise_run(run)
+    states = {stage["stage"]: stage["state"] for stage in summary["stages"]}
+    assert states[STAGES[2]] == "incomplete" and states[STAGES[3]] == "unreadable" and states[STAGES[4]] == "done"
+    assert summary["unfinished"] == [STAGES[2], STAGES[3]] and summary["subject"] is None
+
+
+def test_a_stage_of_another_pipeline_is_listed_in_its_place(run):
+    add_stage(run, "70_bind")
+    names = [stage["stage"] for stage in summarise_run(run)[0]["stages"]]
+    assert names == sorted([*STAGES, "70_bind"])
+
+
+def test_metrics_alone_are_enough_for_the_checks(tmp_path):
+    check = Check("mean error", 9.0, "mm", 1, 2).as_dict()
+    (tmp_path / "metrics.json").write_text(json.dumps({"subject": "s", "checks": [{"stage": "65_validate", **check}]}))
+    summary, checks = summarise_run(tmp_path)
+    assert summary["verdict"] == "fail" and checks[0].stage == "65_validate"
+
+
+@pytest.mark.parametrize("name", ["empty", "absent"])
+def test_a_folder_without_a_run_is_refused(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="run folder"):
+        Inspect(tmp_path / name).run()
+
+
+def test_the_terminal_lists_what_does_not_pass_and_all_on_request(run, capsys):
+    Inspect(run).run()
+    brief = capsys.readouterr().out
+    assert "p95 error" in brief and "mean error" not in brief and "1 warn" in brief
+    Inspect(run, all=True).run()
+    assert "mean error" in capsys.readouterr().out
+
+
+def test_json_and_exit_status(run, capsys):
+    assert main(["inspect", str(run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["counts"]["warn"] == 1
+    add_stage(run, "70_bind", [Check("broken", 5, "", 1, 2)])
+    assert main(["inspect", str(run)]) == 0
+    assert main(["inspect", str(run), "--strict"]) == 1
+    assert main(["inspect", str(run / "nothing")]) == 2
