@@ -105,13 +105,13 @@ def sanitize(vertices: np.ndarray, faces: np.ndarray, *, weld_tolerance: float |
     edge = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     solid = 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > _ZERO_AREA * diagonal**2
     faces, kept = faces[solid], kept[solid]
-    unique = _first_of_each(faces)
-    duplicates = len(faces) - len(unique)
-    faces, kept = faces[unique], kept[unique]
     if not len(faces):
         raise InputError(
             "mesh", expected="faces with area", received="only faces without area", remedy="check the units"
         )
+    unique = _first_of_each(faces)
+    duplicates = len(faces) - len(unique)
+    faces, kept = faces[unique], kept[unique]
 
     flipped = _inconsistent_faces(vertices, faces)
     faces = np.where(flipped[:, None], faces[:, ::-1], faces)

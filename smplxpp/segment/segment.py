@@ -34,7 +34,7 @@ class SegmentConfig:
     fold: float = 0.1
     pseudo_votes: float = 0.02
     full_votes: float = 3.0
-    label_trust: float = 0.5
+    label_trust: float = 0.35
     island_area: float = 1e-4
 
 

@@ -1,0 +1,127 @@
+"""Votes and the smoothed labels of a scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh, view_directions
+from smplxpp.segment import SegmentConfig, segment_scan, vote_on_faces
+
+
+@pytest.fixture(scope="module")
+def ball() -> TriangleMesh:
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    return TriangleMesh(mesh.vertices, mesh.faces)
+
+
+def halves(mesh: TriangleMesh) -> np.ndarray:
+    return np.where(mesh.triangles.mean(axis=1)[:, 1] > 0, 3, 4)
+
+
+def views_of(mesh: TriangleMesh, labels: np.ndarray, count: int = 8) -> list:
+    out = []
+    for direction in view_directions(count):
+        camera = Camera.look_at(eye=4 * direction, target=np.zeros(3), fov_y_deg=35, width=96, height=96, up=(0, 0, 1))
+        face = rasterize_mesh(mesh, camera).face_id
+        out.append((camera, np.where(face >= 0, labels[face], -1)))
+    return out
+
+
+def test_votes_are_weighted_by_angle_and_silhouette(ball):
+    camera = Camera.orthographic_view(center=np.zeros(3), direction=np.array([0, 0, 1.0]), half_extent=1.2, size=128)
+    face = rasterize_mesh(ball, camera).face_id
+    votes = vote_on_faces(ball, [(camera, np.where(face >= 0, 3, -1))])
+    assert (votes[:, [0, 1, 2, 4, 5]] == 0).all()
+    assert (votes[ball.face_normals[:, 2] < -0.1] == 0).all()
+    pixels = np.bincount(face[face >= 0], minlength=ball.face_count)
+    inner = (ball.face_normals[:, 2] > 0.8) & (pixels > 0)
+    np.testing.assert_allclose(votes[inner, 3], (pixels * ball.face_normals[:, 2])[inner], rtol=1e-5)
+    rim = (pixels > 0) & (ball.face_normals[:, 2] < 0.1)
+    assert (votes[rim, 3] <= 0.1 * pixels[rim]).all()
+
+
+def test_noisy_views_are_outvoted_and_smoothed(ball):
+    truth = halves(ball)
+    rng = np.random.default_rng(0)
+    views = views_of(ball, truth)
+    for _, labels in views:
+        wrong = (labels >= 0) & (rng.random(labels.shape) < 0.45)
+        labels[wrong] = rng.integers(0, 6, int(wrong.sum()))
+    votes = vote_on_faces(ball, views)
+    result = segment_scan(ball, votes=votes)
+    before, after = (votes.argmax(1) == truth).mean(), (result.face_labels == truth).mean()
+    assert after > 0.97 and after > before + 0.02
+    assert result.energy_after < result.energy_before
+    assert ((result.confidence >= 0) & (result.confidence <= 1)).all()
+
+
+def test_unseen_faces_are_flagged_and_take_the_neighbours_label(ball):
+    truth = halves(ball)
+    votes = np.zeros((ball.face_count, 6))
+    votes[np.arange(ball.face_count), truth] = 3.0
+    unseen = np.linalg.norm(ball.triangles.mean(1) - [0, 1, 0], axis=1) < 0.4
+    votes[unseen] = 0.0
+    result = segment_scan(ball, votes=votes)
+    np.testing.assert_array_equal(result.seen, ~unseen)
+    assert (result.face_labels[unseen] == 3).all()
+    assert (result.confidence[unseen] == 0).all()
+
+
+def test_given_labels_lose_specks(ball):
+    truth = halves(ball)
+    labels = truth.copy()
+    labels[np.random.default_rng(0).choice(ball.face_count, 60, replace=False)] = 1
+    result = segment_scan(ball, face_labels=labels, config=SegmentConfig(island_area=1e-3))
+    assert (result.face_labels == truth).mean() > 0.99
+    assert not (result.face_labels == 1).any()
+    per_vertex = np.where(ball.vertices[:, 1] > 0, 3, 4)
+    assert (segment_scan(ball, vertex_labels=per_vertex).face_labels == truth).mean() > 0.97
+
+
+def test_same_answer_after_motion_units_and_permutation(ball):
+    labels = halves(ball)
+    rng = np.random.default_rng(4)
+    labels[rng.choice(ball.face_count, 400, replace=False)] = 0
+    reference = segment_scan(ball, face_labels=labels)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.linalg.det(rotation)
+    moved = ball.with_vertices(100 * ball.vertices @ rotation.T + [3, 4, 5])
+    assert segment_scan(moved, face_labels=labels).energy_after == pytest.approx(reference.energy_after, rel=1e-4)
+    order = rng.permutation(ball.face_count)
+    permuted = segment_scan(TriangleMesh(ball.vertices, ball.faces[order]), face_labels=labels[order])
+    assert permuted.energy_after == pytest.approx(reference.energy_after, rel=1e-3)
+    assert (permuted.face_labels == reference.face_labels[order]).mean() > 0.999
+
+
+def test_bad_input_is_refused(ball):
+    with pytest.raises(InputError, match="one of votes"):
+        segment_scan(ball)
+    with pytest.raises(InputError, match="shape"):
+        segment_scan(ball, face_labels=np.zeros(3, int))
+    with pytest.raises(InputError, match="out of range"):
+        segment_scan(ball, face_labels=np.full(ball.face_count, 17))
+    with pytest.raises(InputError, match="at least one labelled"):
+        segment_scan(ball, face_labels=np.full(ball.face_count, -1))
+    away = Camera.look_at(eye=np.array([0, 0, 4.0]), target=np.array([0, 0, 9.0]), fov_y_deg=30, width=8, height=8)
+    with pytest.raises(InputError, match="no labelled pixel"):
+        vote_on_faces(ball, [(away, np.zeros((8, 8), int))])
+    with pytest.raises(InputError, match="intrinsics"):
+        vote_on_faces(ball, [(away, np.zeros((9, 8), int))])
+
+
+@pytest.mark.slow
+def test_capture_label_maps(captures):
+    from benchmarks.segmentation import measure
+
+    rows = {}
+    for row in measure(captures / "woman_casual"):
+        case, _, share = row["case"].partition(" at ")
+        rows[case, bool(share)] = row
+    assert rows["label maps", False]["accuracy"] > 0.975
+    assert rows["label maps", True]["accuracy_seen"] > 0.96 > rows["label maps", True]["accuracy_before_seen"]
+    assert rows["vertex labels", False]["accuracy"] > 0.995
