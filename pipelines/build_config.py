@@ -46,7 +46,7 @@ class BuildInputs:
     labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
     cameras: Path | None = None
-    label_set: str = "4d-dress"
+    label_set: str = "4ddress"
     motion: Path | None = None
     body: Path | None = None
 

@@ -33,8 +33,8 @@ class Build:
     labels: Path | None = None
     """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh."""
     label_set: str = "auto"
-    """Label set of the labels: 4d-dress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
-    auto: `capture` with --capture, else 4d-dress."""
+    """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
+    auto: `capture` with --capture, else 4ddress."""
     label_source: Literal["auto", "scan", "views"] = "auto"
     """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the scan's first."""
     frame: int = 0
@@ -116,7 +116,7 @@ class Build:
             raise InputError("input", expected="--params with --scan", received="no --params")
         return BuildInputs(
             subject=self.scan.stem, scan=self.scan, params=self.params, frame=self.frame, labels=self.labels,
-            label_set="4d-dress" if label_set == "auto" else label_set, body=self.body,
+            label_set="4ddress" if label_set == "auto" else label_set, body=self.body,
         )  # fmt: skip
 
     def config(self) -> BuildConfig:
