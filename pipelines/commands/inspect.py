@@ -138,6 +138,7 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
     console.print(table)
     shown = [check for check in checks if show_all or check.status != "pass"]
     if shown:
+        console.print()
         console.print(_check_table(shown))
     verdict = Text("no checks", style="dim") if not checks else _counts(summary["counts"], zeros=True)
     console.print(Text("\nchecks  ") + verdict)
@@ -151,7 +152,7 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
 
 
 def _check_table(checks: list[CheckRow]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(1, 2, 0, 0), header_style="dim", collapse_padding=True)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("status")
     table.add_column("stage", style="dim")
     table.add_column("check")
