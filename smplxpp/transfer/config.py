@@ -7,13 +7,14 @@ from typing import Literal
 
 import numpy as np
 
+from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
-from smplxpp.transfer.regions import JOINTS_OF_LABEL, SMPLX_JOINTS
+from smplxpp.transfer.regions import JOINTS_OF_LABEL
 
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """Settings of `transfer_weights`; every length is a fraction of a box's diagonal, so units do not matter.
+    """Settings of `transfer_weights`; every length is a fraction of a mesh's `extent`, so units do not matter.
 
     The default goes beyond the published method in three ways, each of which None or 0 turns off: `falloff`,
     `smoothing`, and (through `for_label`) `allowed_joints`. `TransferConfig.paper()` is the published method.
@@ -28,13 +29,14 @@ class TransferConfig:
             restricted to the faces that these joints own.
         unmatched: what a connected component without any match gets: "extend" the extension like all others,
             "nearest" the closest source point's weights, "rigid:JOINT" (name or index) one joint, "raise" an error.
-        max_distance: a vertex is matched within this fraction of the target's bounding-box diagonal.
+        max_distance: a vertex is matched within this fraction of the target's extent.
         max_angle_deg: ... and if the normals differ by at most this.
-        length_scale: `l` of the energy, as a fraction of the source's bounding-box diagonal.
+        length_scale: `l` of the energy, as a fraction of the source's extent.
         laplacian: "cotangent" as given; "intrinsic" mollified and Delaunay; "auto" the latter where a face is bad.
         max_influences: joints kept at a vertex; None keeps all.
         averaging_steps: Jacobi averaging over unmatched vertices at the end (rate 0.2).
-        joint_names: names for `allowed_joints`, `unmatched` and messages.
+        joint_names: names for `allowed_joints` and `unmatched`; None takes the names of the SMPL family by the number
+            of joints.
     """
 
     falloff: float | None = 6.0
@@ -48,7 +50,7 @@ class TransferConfig:
     laplacian: Literal["auto", "cotangent", "intrinsic"] = "auto"
     max_influences: int | None = 8
     averaging_steps: int = 0
-    joint_names: tuple[str, ...] = SMPLX_JOINTS
+    joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing"):
@@ -100,14 +102,15 @@ class TransferConfig:
         Raises:
             InputError: no such joint.
         """
-        if joint in self.joint_names:
-            index = self.joint_names.index(joint)
+        names = self.joint_names or JOINT_NAMES.get(joint_count, ())
+        if joint in names:
+            index = names.index(joint)
         else:
             index = int(joint) if str(joint).isdigit() else -1
         if not 0 <= index < joint_count:
             raise InputError(
                 f"joint {joint!r}",
-                expected=f"an index below {joint_count}, or a name of joint_names that lies there",
+                expected=f"an index below {joint_count}, or a name of joint_names",
                 received=repr(joint),
                 remedy="give TransferConfig(joint_names=...) of the body model",
             )

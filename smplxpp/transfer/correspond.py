@@ -75,7 +75,9 @@ def face_outward(
     against = near & (found.angle > np.pi / 2)
     count = int(component.max(initial=-1)) + 1
     outward = np.bincount(component, near & (found.angle <= np.pi / 2), minlength=count)
-    turned = (np.bincount(component, against, minlength=count) > 2 * outward)[component]
+    size = np.bincount(component, minlength=count)
+    inward = np.bincount(component, against, minlength=count)
+    turned = ((inward > 2 * outward) & (inward > 0.1 * size))[component]
     if not turned.any():
         return found, target.vertex_normals
     warnings.warn(

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.correspond import Correspondence
 
-_SAMPLES = 2000
-_NEIGHBOURS = 128
+_SAMPLES = 1000
+_NEIGHBOURS = 32  # at a few radii of a sample the rest of the kernel is a few percent
 _LEAST_AGREEMENT = 0.02  # a lining faces away from all skin near it, and still belongs there
 
 
@@ -78,7 +78,7 @@ def extend_weights(
     near = np.pi / (half - 1.0) * (1.0 - fraction) * _agreement(np.cos(found.angle))
     count = min(_NEIGHBOURS, len(samples.points))
     distance, index = cKDTree(samples.points).query(points, k=np.arange(1, count + 1), workers=-1)
-    cosine = np.einsum("nd,nkd->nk", normals, samples.normals[index])
+    cosine = sum(normals[:, None, k] * samples.normals[index, k] for k in range(3))
     # d^(p-2) (r^2 + rho^2)^(-p/2) as a ratio of like magnitudes, whatever the unit.
     scale = d2 + rho2
     far = (scale[:, None] / (distance**2 + rho2)) ** half * (fraction / scale * samples.area)[:, None]

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from smplxpp.core.mesh import TriangleMesh
 
 _SLACK = 1e-4  # of the mean edge: how far mollification keeps a face from collapsing
-_SMALL_ANGLE = np.radians(1.0)
+_SMALL_ANGLE = np.radians(0.1)
 
 
 def edge_lengths(mesh: TriangleMesh) -> np.ndarray:
@@ -35,14 +35,14 @@ def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.cs
         mesh: every vertex referenced by a face.
         kind: "cotangent": as the mesh is (zero-area faces are still mollified: their cotangents do not exist).
             "intrinsic": edges flipped to an intrinsic Delaunay triangulation (Bobenko and Springborn 2007), which has
-            no negative weights; needs at most two faces at an edge. "auto": "intrinsic" where some angle is below
-            1 degree, else "cotangent".
+            no negative weights; needs at most two faces at an edge, wound alike. "auto": "intrinsic"
+            where some angle is below 0.1 degrees, else "cotangent".
     """
     lengths = edge_lengths(mesh)
     if kind == "auto":
         kind = "intrinsic" if _smallest_angle(lengths) < _SMALL_ANGLE else "cotangent"
     lengths, faces = mollify(lengths), mesh.faces
-    if kind == "intrinsic" and mesh.edges_with_counts[1].max(initial=0) <= 2 and igl.is_edge_manifold(faces)[0]:
+    if kind == "intrinsic" and igl.is_edge_manifold(faces)[0]:
         lengths, faces = igl.intrinsic_delaunay_triangulation(lengths, faces)[:2]
     cotangent = igl.cotmatrix_intrinsic(lengths, faces)
     mass = igl.massmatrix_intrinsic(lengths, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal()

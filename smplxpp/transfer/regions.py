@@ -7,15 +7,6 @@ import numpy as np
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
-SMPLX_JOINTS: tuple[str, ...] = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "jaw", "left_eye_smplhf",
-    "right_eye_smplhf",
-    *(f"{side}_{finger}{k}" for side in ("left", "right")
-      for finger in ("index", "middle", "pinky", "ring", "thumb") for k in (1, 2, 3)),
-)  # fmt: skip
-
 _BOTH = ("left_", "right_")
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3")
 _ARMS = tuple(side + joint for side in _BOTH for joint in ("collar", "shoulder", "elbow", "wrist"))

@@ -60,6 +60,15 @@ def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
     return out
 
 
+def extent(mesh: TriangleMesh) -> float:
+    """Size of a mesh: twice the largest distance from the area's centroid.
+
+    It is the bounding box's diagonal for a box, but unlike that it does not change with the mesh's orientation.
+    """
+    centroid = (mesh.face_areas @ mesh.triangles.mean(axis=1)) / max(mesh.face_areas.sum(), np.finfo(float).tiny)
+    return 2.0 * float(np.linalg.norm(mesh.triangles.reshape(-1, 3) - centroid, axis=1).max())
+
+
 def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.ndarray) -> None:
     """Refuse a target that plainly does not lie on the source: other units, other axes, another place.
 
@@ -72,12 +81,12 @@ def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.nda
     if not target.face_count:
         raise InputError("target mesh", expected="at least one face", received="none")
     points = target.vertices[np.unique(target.faces)]
-    ratio = target.bbox_diagonal / source.bbox_diagonal
-    far = float(np.median(distance)) / source.bbox_diagonal
+    ratio = extent(target) / extent(source)
+    far = float(np.median(distance)) / extent(source)
     remedy = ""
     if ratio > _LARGEST or ratio < _SMALLEST:
-        # Parts are a tenth of the body to all of it: the power of ten that brings the ratio there.
-        power = int(np.floor(np.log10(ratio))) if ratio > 1 else int(np.floor(np.log10(ratio))) + 1
+        # The power of ten that makes the part at most a little larger than the body.
+        power = int(np.ceil(np.log10(ratio / 1.5)))
         remedy = f"the units differ: multiply the target's coordinates by {10.0**-power:g}"
     elif far > _DOUBTFUL:
         remedy = _axes_remedy(source, points, 0.5 * float(np.median(distance)))

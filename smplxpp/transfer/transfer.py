@@ -10,9 +10,9 @@ from smplxpp.transfer.components import settle_unmatched, vertex_components
 from smplxpp.transfer.config import TransferConfig
 from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward
 from smplxpp.transfer.extend import extend_weights, sample_surface
-from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly, inpaint
+from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.regions import restrict_source
-from smplxpp.transfer.repair import check_placement, check_source, consistent_winding
+from smplxpp.transfer.repair import check_placement, check_source, consistent_winding, extent
 
 
 def transfer_weights(
@@ -57,14 +57,14 @@ def transfer_weights(
     joint_count = weights.shape[1]
     source = consistent_winding(source, subject="source mesh")
     target = consistent_winding(target, subject="target mesh")
-    length = config.length_scale * source.bbox_diagonal
+    length = config.length_scale * extent(source)
     allowed = config.allowed_mask(joint_count)
     if allowed is not None:
         source, weights = restrict_source(source, weights, allowed)
     found = closest_points(source, target)
     check_placement(source, target, found.distance)
     component = vertex_components(target)
-    limit = config.max_distance * target.bbox_diagonal
+    limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
     matched = found.matched(max_distance=limit, max_angle=np.radians(config.max_angle_deg))
     values = _values(source, weights, target, found, normals, config)
@@ -108,13 +108,13 @@ def _smooth(
     config: TransferConfig,
 ) -> np.ndarray:
     """(N, J) the values fitted smoothly over the surface; vertices without a face keep theirs."""
-    mesh, used = target.submesh(slice(None))
     if config.smoothing is None:
-        fitted = inpaint(mesh, values[used], (matched | settled)[used], length=length, laplacian=config.laplacian)
+        width = np.where(matched | settled, 0.0, np.inf)
     else:
         doubt = 1.0 + config.normal_doubt * (1.0 - np.cos(np.nan_to_num(found.angle)))
         width = np.where(settled, 0.0, config.smoothing * doubt * found.distance)
-        fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
+    mesh, used = target.submesh(slice(None))
+    fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)
     out /= out.sum(axis=1, keepdims=True)

@@ -1,0 +1,58 @@
+"""Runs the user's checkout of github.com/rin-23/RobustSkinWeightsTransferCode on today's libigl."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from pathlib import Path
+from types import ModuleType
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+
+from smplxpp.core.mesh import TriangleMesh
+
+
+class _Igl:
+    """libigl 2.6 under the names and signatures that the peer was written for; everything else passes through."""
+
+    def __getattr__(self, name: str):
+        return getattr(igl, name)
+
+    @staticmethod
+    def barycentric_coordinates_tri(p, a, b, c):
+        return igl.barycentric_coordinates(*(np.ascontiguousarray(x) for x in (p, a, b, c)))
+
+    @staticmethod
+    def min_quad_with_fixed(q, b, known, values, _aeq, _beq, definite):
+        n, columns = b.shape
+        empty = sp.csc_matrix((0, n)), np.zeros((0, columns))
+        return True, igl.min_quad_with_fixed(sp.csc_matrix(q), b, known, values, *empty, definite)
+
+
+def load_peer(checkout: Path) -> ModuleType:
+    """The peer's `src/utils.py` as a module."""
+    spec = importlib.util.spec_from_file_location("rin23_utils", checkout / "src" / "utils.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.igl = _Igl()
+    return module
+
+
+def run_peer(
+    peer: ModuleType, source: TriangleMesh, weights: np.ndarray, target: TriangleMesh
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Its matching and inpainting as its example calls them, thresholds included.
+
+    Returns:
+        (N, J) its weights as they come, (N,) matched, seconds of both steps.
+    """
+    v1, f1, v2, f2 = (np.array(x) for x in (source.vertices, source.faces, target.vertices, target.faces))
+    n1, n2 = igl.per_vertex_normals(v1, f1), igl.per_vertex_normals(v2, f2)
+    limit = (0.05 * igl.bounding_box_diagonal(v2)) ** 2
+    start = time.perf_counter()
+    matched, copied = peer.find_matches_closest_surface(v1, f1, n1, v2, f2, n2, weights, limit, 30)
+    middle = time.perf_counter()
+    result, _ = peer.inpaint(v2, f2, copied, matched)
+    return np.asarray(result), matched, {"match": middle - start, "inpaint": time.perf_counter() - middle}

@@ -1,0 +1,176 @@
+"""Invariants of skin-weight transfer, on a small body of two limbs and what it wears."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.spatial.transform import Rotation
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.transfer import TransferConfig, transfer_weights
+from smplxpp.transfer.repair import extent
+
+NAMES = ("hips", "left", "right", "hand")
+CONFIGS = {"default": TransferConfig(), "paper": TransferConfig.paper()}
+
+
+def tube(radius: float, low: float, high: float, *, around: int = 24, along: int = 30, x: float = 0.0) -> TriangleMesh:
+    """An open vertical cylinder, normals outwards, slightly crumpled so that nothing is symmetric."""
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(low, high, along))
+    r = radius * (1 + 0.05 * np.sin(3 * angle + 7 * height))
+    points = np.stack([x + r * np.cos(angle), height, r * np.sin(angle)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(around), np.arange(along - 1))
+    a, b = (j * around + i).ravel(), (j * around + (i + 1) % around).ravel()
+    faces = np.concatenate([np.stack([a, a + around, b], 1), np.stack([b, a + around, b + around], 1)])
+    return TriangleMesh(points, faces)
+
+
+@pytest.fixture(scope="module")
+def body() -> tuple[TriangleMesh, np.ndarray]:
+    """Two legs at x = -0.1 and 0.1 that blend into the hips at the top, and a hand beside them at x = 0.4."""
+    legs = [tube(0.08, 0.0, 1.0, x=x) for x in (0.1, -0.1)]
+    hand = tube(0.03, 0.4, 0.7, along=10, x=0.26)
+    mesh = concatenate_meshes([*legs, hand])
+    weights = np.zeros((mesh.vertex_count, 4))
+    for k, leg in enumerate(legs):
+        share = np.clip((leg.vertices[:, 1] - 0.7) / 0.2, 0, 1)
+        rows = slice(k * leg.vertex_count, (k + 1) * leg.vertex_count)
+        weights[rows, 0], weights[rows, 1 + k] = share, 1 - share
+    weights[-hand.vertex_count :, 3] = 1
+    return mesh, weights
+
+
+@pytest.fixture(scope="module")
+def skirt() -> TriangleMesh:
+    return tube(0.22, 0.1, 0.95, around=40)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_mesh_gives_itself_its_own_weights(body, name):
+    mesh, weights = body
+    result = transfer_weights(mesh, weights, mesh, config=CONFIGS[name])
+    assert np.abs(result.dense() - weights).max() < 1e-9
+    assert result.matched.all() and set(result.policies) == {"matched"}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_rows_are_partitions_of_unity(body, skirt, name):
+    dense = transfer_weights(*body, skirt, config=CONFIGS[name]).dense()
+    assert np.abs(dense.sum(axis=1) - 1).max() < 1e-12 and dense.min() >= 0
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("scale", [100.0, 1000.0])
+def test_the_unit_does_not_matter(body, skirt, name, scale):
+    mesh, weights = body
+    metres = transfer_weights(mesh, weights, skirt, config=CONFIGS[name]).dense()
+    other = transfer_weights(
+        mesh.with_vertices(scale * mesh.vertices),
+        weights,
+        skirt.with_vertices(scale * skirt.vertices),
+        config=CONFIGS[name],
+    ).dense()
+    assert np.abs(metres - other).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_rigid_motion_does_not_matter(body, skirt, name):
+    mesh, weights = body
+    rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    moved = [m.with_vertices(m.vertices @ rotation.T + [3.0, -1.0, 0.5]) for m in (mesh, skirt)]
+    still = transfer_weights(mesh, weights, skirt, config=CONFIGS[name]).dense()
+    assert np.abs(still - transfer_weights(moved[0], weights, moved[1], config=CONFIGS[name]).dense()).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_order_of_vertices_does_not_matter(body, skirt, name):
+    mesh, weights = body
+    rng = np.random.default_rng(3)
+
+    def shuffled(m: TriangleMesh) -> tuple[TriangleMesh, np.ndarray]:
+        order = rng.permutation(m.vertex_count)
+        return TriangleMesh(m.vertices[order], np.argsort(order)[m.faces]), order
+
+    (other_mesh, order), (other_skirt, skirt_order) = shuffled(mesh), shuffled(skirt)
+    expected = transfer_weights(mesh, weights, skirt, config=CONFIGS[name]).dense()
+    found = transfer_weights(other_mesh, weights[order], other_skirt, config=CONFIGS[name]).dense()
+    assert np.abs(found - expected[skirt_order]).max() < 1e-6
+
+
+def test_inpainting_is_the_constrained_minimum_that_libigl_finds(body, skirt):
+    """Another solver on the published energy, as an oracle of the paper's settings."""
+    mesh, weights = body
+    config = TransferConfig(
+        falloff=None, smoothing=None, unmatched="nearest", laplacian="cotangent", max_influences=None, max_distance=0.08
+    )
+    result = transfer_weights(mesh, weights, skirt, config=config)
+    assert 0.05 < result.matched.mean() < 0.95
+    c = igl.cotmatrix(skirt.vertices, skirt.faces)
+    m = igl.massmatrix(skirt.vertices, skirt.faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
+    length = 0.4 * extent(mesh)
+    q = sp.csc_matrix(-c + length**2 * (c @ sp.diags(1 / m) @ c))
+    dense = result.dense()
+    known = np.flatnonzero(result.matched)
+    n = skirt.vertex_count
+    expected = igl.min_quad_with_fixed(
+        q, np.zeros((n, 4)), known, dense[known], sp.csc_matrix((0, n)), np.zeros((0, 4)), True
+    )
+    expected = np.clip(expected, 0, 1)
+    assert np.abs(expected / expected.sum(axis=1, keepdims=True) - dense).max() < 1e-6
+
+
+def test_a_loose_skirt_blends_the_legs_where_the_nearest_point_tears(body, skirt):
+    """Between the legs the jump from one leg to the other is spread over several edges."""
+    mesh, weights = body
+    config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES)
+    dense = transfer_weights(mesh, weights, skirt, config=config).dense()
+    middle = np.abs(skirt.vertices[skirt.edges].mean(axis=1)[:, 0]) < 0.05
+    low = skirt.vertices[skirt.edges].mean(axis=1)[:, 1] < 0.6
+    jump = np.abs(dense[skirt.edges[:, 0], 1] - dense[skirt.edges[:, 1], 1])[middle & low]
+    assert 0.05 < jump.max() < 0.45
+    side = skirt.vertices[:, 0] > 0.2
+    assert (dense[side & (skirt.vertices[:, 1] < 0.6), 1] > 0.9).all()
+
+
+def test_a_forbidden_limb_is_never_followed(body, skirt):
+    mesh, weights = body
+    free = transfer_weights(mesh, weights, skirt).dense()
+    assert free[:, 3].max() > 0.5  # the hand touches the skirt
+    config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES)
+    assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
+
+
+def test_labels_name_joints_of_the_model_by_their_number():
+    config = TransferConfig.for_label("lower")
+    mask = config.allowed_mask(55)
+    assert mask[[0, 1, 2, 4, 5]].all() and not mask[[15, 18, 20]].any() and not mask[25:].any()
+    assert TransferConfig.for_label("skin").allowed_mask(55) is None
+    with pytest.raises(InputError, match="tail"):
+        TransferConfig(allowed_joints=("tail",)).allowed_mask(55)
+
+
+def test_influences_are_limited(body, skirt):
+    result = transfer_weights(*body, skirt, config=TransferConfig(max_influences=2))
+    assert result.joint_indices.shape[1] <= 2
+    assert np.abs(result.dense().sum(axis=1) - 1).max() < 1e-12
+
+
+def test_averaging_moves_unmatched_vertices_only(body, skirt):
+    plain = transfer_weights(*body, skirt, config=TransferConfig.paper())
+    smoothed = transfer_weights(
+        *body,
+        skirt,
+        config=TransferConfig(falloff=None, smoothing=None, unmatched="nearest", normal_doubt=0, averaging_steps=5),
+    )
+    change = np.abs(plain.dense() - smoothed.dense()).max(axis=1)
+    assert change[plain.matched].max() < 1e-12 and change[~plain.matched].max() > 1e-4
+
+
+def test_provenance_is_recorded(body, skirt):
+    result = transfer_weights(*body, skirt)
+    assert result.distance.min() >= 0 and np.isfinite(result.angle).all() and len(result.policies) == 1
+    far = transfer_weights(*body, skirt, config=TransferConfig(max_distance=0.01))
+    assert far.matched.sum() < result.matched.sum()
