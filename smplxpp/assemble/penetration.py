@@ -30,11 +30,11 @@ class PushConfig:
     max_depth: float = 0.03
 
     def __post_init__(self) -> None:
-        good = 1e-5 <= self.clearance < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0 < self.max_depth
+        good = 1e-4 <= self.clearance < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0 < self.max_depth
         if not good:
             raise InputError(
                 "push configuration",
-                expected="clearance >= 1e-5, damping in [0, 1], iterations >= 0, max_depth > 0",
+                expected="clearance >= 1e-4, damping in [0, 1], iterations >= 0, max_depth > 0",
                 received=str(self),
             )
 
@@ -42,13 +42,13 @@ class PushConfig:
 # Projections alone, after the smoothing, until nothing is left inside.
 _FINAL_PROJECTIONS = 30
 # Rounds of smoothing around faces that a push has turned over, and steps in each.
-_UNFLIP_ROUNDS, _UNFLIP_STEPS = 12, 4
+_UNFLIP_ROUNDS, _UNFLIP_STEPS = 8, 4
 # A push must not lead to the far side of a limb: the way out and the vertex's own outside make less than this angle.
 _FACING_COSINE = -0.2
 # Centres of faces keep this share of the clearance: a chord runs below its arc.
 _CENTER_SHARE = 0.5
 # Metres nearer than the clearance that need no push.
-_TOLERANCE = 1e-7
+_TOLERANCE = 1e-5
 
 
 def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None) -> np.ndarray:
@@ -70,18 +70,19 @@ def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig |
     config = config or PushConfig()
     walls = [_Wall(obstacle, mesh, config.clearance) for obstacle in obstacles]
     mean = _neighbour_mean(mesh)
-    d = _project(mesh, np.zeros_like(mesh.vertices), walls, facing_only=True)
+    d = _project(mesh, np.zeros_like(mesh.vertices), walls)
     for _ in range(config.iterations):
-        d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls, facing_only=True)
+        d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls)
     d = _clear(mesh, d, walls)
+    joined = mean + mean.T != 0
+    near = np.zeros(mesh.vertex_count, dtype=bool)
     for _ in range(_UNFLIP_ROUNDS):
         turned = turned_faces(mesh, mesh.vertices + d)
         if not turned.any():
             break
-        # Two rings around the faces that turned over share their displacement, then all go out again.
-        near = np.zeros(mesh.vertex_count)
-        near[mesh.faces[turned]] = 1.0
-        near = ((mean != 0) @ ((mean != 0) @ near) + near) > 0
+        # A growing neighbourhood of the faces that turned over shares its displacement, then all go out again.
+        near[mesh.faces[turned]] = True
+        near |= (joined @ near) > 0
         for _ in range(_UNFLIP_STEPS):
             d = np.where(near[:, None], mean @ d, d)
         d = _clear(mesh, d, walls)
@@ -101,17 +102,17 @@ class _Wall:
         self._vertex_start = obstacle.lower_bound(mesh.vertices)
         self._center_start = obstacle.lower_bound(mesh.triangles.mean(axis=1))
 
-    def vertex_push(self, mesh: TriangleMesh, d: np.ndarray, facing_only: bool) -> np.ndarray:
+    def vertex_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
         """(N, 3) that brings every vertex to the clearance."""
-        return self._push(mesh.vertices + d, mesh.vertex_normals, d, self._vertex_start, self.clearance, facing_only)
+        normals = (facing or mesh).vertex_normals
+        return self._push(mesh.vertices + d, normals, d, self._vertex_start, self.clearance, facing is None)
 
-    def center_push(self, mesh: TriangleMesh, d: np.ndarray, facing_only: bool) -> np.ndarray:
+    def center_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
         """(M, 3) that brings the centre of every face clear of the surface."""
         moved = d[mesh.faces].mean(axis=1)
         centers = mesh.triangles.mean(axis=1) + moved
-        return self._push(
-            centers, mesh.face_normals, moved, self._center_start, _CENTER_SHARE * self.clearance, facing_only
-        )
+        normals, clearance = (facing or mesh).face_normals, _CENTER_SHARE * self.clearance
+        return self._push(centers, normals, moved, self._center_start, clearance, facing is None)
 
     def _push(self, points, normals, moved, start, clearance, facing_only):
         # A signed distance changes by no more than the way travelled: the rest need not be asked again.
@@ -126,10 +127,13 @@ class _Wall:
         return push
 
 
-def _project(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing_only: bool) -> np.ndarray:
+def _project(
+    mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing: TriangleMesh | None = None
+) -> np.ndarray:
+    """One round of pushes; without `facing` only those that do not lead to the far side of a limb."""
     for wall in walls:
-        d = d + wall.vertex_push(mesh, d, facing_only)
-        face_push = wall.center_push(mesh, d, facing_only)
+        d = d + wall.vertex_push(mesh, d, facing)
+        face_push = wall.center_push(mesh, d, facing)
         pushed = (face_push != 0).any(axis=1)
         corners = mesh.faces[pushed].ravel()
         count = np.bincount(corners, minlength=len(d))
@@ -141,7 +145,8 @@ def _project(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing_on
 
 def _clear(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall]) -> np.ndarray:
     for _ in range(_FINAL_PROJECTIONS):
-        moved = _project(mesh, d, walls, facing_only=False)
+        # The normals decide what counts as behind a garment: take those of the surface as it lies now.
+        moved = _project(mesh, d, walls, facing=mesh.with_vertices(mesh.vertices + d))
         if np.array_equal(moved, d):
             break
         d = moved

@@ -65,10 +65,10 @@ class SignedDistanceField:
         kept = np.flatnonzero(mesh.face_areas > 0)
         if not len(kept):
             raise InputError("signed distance", expected="a mesh with faces that have an area", received="none")
-        self._solid = TriangleMesh(mesh.vertices, mesh.faces[kept]) if solid else None
+        self._winding: igl.FastWindingNumberBVH | None = None
         self._resolution = _WINDING_RESOLUTION * mesh.bbox_diagonal
         if solid:
-            kept = kept[self._outer_faces(self._solid)]
+            kept = kept[self._outer_faces(TriangleMesh(mesh.vertices, mesh.faces[kept]))]
         self._kept, self._mesh = kept, TriangleMesh(mesh.vertices, mesh.faces[kept])
         self._tree = igl.AABB()
         self._tree.init(self._mesh.vertices, self._mesh.faces)
@@ -80,13 +80,15 @@ class SignedDistanceField:
                 "signed distance", expected="a solid with outward faces", received="faces that point inward",
                 remedy="reverse the order of the corners of every face",
             )  # fmt: skip
+        self._winding = igl.FastWindingNumberBVH()
+        self._winding.init(mesh.vertices, mesh.faces)
         before = mesh.triangles.mean(axis=1) + _BURIED_PROBE * mesh.bbox_diagonal * mesh.face_normals
         outer = np.flatnonzero(~self._inside(before))
         assert len(outer), "a solid with a positive volume has an outside"
         return outer
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
-        return igl.fast_winding_number(self._solid.vertices, self._solid.faces, points) > 0.5
+        return self._winding.winding_number(points) > 0.5
 
     def _index_edges(self) -> None:
         mesh = self._mesh
@@ -116,7 +118,7 @@ class SignedDistanceField:
         normal, on_border = self._pseudonormals(face, barycentric_coordinates(closest, mesh.triangles[face]))
         offset = points - closest
         inside = np.einsum("ij,ij->i", offset, normal) < 0
-        if self._solid is not None:
+        if self._winding is not None:
             clear = length > self._resolution
             inside[clear] = self._inside(points[clear])
         side = np.where(inside, -1.0, 1.0)
