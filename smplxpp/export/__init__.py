@@ -1,4 +1,4 @@
-"""Writers of templates for other programs."""
+"""Export: a template as GLB and OBJ."""
 
 from smplxpp.export.gltf import write_glb
 from smplxpp.export.obj import write_obj

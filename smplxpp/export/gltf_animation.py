@@ -1,62 +1,150 @@
-"""glTF animation of a Template's skeleton and expressions."""
+"""Frames of body parameters as a glTF animation."""
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
-import pygltflib as gl
+import pygltflib
 from scipy.spatial.transform import Rotation
 
+from smplxpp.body.layout import JOINT_NAMES
+from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.template import Template
-from smplxpp.export.gltf_buffer import GltfBuffer
+from smplxpp.export.gltf_buffers import BufferBuilder
+from smplxpp.export.gltf_skin import rest_offsets
 
 DEFAULT_FPS = 30.0
-# Frames posed at a time: only their transforms are kept.
-_CHUNK = 32
+# A joint that expressions move by less, in metres, keeps its place at rest.
+_STILL = 1e-6
+
+
+def joint_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np.ndarray]:
+    """Each joint's rotation and translation in its parent's frame, so that glTF's skinning gives the template's pose.
+
+    The inverse bind matrices stand for the neutral joints `J`. An expression moves joints (the jaw's, the eyes') by
+    `d`, about which they then turn: with `W_j = G_j [I, J_j; 0, 1]`, the node's global transform, the local
+    translation is `J_j - J_parent + (I - R_j) d_j`, and of the root `J_root + transl + (I - R_root) d_root`.
+
+    Args:
+        template: J joints.
+        params: T frames; betas are not looked at, as in `Template.pose`.
+
+    Returns:
+        (T, J, 3, 3) rotations and (T, J, 3) translations in metres.
+
+    Raises:
+        InputError: more expressions than the template has, a skeleton outside the SMPL family, hand coefficients that
+            the template cannot expand.
+    """
+    if template.joint_count not in JOINT_NAMES:
+        raise InputError(
+            "animation", expected=f"a template of {', '.join(map(str, sorted(JOINT_NAMES)))} joints, as the parameters",
+            received=f"{template.joint_count} joints", remedy="write the file without an animation",
+        )  # fmt: skip
+    posed = _joints_alone(template).forward(replace(params, betas=np.zeros((len(params), 0))))
+    global_rotations = posed.posed_from_rest[..., :3, :3]
+    parents = template.parents
+    above = np.where((parents >= 0)[:, None, None], global_rotations[:, parents], np.eye(3))
+    rotations = above.swapaxes(-1, -2) @ global_rotations
+    moved = posed.rest_joints - template.joints
+    translations = rest_offsets(template) + moved - (rotations @ moved[..., None])[..., 0]
+    translations[:, parents < 0] += params.transl[:, None]
+    return rotations, translations
 
 
 def add_animation(
-    document: gl.GLTF2, buffer: GltfBuffer, template: Template, params: BodyParams, morph_node: int | None
+    gltf: pygltflib.GLTF2,
+    buffers: BufferBuilder,
+    template: Template,
+    params: BodyParams,
+    *,
+    joint_nodes: np.ndarray,
+    morph_node: int | None,
 ) -> None:
-    """Rotations of the joints that move, translation of the root, and weights of the expressions at `morph_node`."""
-    rotations, root_positions = _local_motion(template, params)
-    times = (np.arange(len(params)) / (params.fps or DEFAULT_FPS)).astype(np.float32)
-    animation = gl.Animation(name="motion", samplers=[], channels=[])
-    time_accessor = buffer.add(times, bounds=True)
+    """Add the frames as the animation "motion".
+
+    Every joint has a rotation; roots, and joints that expressions move, a translation; the node of the body's mesh the
+    morph weights. Frames are a linear interpolation apart.
+
+    Args:
+        gltf: where the animation goes.
+        buffers: its buffer.
+        template: J joints.
+        params: T frames at `params.fps`, or 30 a second; without morph targets the face stays neutral.
+        joint_nodes: (J,) indices of the joints' nodes.
+        morph_node: the node with the expressions, None where there are none.
+
+    Raises:
+        InputError: no frames, a frame rate that is not positive, or what `joint_motion` refuses.
+
+    Warns:
+        GeometryWarning: the template has pose correctives, which glTF's skinning leaves out.
+    """
+    times = _times(params)
+    if morph_node is None:
+        params = replace(params, expression=np.zeros((len(params), 0)))
+    rotations, translations = joint_motion(template, params)
+    if template.pose_basis is not None:
+        warnings.warn(
+            "animation: the pose correctives of the template are left out, glTF has no place for them",
+            GeometryWarning,
+            stacklevel=3,
+        )
+    animation = pygltflib.Animation(name="motion")
+    clock = buffers.add(times, bounds=True)
 
     def add_channel(node: int, path: str, values: np.ndarray) -> None:
-        output = buffer.add(values.astype(np.float32))
-        animation.samplers.append(gl.AnimationSampler(input=time_accessor, output=output, interpolation="LINEAR"))
-        target = gl.AnimationChannelTarget(node=node, path=path)
-        animation.channels.append(gl.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+        target = pygltflib.AnimationChannelTarget(node=int(node), path=path)
+        animation.channels.append(pygltflib.AnimationChannel(sampler=len(animation.samplers), target=target))
+        output = buffers.add(values.astype(np.float32))
+        animation.samplers.append(pygltflib.AnimationSampler(input=clock, output=output, interpolation="LINEAR"))
 
-    root = int(np.argmax(template.parents < 0))
-    add_channel(root, "translation", root_positions)
-    for joint in range(template.joint_count):
-        if not np.allclose(rotations[:, joint], np.eye(3), rtol=0, atol=1e-9):
-            add_channel(joint, "rotation", continuous_quaternions(rotations[:, joint]))
+    moved = np.abs(translations - rest_offsets(template)).max(axis=(0, 2)) > _STILL
+    for j, (node, quaternions) in enumerate(zip(joint_nodes, _quaternions(rotations), strict=True)):
+        add_channel(node, "rotation", quaternions)
+        if moved[j] or template.parents[j] < 0:
+            add_channel(node, "translation", translations[:, j])
     if morph_node is not None:
         weights = np.zeros((len(params), template.expression_basis.shape[2]))
         weights[:, : params.expression.shape[1]] = params.expression
-        add_channel(morph_node, "weights", weights.ravel())
-    document.animations.append(animation)
+        add_channel(morph_node, "weights", weights.reshape(-1))
+    gltf.animations.append(animation)
 
 
-def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) -> (T, 4) unit quaternions xyzw, each on its predecessor's side, so that interpolation is short."""
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    flips = np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]) < 0
-    sign = np.cumprod(np.where(np.concatenate([[False], flips]), -1.0, 1.0))
-    return quaternions * sign[:, None]
+def _joints_alone(template: Template) -> BodyModel:
+    """The body model with its joints as the only vertices; being linear in the vertices, they move as in the model."""
+    model, regressor = template.body_model, template.joint_regressor
+    eye = np.eye(model.joint_count)
+    return replace(
+        model,
+        v_template=template.joints,
+        faces=np.zeros((0, 3), np.int64),
+        shapedirs=np.tensordot(regressor, model.shapedirs, axes=1),
+        exprdirs=np.tensordot(regressor, model.exprdirs, axes=1),
+        posedirs=None,
+        joint_regressor=eye,
+        weights=eye,
+    )
 
 
-def _local_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np.ndarray]:
-    """(T, J, 3, 3) rotations relative to the parents, (T, 3) position of the root joint."""
-    transforms = []
-    for start in range(0, len(params), _CHUNK):
-        transforms.append(template.posed_from_rest(params.select(slice(start, start + _CHUNK))))
-    world = np.concatenate(transforms)
-    turned, parents = world[..., :3, :3], template.parents
-    local = np.where(parents[:, None, None] < 0, turned, turned[:, np.maximum(parents, 0)].swapaxes(-1, -2) @ turned)
-    root = int(np.argmax(parents < 0))
-    return local, turned[:, root] @ template.joints[root] + world[:, root, :3, 3]
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """(T, J, 3, 3) -> (J, T, 4) xyzw; the sign follows the frame before, so that interpolation takes the short way."""
+    frames, joints = rotations.shape[:2]
+    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, joints, 4)
+    turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
+    quaternions[1:] *= np.cumprod(turns, axis=0)[..., None]
+    return quaternions.swapaxes(0, 1)
+
+
+def _times(params: BodyParams) -> np.ndarray:
+    """(T,) float32 seconds."""
+    fps = DEFAULT_FPS if params.fps is None else params.fps
+    if not (np.isfinite(fps) and fps > 0):
+        raise InputError("animation: fps", expected="a positive number of frames a second", received=str(fps))
+    if not len(params):
+        raise InputError("animation", expected="at least one frame", received="none")
+    return (np.arange(len(params)) / fps).astype(np.float32)

@@ -1,54 +1,79 @@
-"""glTF joints, skin and per-vertex influences of a Template."""
+"""A template's skeleton and skinning weights in glTF's terms."""
 
 from __future__ import annotations
 
 import numpy as np
-import pygltflib as gl
+import pygltflib
 
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.core.template import Template
-from smplxpp.export.gltf_buffer import GltfBuffer
+from smplxpp.export.gltf_buffers import BufferBuilder
 
-# Two sets of four; engines read no more.
+# glTF names influences four at a time; two sets are what engines that read more than one take.
+SET_SIZE = 4
 MAX_INFLUENCES = 8
-_SET = 4
+# Weights are multiples of this: each is exact in float32, and so is any sum of a row.
+_WEIGHT_STEP = 2.0**-24
 
 
-def add_skeleton(document: gl.GLTF2, buffer: GltfBuffer, template: Template) -> int:
-    """Nodes 0..J-1 for the joints, each at its rest offset from its parent, and their skin; returns the skin's index.
+def quantized_influences(weights: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
+    """The strongest influences of every vertex, strongest first, in float32 weights whose rows sum to exactly 1.
 
-    The joints' frames are the world's axes in the T-pose, so that an inverse bind matrix is a translation by -J.
+    At most 8 joints are kept and renormalised. Weights are rounded to multiples of 2^-24; what a row lacks to 1 goes to
+    its strongest joint. Slots without weight name joint 0, as glTF asks.
+
+    Args:
+        weights: of N vertices over J joints.
+
+    Returns:
+        (N, K) uint8, or uint16 from 257 joints on, and (N, K) float32; K is the most influences any vertex has.
+    """
+    strongest = SkinWeights.from_dense(weights.dense(), max_influences=MAX_INFLUENCES)
+    steps = np.rint(strongest.joint_weights / _WEIGHT_STEP).astype(np.int64)
+    steps[:, 0] += round(1 / _WEIGHT_STEP) - steps.sum(axis=1)
+    used = max(1, int((steps > 0).sum(axis=1).max(initial=0)))
+    steps = steps[:, :used]
+    joints = np.where(steps > 0, strongest.joint_indices[:, :used], 0)
+    dtype = np.uint8 if weights.joint_count <= 256 else np.uint16
+    return joints.astype(dtype), (steps * _WEIGHT_STEP).astype(np.float32)
+
+
+def influence_sets(joints: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Split (N, K) influences into sets of 4 for JOINTS_n and WEIGHTS_n, as many as a vertex among these needs."""
+    used = max(1, int((weights > 0).sum(axis=1).max(initial=0)))
+    fill = ((0, 0), (0, -used % SET_SIZE))
+    joints, weights = np.pad(joints[:, :used], fill), np.pad(weights[:, :used], fill)
+    return [(joints[:, k : k + SET_SIZE], weights[:, k : k + SET_SIZE]) for k in range(0, joints.shape[1], SET_SIZE)]
+
+
+def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) -> np.ndarray:
+    """Add the skeleton: a root node, a node for each joint at rest, and the skin that binds them.
+
+    A joint's node holds its offset from its parent; its inverse bind matrix is the translation by `-J_j`, so that
+    the global transform of the node times it is `posed_from_rest` of `smplxpp.body.skinning`.
+
+    Returns:
+        (J,) indices of the joints' nodes. The skeleton's root node is the one before the first.
     """
     joints, parents = template.joints, template.parents
-    offsets = np.where(parents[:, None] < 0, joints, joints - joints[np.maximum(parents, 0)])
-    for joint, name in enumerate(template.joint_names):
-        children = np.flatnonzero(parents == joint).tolist()
-        document.nodes.append(gl.Node(name=name, translation=offsets[joint].tolist(), children=children))
-    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
-    inverse_bind[:, :3, 3] = -joints
-    document.skins.append(
-        gl.Skin(
-            name="skeleton",
-            joints=list(range(len(joints))),
-            skeleton=int(np.argmax(parents < 0)),
-            inverseBindMatrices=buffer.add(inverse_bind),
+    root = len(gltf.nodes)
+    nodes = root + 1 + np.arange(len(parents))
+    offsets = rest_offsets(template)
+    children = [nodes[parents == j].tolist() for j in range(-1, len(parents))]
+    gltf.nodes.append(pygltflib.Node(name="skeleton", children=children[0]))
+    for name, offset, below in zip(template.joint_names, offsets, children[1:], strict=True):
+        gltf.nodes.append(pygltflib.Node(name=name, translation=offset.tolist(), children=below))
+    inverse_binds = np.tile(np.eye(4, dtype=np.float32), (len(parents), 1, 1))
+    inverse_binds[:, :3, 3] = -joints
+    gltf.skins.append(
+        pygltflib.Skin(
+            name="skin", inverseBindMatrices=buffers.add(inverse_binds), joints=nodes.tolist(), skeleton=root
         )
     )
-    return len(document.skins) - 1
+    return nodes
 
 
-def influence_sets(weights: SkinWeights) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The `MAX_INFLUENCES` largest weights of N vertices in sets of four: (N, 4) joints, (N, 4) float32 weights.
-
-    Each row of all sets together sums to 1 to float32's last bit; unused slots are joint 0 at weight 0.
-    """
-    # Through the dense form: joints that occur twice at a vertex become one.
-    kept = SkinWeights.from_dense(weights.dense(), max_influences=MAX_INFLUENCES)
-    width = -(-kept.joint_indices.shape[1] // _SET) * _SET
-    missing = ((0, 0), (0, width - kept.joint_indices.shape[1]))
-    values = np.pad(kept.joint_weights, missing).astype(np.float32)
-    # Weights come largest first: that one takes the rounding.
-    values[:, 0] = 1.0 - values[:, 1:].sum(axis=1, dtype=np.float64)
-    joints = np.pad(kept.joint_indices, missing)
-    joints = np.where(values > 0, joints, 0).astype(np.uint8 if weights.joint_count <= 256 else np.uint16)
-    return [(joints[:, k : k + _SET], values[:, k : k + _SET]) for k in range(0, width, _SET)]
+def rest_offsets(template: Template) -> np.ndarray:
+    """(J, 3) of each rest joint from its parent, of a root from the origin; metres."""
+    joints, parents = template.joints, template.parents
+    return joints - np.where(parents[:, None] >= 0, joints[parents], 0.0)

@@ -1,37 +1,30 @@
-"""OBJ files with a group for each part."""
+"""A template as a Wavefront OBJ file."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
-from smplxpp.core.atomic import atomic_write_text
-from smplxpp.core.errors import InputError
+from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.template import Template
 
 
-def write_obj(path: str | Path, template: Template, *, vertices: np.ndarray | None = None) -> None:
-    """Write the template as OBJ, whole or not at all: one group a part, vertex order kept, colours after positions.
+def write_obj(path: str | Path, template: Template) -> None:
+    """Write the T-pose as an OBJ file with a group a part, whole or not at all.
+
+    Colours follow the coordinates (`v x y z r g b`), sRGB in [0, 1], as MeshLab and Blender read them. Vertices keep
+    the template's order, in metres to a tenth of a micrometre; indices count from 1 through all groups.
 
     Args:
         path: of the file.
-        template: what to write.
-        vertices: (V, 3) positions instead of the T-pose, for instance one frame of `template.pose`.
-
-    Raises:
-        InputError: positions that do not fit the template.
+        template: body and parts.
     """
-    points = template.vertices if vertices is None else np.asarray(vertices, dtype=np.float64)
-    if points.shape != template.vertices.shape or not np.isfinite(points).all():
-        raise InputError(
-            "OBJ vertices", expected=f"finite {template.vertices.shape}", received=f"shape {points.shape} or NaN"
-        )
-    rows = np.concatenate([points, template.vertex_colors / 255.0], axis=1)
-    lines = ["# metres, +Y up; colours sRGB"]
-    # Nine decimals are a nanometre.
-    lines += [f"v {x:.9f} {y:.9f} {z:.9f} {r:.4f} {g:.4f} {b:.4f}" for x, y, z, r, g, b in rows.tolist()]
+    buffer = io.BytesIO()
+    rows = np.hstack([template.vertices, template.vertex_colors / 255.0])
+    np.savetxt(buffer, rows, fmt="v %.7f %.7f %.7f %.4f %.4f %.4f")
     for name in template.part_names:
-        lines.append(f"g {name}")
-        lines += [f"f {i} {j} {k}" for i, j, k in (template.faces[template.part_faces(name)] + 1).tolist()]
-    atomic_write_text(path, "\n".join(lines) + "\n")
+        buffer.write(f"g {name}\n".encode())
+        np.savetxt(buffer, template.faces[template.part_faces(name)] + 1, fmt="f %d %d %d")
+    atomic_write_bytes(path, buffer.getvalue())

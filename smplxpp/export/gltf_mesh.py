@@ -1,0 +1,105 @@
+"""A template's parts as glTF meshes: surface, colours, influences, expressions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pygltflib
+from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
+
+from smplxpp.core.labels import LABELS
+from smplxpp.core.template import BODY_PART, Template
+from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
+from smplxpp.export.gltf_skin import influence_sets, quantized_influences
+
+# A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
+_STILL = 1e-6
+
+
+def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template, *, morph_targets: bool) -> list[int]:
+    """Add a mesh, a material and a node for every part that has faces; skin 0 moves them all.
+
+    Vertices of a part keep their order; the body's are the body model's own.
+
+    Returns:
+        Indices of the nodes, the body's first.
+    """
+    joints, weights = quantized_influences(template.weights)
+    normals = _unit_normals(template)
+    colors = linear_from_srgb(template.vertex_colors)
+    nodes = []
+    for index, name in enumerate(template.part_names):
+        faces = template.faces[template.part_faces(name)]
+        if not len(faces):
+            continue
+        rows = np.flatnonzero(template.vertex_part == index)
+        attributes = {
+            "POSITION": buffers.add(template.vertices[rows].astype(np.float32), target=ARRAY_BUFFER, bounds=True),
+            "NORMAL": buffers.add(normals[rows], target=ARRAY_BUFFER),
+            "COLOR_0": buffers.add(colors[rows], target=ARRAY_BUFFER, normalized=True),
+        }
+        for k, (set_joints, set_weights) in enumerate(influence_sets(joints[rows], weights[rows])):
+            attributes[f"JOINTS_{k}"] = buffers.add(set_joints, target=ARRAY_BUFFER)
+            attributes[f"WEIGHTS_{k}"] = buffers.add(set_weights, target=ARRAY_BUFFER)
+        primitive = pygltflib.Primitive(
+            attributes=pygltflib.Attributes(**attributes),
+            # Parts follow each other in the vertices, so the part's own indices are these.
+            indices=buffers.add(
+                (faces - rows[0]).reshape(-1).astype(index_dtype(len(rows))), target=ELEMENT_ARRAY_BUFFER
+            ),
+            material=len(gltf.materials),
+        )
+        gltf.materials.append(_material(template, name, rows))
+        mesh = pygltflib.Mesh(name=name, primitives=[primitive])
+        if morph_targets and name == BODY_PART and template.expression_basis.shape[2]:
+            _add_expressions(buffers, template, mesh)
+        nodes.append(len(gltf.nodes))
+        gltf.nodes.append(pygltflib.Node(name=name, mesh=len(gltf.meshes), skin=0))
+        gltf.meshes.append(mesh)
+    return nodes
+
+
+def expression_names(template: Template) -> list[str]:
+    """Names of the morph targets: expressions are numbered, as in the parameters."""
+    return [f"expression_{k:02d}" for k in range(template.expression_basis.shape[2])]
+
+
+def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
+    """(N, 3) uint8 sRGB -> (N, 4) uint16 linear RGB and full alpha.
+
+    Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge (IEC 61966-2-1).
+    """
+    c = np.arange(256) / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    table = np.rint(65535 * linear).astype(np.uint16)
+    return np.pad(table[colors], ((0, 0), (0, 1)), constant_values=65535)
+
+
+def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh) -> None:
+    # (E, Vb, 3): each target's rows lie together.
+    offsets = np.ascontiguousarray(np.moveaxis(template.expression_basis, 2, 0))
+    moved = np.einsum("evc,evc->ev", offsets, offsets) > _STILL**2
+    mesh.primitives[0].targets = [
+        {"POSITION": buffers.add_sparse(target, np.flatnonzero(rows))}
+        for target, rows in zip(offsets, moved, strict=True)
+    ]
+    mesh.weights = [0.0] * len(offsets)
+    mesh.extras = {"targetNames": expression_names(template)}
+
+
+def _unit_normals(template: Template) -> np.ndarray:
+    """(V, 3) float32; up where a vertex has no face of any area, since glTF asks for length 1 everywhere."""
+    normals = template.mesh.vertex_normals.astype(np.float32)
+    normals[~normals.any(axis=1)] = (0.0, 1.0, 0.0)
+    return normals
+
+
+def _material(template: Template, name: str, rows: np.ndarray) -> pygltflib.Material:
+    label = LABELS[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    return pygltflib.Material(
+        name=label.name,
+        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9),
+        # Clothes are open sheets, seen from inside at hems and cuffs; the body is closed.
+        doubleSided=name != BODY_PART,
+        alphaCutoff=None,
+        extras={"label": label.id, "part": name},
+    )
