@@ -66,9 +66,9 @@ class Person:
             if name == "body":
                 out[own] = textures.skin_colors(points[own], self.brows, self.lips, seed=1)
                 own &= (label == _OTHER) & (np.linalg.norm(points - eye, axis=1) < 0.02)
-                out[own] = textures.eye_colors(points[own] - eye[own], np.zeros(3))
+                out[own] = textures.eye_colors(points[own] - eye[own])
             elif name == "upper":
-                out[own] = textures.shirt_colors(points[own], joint["left_shoulder"][0] + 0.03)
+                out[own] = textures.shirt_colors(points[own], joint["left_shoulder"])
             elif name == "lower":
                 out[own] = textures.skirt_colors(points[own], joint["pelvis"][2])
             elif name == "shoes":

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import fast_simplification
 import igl
 import numpy as np
 
-from pipelines.makers.cloth_mesh import smooth
+from pipelines.makers.cloth_mesh import diffuse, smooth
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
@@ -27,18 +26,23 @@ class ScanConfig:
         sure_free: a cell is empty when a camera sees at least this far past it.
         sheet_thickness: given to open sheets (clothes), inwards, so that both their sides exist.
         faces: of the finished scan.
-        noise: standard deviation along the normal, correlated over neighbouring vertices.
+        detail_above, detail: edges above this height (metres over the lowest vertex: the head) are shorter by this
+            factor, as captures with cameras on the face have it.
+        noise, noise_radius: standard deviation along the normal, and over what distance it is correlated.
         seed: of the noise.
     """
 
-    cell: float = 0.0045
+    cell: float = 0.004
     views: int = 96
     resolution: int = 1024
-    min_elevation: float = -0.35
+    min_elevation: float = -0.02
     sure_free: float = 0.006
-    sheet_thickness: float = 0.004
-    faces: int = 75_000
+    sheet_thickness: float = 0.009
+    faces: int = 80_000
+    detail_above: float = 1.45
+    detail: float = 1.7
     noise: float = 0.0007
+    noise_radius: float = 0.006
     seed: int = 0
 
 
@@ -76,13 +80,10 @@ def simulate_scan(layers: TriangleMesh, sheets: list[np.ndarray], config: ScanCo
     vertices, faces, _ = igl.marching_cubes(level, grid, *size, 0.0)
     surface = _outer_component(TriangleMesh(vertices, faces))
     surface = surface.with_vertices(smooth(surface, surface.vertices, steps=1))
-    points, faces = fast_simplification.simplify(
-        surface.vertices.astype(np.float32), surface.faces.astype(np.int32), target_count=config.faces, agg=3.0
-    )
-    surface = TriangleMesh(points, faces)
+    surface = _simplified(surface, config)
     face, barycentric = _shown_points(layers, seen[: layers.face_count], surface.vertices)
     rng = np.random.default_rng(config.seed)
-    bumps = smooth(surface, rng.normal(size=(surface.vertex_count, 1)), steps=1)
+    bumps = diffuse(surface, rng.normal(size=(surface.vertex_count, 1)), radius=config.noise_radius)
     noisy = surface.vertices + config.noise * bumps / bumps.std() * surface.vertex_normals
     return SimulatedScan(surface.with_vertices(noisy), face, barycentric)
 
@@ -150,9 +151,8 @@ def _level_set(
 
     band = 2 * config.cell
     level = np.where(solid, -band, band)
-    # Only points beside a change of side, or beside the surface, need an exact distance.
-    near = np.flatnonzero(_near_vertices(mesh, grid, config.cell) | solid)
-    where = SignedDistanceField(mesh, solid=False).query(grid[near])
+    near = np.flatnonzero(_near_vertices(mesh, grid, config.cell))
+    where = SignedDistanceField(mesh, solid=True).query(grid[near])
     close = np.abs(where.distance) < band
     outside = ~solid[near] | ((where.distance > 0) & seen[where.face])
     level[near] = np.where(outside, 1.0, -1.0) * np.where(close, np.abs(where.distance), band)
@@ -182,6 +182,23 @@ def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
     kept = mesh.submesh(component == np.argmax(areas))[0]
     volume = np.einsum("ij,ij->", kept.triangles.mean(axis=1) - kept.vertices.mean(axis=0), kept.face_cross)
     return kept if volume > 0 else TriangleMesh(kept.vertices, kept.faces[:, ::-1])
+
+
+def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
+    """`config.faces` faces of about equal size (shortest edges collapse first), smaller ones on the head."""
+    floor = mesh.vertices[:, 1].min()
+    # Simplify in a space that is stretched above `detail_above`, then undo the stretch.
+    height = np.linspace(-0.1, 2.5, 2601)
+    scale = 1 + (config.detail - 1) * np.clip((height - config.detail_above) / 0.1 + 0.5, 0, 1)
+    stretched = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(height))])
+
+    y = mesh.vertices[:, 1] - floor
+    wide = np.interp(y, height, scale)
+    points = np.stack([mesh.vertices[:, 0] * wide, np.interp(y, height, stretched), mesh.vertices[:, 2] * wide], axis=1)
+    points, faces = igl.decimate(points, mesh.faces, config.faces)[:2]
+    y = np.interp(points[:, 1], stretched, height)
+    wide = np.interp(y, height, scale)
+    return TriangleMesh(np.stack([points[:, 0] / wide, y + floor, points[:, 2] / wide], axis=1), faces)
 
 
 def _shown_points(layers: TriangleMesh, seen: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

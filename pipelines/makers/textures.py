@@ -7,7 +7,7 @@ import numpy as np
 from pipelines.makers.garments import ramp, smooth_noise
 
 SKIN, LIPS, BROWS, SCLERA, IRIS, PUPIL = (
-    (222, 176, 150), (184, 100, 96), (74, 50, 36), (238, 234, 228), (86, 112, 96), (22, 18, 18),
+    (222, 176, 150), (192, 116, 108), (74, 50, 36), (238, 234, 228), (86, 112, 96), (22, 18, 18),
 )  # fmt: skip
 HAIR, HAIR_LIGHT = (62, 38, 24), (112, 72, 44)
 SHOE, SOLE = (124, 74, 46), (232, 226, 214)
@@ -21,16 +21,18 @@ def mix(a, b, t: np.ndarray) -> np.ndarray:
     return (1 - t) * np.asarray(a, dtype=float) + t * np.asarray(b, dtype=float)
 
 
-def band(x: np.ndarray, *, period: float, width: float, edge: float = 0.004) -> np.ndarray:
+def band(x: np.ndarray, *, period: float, width: float, edge: float = 0.006) -> np.ndarray:
     """(N,) 1 within `width` metres about every multiple of `period`, 0 between, soft over `edge`."""
     distance = np.abs((x + 0.5 * period) % period - 0.5 * period)
     return ramp(distance, 0.5 * (width + edge), 0.5 * (width - edge))
 
 
-def shirt_colors(points: np.ndarray, sleeve_start: float) -> np.ndarray:
+def shirt_colors(points: np.ndarray, shoulder: np.ndarray) -> np.ndarray:
     """Stripes around torso and sleeves."""
     x, y, _ = points.T
-    along = np.where(np.abs(x) > sleeve_start, np.abs(x) - sleeve_start, y)
+    start = shoulder[0] + 0.03
+    on_sleeve = (np.abs(x) > start) & (y > shoulder[1] - 0.13)
+    along = np.where(on_sleeve, np.abs(x) - start, y)
     return mix(SHIRT, STRIPE, band(along, period=0.048, width=0.02))
 
 
@@ -65,16 +67,16 @@ def skin_colors(points: np.ndarray, brows: np.ndarray, lips: np.ndarray, seed: i
     middle, half = lips.mean(axis=0), np.abs(lips - lips.mean(axis=0)).max(axis=0)
     ellipse = np.hypot((points[:, 0] - middle[0]) / half[0], (points[:, 1] - middle[1]) / half[1])
     in_front = np.abs(points[:, 2] - middle[2]) < 0.04
-    colors = mix_rows(colors, LIPS, ramp(ellipse, 1.1, 0.85) * in_front)
+    colors = mix_rows(colors, LIPS, ramp(ellipse, 1.0, 0.75) * in_front)
     # Distance to the line through the brows' points: dense samples of both arcs.
     arcs = np.concatenate([_resampled(brows[:5]), _resampled(brows[5:])])
     distance = np.linalg.norm(points[:, None] - arcs[None], axis=2).min(axis=1)
     return mix_rows(colors, BROWS, 0.85 * ramp(distance, 0.0065, 0.003))
 
 
-def eye_colors(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """White, iris and pupil by the distance from the axis through the eye's centre, looking along +z."""
-    radius = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1])
+def eye_colors(offsets: np.ndarray) -> np.ndarray:
+    """White, iris and pupil by the distance from the eye's axis, +z; `offsets` (N, 3) from its centre."""
+    radius = np.hypot(offsets[:, 0], offsets[:, 1])
     colors = mix(IRIS, SCLERA, ramp(radius, 0.0058, 0.0066))
     return mix_rows(colors, PUPIL, ramp(radius, 0.003, 0.0022))
 
