@@ -9,8 +9,8 @@ import igl
 import numpy as np
 
 from smplxpp.body import BodyModel, load_body, load_params
-from smplxpp.clean import clean_parts
-from smplxpp.core.labels import LABEL_BY_NAME
+from smplxpp.clean import PartsConfig, clean_parts
+from smplxpp.core.labels import CLOTH_LABELS, LABEL_BY_NAME, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
@@ -49,7 +49,7 @@ def find_captures(folder: Path) -> list[Path]:
     return sorted(path.parents[1] for path in folder.glob("*/geometry/topology.npz"))
 
 
-def read_capture_truth(folder: Path) -> CaptureTruth:
+def read_capture_truth(folder: Path, *, cloth_faces: int = UPPER.face_budget) -> CaptureTruth:
     """Read frame 0 of a capture; the scan is cut by its true labels, so that the figures judge what follows alone."""
     body = load_body()
     topology = np.load(folder / "geometry" / "topology.npz")
@@ -60,7 +60,8 @@ def read_capture_truth(folder: Path) -> CaptureTruth:
     label_of_part = np.array([LABEL_BY_NAME[_LABEL_OF_PART[n]].id if n in _LABEL_OF_PART else 0 for n in names])
     # A face on the seam of two labels goes with its middle one.
     labels = np.sort(label_of_part[part_of_vertex][scan.faces], axis=1)[:, 1]
-    cleaned = clean_parts(scan, labels)
+    budgets = {label.name: cloth_faces for label in CLOTH_LABELS}
+    cleaned = clean_parts(scan, labels, config=PartsConfig(face_budgets=budgets))
     parts = {}
     for part, label in _LABEL_OF_PART.items():
         faces = topology["faces"][topology["face_part"] == names.index(part)].astype(np.int64)

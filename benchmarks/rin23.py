@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import time
 from pathlib import Path
 from types import ModuleType
 
@@ -42,17 +41,24 @@ def load_peer(checkout: Path) -> ModuleType:
 
 def run_peer(
     peer: ModuleType, source: TriangleMesh, weights: np.ndarray, target: TriangleMesh
-) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Its matching and inpainting as its example calls them, thresholds included.
 
     Returns:
-        (N, J) its weights as they come, (N,) matched, seconds of both steps.
+        (N, J) its weights as they come, (N,) matched.
     """
     v1, f1, v2, f2 = (np.array(x) for x in (source.vertices, source.faces, target.vertices, target.faces))
     n1, n2 = igl.per_vertex_normals(v1, f1), igl.per_vertex_normals(v2, f2)
     limit = (0.05 * igl.bounding_box_diagonal(v2)) ** 2
-    start = time.perf_counter()
     matched, copied = peer.find_matches_closest_surface(v1, f1, n1, v2, f2, n2, weights, limit, 30)
-    middle = time.perf_counter()
     result, _ = peer.inpaint(v2, f2, copied, matched)
-    return np.asarray(result), matched, {"match": middle - start, "inpaint": time.perf_counter() - middle}
+    return np.asarray(result), matched
+
+
+def smooth_as_peer(peer: ModuleType, target: TriangleMesh, weights: np.ndarray, matched: np.ndarray) -> np.ndarray:
+    """(N, J) its smoothing, the optional last step of its example, with the example's settings."""
+    limit = 0.05 * igl.bounding_box_diagonal(np.array(target.vertices))
+    smoothed, _ = peer.smooth(
+        target.vertices, target.faces, weights, matched, limit, num_smooth_iter_steps=10, smooth_alpha=0.2
+    )
+    return smoothed

@@ -16,7 +16,7 @@ _LEGS = _THIGHS + tuple(side + joint for side in _BOTH for joint in ("knee", "an
 # What a label can never follow: a skirt hangs beside the hands, a collar and hair touch the jaw. Everything else stays
 # possible, for hair may fall down the back and a boot reach the knee.
 JOINTS_OF_LABEL: dict[str, tuple[str, ...]] = {
-    "hair": ("head", "neck", "spine3", "spine2", "left_collar", "right_collar"),
+    "hair": ("head", "neck", "left_collar", "right_collar", *_TRUNK),
     "shoe": tuple(side + joint for side in _BOTH for joint in ("knee", "ankle", "foot")),
     "lower": ("pelvis", "spine1", "spine2", *_LEGS),
     "upper": (*_TRUNK, "neck", *_ARMS, *_THIGHS),

@@ -21,6 +21,12 @@ _AXES = (
 )
 
 
+def check_target(target: TriangleMesh) -> None:
+    """Raises InputError for a mesh without faces."""
+    if not target.face_count:
+        raise InputError("target mesh", expected="at least one face", received="none")
+
+
 def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
     """Checked (V, J) float64 weights, rows summing to 1 (zero where no face uses the vertex).
 
@@ -78,21 +84,20 @@ def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.nda
     Raises:
         InputError: names the likely cause.
     """
-    if not target.face_count:
-        raise InputError("target mesh", expected="at least one face", received="none")
-    points = target.vertices[np.unique(target.faces)]
-    ratio = extent(target) / extent(source)
-    far = float(np.median(distance)) / extent(source)
+    size = extent(source)
+    ratio = extent(target) / size
+    far = float(np.median(distance)) / size
     remedy = ""
     if ratio > _LARGEST or ratio < _SMALLEST:
         # The power of ten that makes the part at most a little larger than the body.
         power = int(np.ceil(np.log10(ratio / 1.5)))
         remedy = f"the units differ: multiply the target's coordinates by {10.0**-power:g}"
     elif far > _DOUBTFUL:
-        remedy = _axes_remedy(source, points, 0.5 * float(np.median(distance)))
+        remedy = _axes_remedy(source, target.vertices[np.unique(target.faces)], 0.5 * float(np.median(distance)))
         if not remedy and far > _FARTHEST:
             remedy = "check units, axes (+Y up) and translation of both meshes"
     if remedy:
+        points = target.vertices[np.unique(target.faces)]
         low, high = (np.array2string(f(points, axis=0), precision=3) for f in (np.min, np.max))
         raise InputError(
             "target mesh placement",

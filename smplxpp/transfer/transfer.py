@@ -12,7 +12,7 @@ from smplxpp.transfer.correspond import Correspondence, closest_points, face_out
 from smplxpp.transfer.extend import extend_weights, sample_surface
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.regions import restrict_source
-from smplxpp.transfer.repair import check_placement, check_source, consistent_winding, extent
+from smplxpp.transfer.repair import check_placement, check_source, check_target, consistent_winding, extent
 
 
 def transfer_weights(
@@ -54,6 +54,7 @@ def transfer_weights(
     """
     config = config or TransferConfig()
     weights = check_source(source, source_weights)
+    check_target(target)
     joint_count = weights.shape[1]
     source = consistent_winding(source, subject="source mesh")
     target = consistent_winding(target, subject="target mesh")
