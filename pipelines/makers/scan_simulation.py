@@ -35,7 +35,7 @@ class ScanConfig:
     cell: float = 0.004
     views: int = 96
     resolution: int = 1024
-    min_elevation: float = -0.02
+    min_elevation: float = -0.12
     sure_free: float = 0.006
     sheet_thickness: float = 0.009
     faces: int = 80_000
