@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 
 import numpy as np
@@ -80,7 +79,7 @@ class BufferBuilder:
         """The file: header, JSON chunk, binary chunk (glTF 2.0, section 4.4)."""
         binary = b"".join(self._chunks)
         self._gltf.buffers = [pygltflib.Buffer(byteLength=len(binary))]
-        text = json.dumps(json.loads(self._gltf.to_json()), separators=(",", ":")).encode()
+        text = self._gltf.to_json(separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
         return b"".join(
