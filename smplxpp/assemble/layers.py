@@ -13,6 +13,12 @@ from smplxpp.core.signed_distance import SignedDistance, SignedDistanceField
 # From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything.
 LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
 
+# Metres; two parts of one scan touch at their seam to within rounding.
+TOUCHING = 1e-6
+# Cloth comes through cloth where both run alike. Where one part's web stands across the other (a scan bridges the gap
+# under a hem) the points behind the web are beside it, not through it: normals' cosine above which layers run alike.
+_PARALLEL = 0.5
+
 
 class Obstacle:
     """An inner layer that outer ones must stay out of.
@@ -34,11 +40,11 @@ class Obstacle:
         """Signed distance of (N, 3) points with (N, 3) outward unit normals.
 
         The answer is infinite where the question has none: beside a garment's border, further behind it than
-        `max_depth`, and where the two surfaces face different ways.
+        `max_depth`, and where the two surfaces do not run alike.
         """
         found = self._field.query(points)
         if not self._solid:
-            facing = np.einsum("ij,ij->i", found.normal, normals) > 0
+            facing = np.einsum("ij,ij->i", found.normal, normals) > _PARALLEL
             meaningful = facing & ~found.on_border & (found.distance > -self._max_depth)
             found.distance[~meaningful] = np.inf
         return found
@@ -51,6 +57,17 @@ class Obstacle:
         bound = self._field.query(points).distance
         return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
+    def clearance(self, points: np.ndarray, normals: np.ndarray, wanted: float) -> np.ndarray:
+        """(N,) metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
+
+        Parts cut from one scan share a seam; a gap there would have to tear the cloth.
+        """
+        if self._solid:
+            return np.full(len(points), wanted)
+        start = self.distance(points, normals).distance
+        outside = np.clip(np.where(np.isfinite(start), start, 0.0), 0.0, wanted)
+        return np.where(start < -TOUCHING, wanted, outside)
+
 
 @dataclass(frozen=True)
 class Penetration:
@@ -58,7 +75,7 @@ class Penetration:
 
     Attributes:
         inner: name of the inner layer.
-        vertices: vertices strictly inside. face_centers: centres of faces strictly inside.
+        vertices: vertices inside by more than `TOUCHING`. face_centers: centres of faces inside by more.
         depth_mean, depth_max: of those vertices, metres; 0 if none.
     """
 
@@ -73,11 +90,11 @@ def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
     """Count and depth of an outer layer's vertices and face centres inside an inner layer."""
     distance = obstacle.distance(mesh.vertices, mesh.vertex_normals).distance
     centers = obstacle.distance(mesh.triangles.mean(axis=1), mesh.face_normals).distance
-    depth = -distance[distance < 0]
+    depth = -distance[distance < -TOUCHING]
     return Penetration(
         inner=obstacle.name,
         vertices=len(depth),
-        face_centers=int((centers < 0).sum()),
+        face_centers=int((centers < -TOUCHING).sum()),
         depth_mean=float(depth.mean()) if len(depth) else 0.0,
         depth_max=float(depth.max(initial=0.0)),
     )

@@ -17,7 +17,8 @@ class PushConfig:
     """How `push_out` moves a layer.
 
     Attributes:
-        clearance: metres that every vertex keeps from the inner layers.
+        clearance: metres that every vertex keeps from the body, and from a garment that it had come through. Cloth
+            closer to a garment without cutting into it (two parts of one scan meet at their seam) keeps what it has.
         damping: share of a displacement lost at each ring of vertices around a push; the smaller, the wider and
             gentler the bulge.
         iterations: smoothing steps.
@@ -27,7 +28,7 @@ class PushConfig:
     clearance: float = 1e-3
     damping: float = 0.25
     iterations: int = 20
-    max_depth: float = 0.03
+    max_depth: float = 0.015
 
     def __post_init__(self) -> None:
         good = 1e-4 <= self.clearance < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0 < self.max_depth
@@ -74,19 +75,26 @@ def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig |
     for _ in range(config.iterations):
         d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls)
     d = _clear(mesh, d, walls)
-    joined = mean + mean.T != 0
+    return mesh.vertices + _turn_back(mesh, d, walls, mean)
+
+
+def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_matrix) -> np.ndarray:
+    """Share the displacement in a growing neighbourhood of faces that turned over; the best of all rounds."""
     near = np.zeros(mesh.vertex_count, dtype=bool)
+    turned = turned_faces(mesh, mesh.vertices + d)
+    best, fewest = d, int(turned.sum())
     for _ in range(_UNFLIP_ROUNDS):
-        turned = turned_faces(mesh, mesh.vertices + d)
-        if not turned.any():
+        if not fewest:
             break
-        # A growing neighbourhood of the faces that turned over shares its displacement, then all go out again.
         near[mesh.faces[turned]] = True
-        near |= (joined @ near) > 0
+        near |= (mean @ near) > 0
         for _ in range(_UNFLIP_STEPS):
             d = np.where(near[:, None], mean @ d, d)
         d = _clear(mesh, d, walls)
-    return mesh.vertices + d
+        turned = turned_faces(mesh, mesh.vertices + d)
+        if turned.sum() < fewest:
+            best, fewest = d, int(turned.sum())
+    return best
 
 
 def turned_faces(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
@@ -98,27 +106,29 @@ class _Wall:
     """One obstacle as seen from one layer: signed distance where the layer began bounds it where it is now."""
 
     def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self.obstacle, self.clearance = obstacle, clearance
-        self._vertex_start = obstacle.lower_bound(mesh.vertices)
-        self._center_start = obstacle.lower_bound(mesh.triangles.mean(axis=1))
+        self.obstacle = obstacle
+        centers = mesh.triangles.mean(axis=1)
+        self._vertex_start, self._center_start = (obstacle.lower_bound(x) for x in (mesh.vertices, centers))
+        self._vertex_clearance = obstacle.clearance(mesh.vertices, mesh.vertex_normals, clearance)
+        self._center_clearance = obstacle.clearance(centers, mesh.face_normals, _CENTER_SHARE * clearance)
 
     def vertex_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
-        """(N, 3) that brings every vertex to the clearance."""
+        """(N, 3) that brings every vertex to its clearance."""
         normals = (facing or mesh).vertex_normals
-        return self._push(mesh.vertices + d, normals, d, self._vertex_start, self.clearance, facing is None)
+        return self._push(mesh.vertices + d, normals, d, self._vertex_start, self._vertex_clearance, facing is None)
 
     def center_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
         """(M, 3) that brings the centre of every face clear of the surface."""
         moved = d[mesh.faces].mean(axis=1)
         centers = mesh.triangles.mean(axis=1) + moved
-        normals, clearance = (facing or mesh).face_normals, _CENTER_SHARE * self.clearance
-        return self._push(centers, normals, moved, self._center_start, clearance, facing is None)
+        normals = (facing or mesh).face_normals
+        return self._push(centers, normals, moved, self._center_start, self._center_clearance, facing is None)
 
     def _push(self, points, normals, moved, start, clearance, facing_only):
         # A signed distance changes by no more than the way travelled: the rest need not be asked again.
         ask = np.flatnonzero(start - np.linalg.norm(moved, axis=1) < clearance)
         found = self.obstacle.distance(points[ask], normals[ask])
-        missing = clearance - found.distance
+        missing = clearance[ask] - found.distance
         near = missing > _TOLERANCE
         if facing_only:
             near &= np.einsum("ij,ij->i", found.gradient, normals[ask]) > _FACING_COSINE

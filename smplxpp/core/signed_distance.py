@@ -14,8 +14,9 @@ from smplxpp.core.mesh import TriangleMesh, normalize_rows
 _ON_EDGE = 1e-9
 # libigl's fast winding number works in float32: this share of the mesh's size is safely beyond its noise.
 _WINDING_RESOLUTION = 1e-6
-# A face whose outer side, this share of the mesh's size before it, is inside the solid belongs to no outer surface.
-_BURIED_PROBE = 1e-4
+# A face with the solid again this share of the mesh's size before it (2 mm on a body) lies within it, or in a slit (a
+# closed mouth, an eyelid's fold) that is no way out.
+_BURIED_PROBE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +45,12 @@ class SignedDistanceField:
 
     A solid (`solid=True`: a body) is the union of what its surfaces enclose: inside is where the generalised winding
     number is above 1/2 (Jacobson et al. 2013; fast evaluation of Barill et al. 2018). Small holes, limbs that
-    overlap, eyes and teeth within the head do not disturb it. Faces that lie within the solid are no part of its
-    surface and are left out, so that the gradient leads out of the union.
+    overlap, eyes and teeth within the head do not disturb it. Faces that lie within the solid, or in slits narrower
+    than a thousandth of its size, are left out, so that the gradient leads out of the union.
 
     An open surface (`solid=False`: a garment) has a front and a back: the sign is that of (p - c) . n with c the
-    closest point and n its pseudonormal, the face's normal, the sum of both normals on an edge, the angle-weighted normal at a
-    vertex (Baerentzen and Aanaes, IEEE TVCG 2005). It says nothing where `on_border`.
+    closest point and n its pseudonormal: the face's normal, the sum of both normals on an edge, the angle-weighted
+    normal at a vertex (Baerentzen and Aanaes, IEEE TVCG 2005). It says nothing where `on_border`.
 
     Zero-area faces are left out.
 

@@ -1,0 +1,94 @@
+"""Pushing layers apart: nothing left inside, no spike, no face turned, and nothing moved without need."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from smplxpp.assemble import Obstacle, PushConfig, measure_penetration, push_out, turned_faces
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+def ball(radius: float, subdivisions: int = 4) -> TriangleMesh:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def dented(radius: float = 0.105, depth: float = 0.012) -> TriangleMesh:
+    """A ball around the one of 0.1 m, with a dent that goes into it."""
+    mesh = ball(radius)
+    dent = np.exp(-((1 - mesh.vertices[:, 0] / radius) ** 2) / 0.02)
+    return mesh.with_vertices(mesh.vertices * (1 - depth / radius * dent)[:, None])
+
+
+def solid(mesh: TriangleMesh) -> Obstacle:
+    return Obstacle("body", mesh, solid=True, max_depth=0.03)
+
+
+def test_a_dent_is_pushed_out_to_the_clearance():
+    inner, outer = ball(0.1), dented()
+    before = measure_penetration(outer, solid(inner))
+    assert before.vertices > 20
+    assert before.depth_max == pytest.approx(0.007, abs=5e-4)
+    moved = outer.with_vertices(push_out(outer, [solid(inner)], PushConfig(clearance=1e-3)))
+    after = measure_penetration(moved, solid(inner))
+    assert (after.vertices, after.face_centers) == (0, 0)
+    assert np.linalg.norm(moved.vertices, axis=1).min() > 0.1
+    assert not turned_faces(outer, moved.vertices).any()
+    way = np.linalg.norm(moved.vertices - outer.vertices, axis=1)
+    assert way.max() < 0.0095
+    # No spike: neighbours' ways differ by less than half the longest.
+    assert np.abs(np.diff(way[moved.edges], axis=1)).max() < 0.5 * way.max()
+    # Away from the dent nothing moves.
+    assert way[outer.vertices[:, 0] < 0].max() < 1e-6
+
+
+def test_clear_layers_are_left_alone():
+    outer = ball(0.11)
+    assert np.array_equal(push_out(outer, [solid(ball(0.1))]), outer.vertices)
+    assert np.array_equal(push_out(outer, []), outer.vertices)
+
+
+def test_rigid_motion_moves_the_answer_along():
+    # Turned against each other: where two faces are equally near, rounding would choose.
+    skew = Rotation.from_rotvec([0.11, 0.23, 0.35]).as_matrix()
+    inner, outer = ball(0.1, 3), dented()
+    inner = inner.with_vertices(inner.vertices @ skew.T)
+    turn, shift = Rotation.from_euler("xyz", [1.0, 0.2, -0.7]).as_matrix(), np.array([0.3, 1.0, -0.2])
+    moved_inner = inner.with_vertices(inner.vertices @ turn.T + shift)
+    moved_outer = outer.with_vertices(outer.vertices @ turn.T + shift)
+    here, there = push_out(outer, [solid(inner)]), push_out(moved_outer, [solid(moved_inner)])
+    assert np.allclose(there, here @ turn.T + shift, atol=1e-6)
+
+
+def test_order_of_the_vertices_does_not_matter():
+    inner, outer = ball(0.1, 3), dented()
+    order = np.random.default_rng(0).permutation(outer.vertex_count)
+    back = np.argsort(order)
+    shuffled = TriangleMesh(outer.vertices[order], back[outer.faces])
+    assert np.allclose(push_out(shuffled, [solid(inner)])[back], push_out(outer, [solid(inner)]), atol=1e-9)
+
+
+def half(mesh: TriangleMesh) -> TriangleMesh:
+    return mesh.submesh(mesh.triangles.mean(axis=1)[:, 0] > 0)[0]
+
+
+def test_garments_are_open_surfaces():
+    # A half shell: what lies far behind it, or beside its border, is not "inside".
+    inner = Obstacle("shirt", half(ball(0.1)), solid=False, max_depth=0.03)
+    assert measure_penetration(half(ball(0.098)), inner).vertices > 100
+    assert measure_penetration(half(ball(0.06)), inner).vertices == 0
+    assert measure_penetration(ball(0.05, 2).with_vertices(ball(0.05, 2).vertices - [0.3, 0, 0]), inner).vertices == 0
+    outer = half(dented())
+    moved = outer.with_vertices(push_out(outer, [inner]))
+    assert measure_penetration(outer, inner).vertices > 20
+    assert measure_penetration(moved, inner).vertices == 0
+
+
+@pytest.mark.parametrize("change", [{"clearance": 0.0}, {"damping": 1.5}, {"iterations": -1}, {"max_depth": 0.0}])
+def test_bad_configuration(change):
+    with pytest.raises(InputError, match="push configuration"):
+        PushConfig(**change)
