@@ -75,9 +75,10 @@ def load_template(path: str | Path) -> Template:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # A file of our own: numpy does not close what it opened when the archive turns out to be damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             return {key: data[key] for key in data.files}
-    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         # A lone npy loads as an array, which has no `files`; objects in an npz are refused as ValueError.
         raise InputError(
             f"template file {path}",

@@ -60,6 +60,19 @@ def test_a_part_within_the_body_comes_out(body):
     assert np.array_equal(template.vertices[: body.vertex_count], body.forward(params()).rest_vertices[0])
 
 
+def test_the_mean_hand_leaves_no_correctives_in_the_t_pose(body):
+    # Pose correctives as SMPL-X has them, and a mean hand that would set them off at the zero pose.
+    width = 9 * (body.joint_count - 1)
+    curled = replace(
+        body,
+        posedirs=np.broadcast_to(np.float64(0.01), (body.vertex_count, 3, width)),
+        left_hand_mean=np.full(45, 0.2),
+        right_hand_mean=np.full(45, -0.2),
+    )
+    template, _ = assemble_template(curled, params(), {})
+    assert np.array_equal(template.vertices, body.forward(params()).rest_vertices[0])
+
+
 def test_outer_garments_leave_inner_ones(body):
     hips = ["pelvis", "spine1"]
     parts = {

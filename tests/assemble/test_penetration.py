@@ -92,3 +92,13 @@ def test_garments_are_open_surfaces():
 def test_bad_configuration(change):
     with pytest.raises(InputError, match="push configuration"):
         PushConfig(**change)
+
+
+def test_a_shared_seam_stays_closed():
+    # One sheet cut in two: the pieces touch along the cut, and neither has come through the other.
+    whole = ball(0.1)
+    lower = whole.triangles.mean(axis=1)[:, 1] < 0
+    inner, outer = whole.submesh(lower)[0], whole.submesh(~lower)[0]
+    obstacle = Obstacle("trousers", inner, solid=False, max_depth=0.03)
+    assert measure_penetration(outer, obstacle).vertices == 0
+    assert np.abs(push_out(outer, [obstacle]) - outer.vertices).max() < 1e-9
