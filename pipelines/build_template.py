@@ -12,7 +12,7 @@ from typing import Any
 
 from pipelines import scan_stages, template_stages, validate_stage
 from pipelines.build_config import STAGES, BuildConfig, BuildInputs
-from smplxpp.core.artifact import StageOutput, StageRecord, jsonable, require_stage, run_stage, sha256_file
+from smplxpp.core.artifact import StageOutput, StageRecord, code_digest, jsonable, require_stage, run_stage, sha256_file
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
 
@@ -59,6 +59,7 @@ def build(
             raise InputError("stage", expected=f"one of {', '.join(STAGES)}", received=repr(name))
     run.mkdir(parents=True, exist_ok=True)
     stages = _stages(run, inputs, config)
+    code = code_digest("smplxpp", "pipelines")
     records: dict[str, StageRecord] = {}
     for name in STAGES[: STAGES.index(last) + 1]:
         stage = stages[name]
@@ -67,7 +68,7 @@ def build(
             continue
         progress(name, False)
         settings = {key: getattr(config if hasattr(config, key) else inputs, key) for key in stage.settings}
-        digests: dict[str, str] = {}
+        digests = {"code": code}
         for key in stage.files:
             digests |= _file_digests(key, getattr(inputs, key))
         for other in stage.needs:

@@ -14,6 +14,7 @@ import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,16 @@ def versions() -> dict[str, str]:
 
     names = ("smplxpp", "numpy", "scipy", "libigl", "fast-simplification")
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def code_digest(*packages: str) -> str:
+    """Hex SHA-256 of the Python sources of installed packages: a change of code is a change of version."""
+    digest = hashlib.sha256()
+    for package in packages:
+        root = Path(str(import_module(package).__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{package}/{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def stage_key(*, config: Any, inputs: Mapping[str, str]) -> str:
