@@ -33,7 +33,7 @@ bench: $(STAMP)
 
 fixture: $(STAMP)
 	$(BIN)/pip install --quiet -c constraints.txt 'anny>=0.6.2'
-	$(BIN)/python -m pipelines.fixture --out data/fixtures/person
+	$(BIN)/python -m pipelines.makers.fixture --out data/fixtures/person
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -1,0 +1,59 @@
+"""`make demo`: the template of the embedded person, from its scan to a report and a moving picture."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.logging import RichHandler
+
+from pipelines.commands.animate import Animate
+from pipelines.commands.build import Build
+from smplxpp.core.errors import InputError
+
+FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Build the embedded person's template, animate it, say where the report lies."""
+
+    out: Path = Path("runs/demo")
+    """Folder of the run."""
+    capture: Path = FIXTURE
+    """Capture to build; the embedded person by default."""
+
+    def run(self) -> Path:
+        """Build and animate; returns the path of the report.
+
+        Raises:
+            InputError: the fixture is not there (an installed package does not hold it).
+        """
+        console = Console(stderr=True)
+        if not self.capture.is_dir():
+            raise InputError("fixture", expected="a folder", received=str(self.capture), remedy="run in a checkout")
+        Build(out=self.out, capture=self.capture).run()
+        film = self.out / "motion.mp4"
+        Animate(run_folder=self.out, params=self.capture / "params" / "params.npz", out=film, height=540).run()
+        report = self.out / "report.html"
+        console.print(f"\nreport  {report.resolve()}\nfilm    {film.resolve()}", highlight=False, soft_wrap=True)
+        return report
+
+
+def main() -> int:
+    """Entry point of `python -m pipelines.demo`."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[RichHandler(show_path=False)])
+    try:
+        tyro.cli(Demo, prog="python -m pipelines.demo").run()
+    except InputError as error:
+        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
