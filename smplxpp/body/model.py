@@ -168,7 +168,7 @@ class BodyModel:
                 received=f"{used}",
                 remedy="use the body that the parameters were fitted with, or cut the parameters",
             )
-        flat = basis.reshape(-1, known)[:, :used]
+        flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
         return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
 
     def _pose_offsets(self, rotations: Any) -> Any | None:
