@@ -8,7 +8,7 @@ import numpy as np
 
 from smplxpp.core.labels import HAIR, LOWER, OUTER, SHOE, UPPER
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.signed_distance import SignedDistance, SignedDistanceField
+from smplxpp.core.signed_distance import SignedDistanceField
 
 # From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything.
 LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
@@ -35,27 +35,42 @@ class Obstacle:
         self.name = name
         self._solid, self._max_depth = solid, max_depth
         self._field = SignedDistanceField(mesh, solid=solid)
+        used = mesh.vertices[np.unique(mesh.faces)]
+        self._low, self._high = used.min(axis=0), used.max(axis=0)
 
-    def distance(self, points: np.ndarray, normals: np.ndarray) -> SignedDistance:
-        """Signed distance of (N, 3) points with (N, 3) outward unit normals.
+    def distance(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance (N,) of (N, 3) points with (N, 3) outward unit normals, and its (N, 3) gradient.
 
-        The answer is infinite where the question has none: beside a garment's border, further behind it than
-        `max_depth`, and where the two surfaces do not run alike.
+        The answer is infinite further than `max_depth` from the bounding box, and where the question has none: beside
+        a garment's border, further behind it than `max_depth`, and where the two surfaces do not run alike.
         """
-        found = self._field.query(points)
+        near = self._box_distance(points) <= self._max_depth
+        found = self._field.query(points[near])
+        distance, gradient = np.full(len(points), np.inf), np.zeros_like(points)
         if not self._solid:
-            facing = np.einsum("ij,ij->i", found.normal, normals) > _PARALLEL
+            facing = np.einsum("ij,ij->i", found.normal, normals[near]) > _PARALLEL
             meaningful = facing & ~found.on_border & (found.distance > -self._max_depth)
             found.distance[~meaningful] = np.inf
-        return found
+        distance[near], gradient[near] = found.distance, found.gradient
+        return distance, gradient
 
     def lower_bound(self, points: np.ndarray) -> np.ndarray:
         """(N,) metres: a point that moves less than this above zero cannot come inside; infinite far behind a garment.
 
         Unlike `distance` it answers beside borders too, where a small move may give the question an answer.
         """
-        bound = self._field.query(points).distance
+        bound = self._box_distance(points)
+        near = bound <= self._max_depth
+        bound[near] = self._field.query(points[near]).distance
         return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
+
+    def _box_distance(self, points: np.ndarray) -> np.ndarray:
+        """(N,) metres to the bounding box, 0 inside: far points need no search."""
+        squared = np.zeros(len(points))
+        for axis in range(3):
+            x = points[:, axis]
+            squared += np.maximum(np.maximum(self._low[axis] - x, x - self._high[axis]), 0.0) ** 2
+        return np.sqrt(squared)
 
     def clearance(self, points: np.ndarray, normals: np.ndarray, wanted: float) -> np.ndarray:
         """(N,) metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
@@ -64,7 +79,7 @@ class Obstacle:
         """
         if self._solid:
             return np.full(len(points), wanted)
-        start = self.distance(points, normals).distance
+        start = self.distance(points, normals)[0]
         outside = np.clip(np.where(np.isfinite(start), start, 0.0), 0.0, wanted)
         return np.where(start < -TOUCHING, wanted, outside)
 
@@ -88,8 +103,8 @@ class Penetration:
 
 def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
     """Count and depth of an outer layer's vertices and face centres inside an inner layer."""
-    distance = obstacle.distance(mesh.vertices, mesh.vertex_normals).distance
-    centers = obstacle.distance(mesh.triangles.mean(axis=1), mesh.face_normals).distance
+    distance, _ = obstacle.distance(mesh.vertices, mesh.vertex_normals)
+    centers, _ = obstacle.distance(face_centers(mesh, mesh.vertices), mesh.face_normals)
     depth = -distance[distance < -TOUCHING]
     return Penetration(
         inner=obstacle.name,
@@ -98,3 +113,9 @@ def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
         depth_mean=float(depth.mean()) if len(depth) else 0.0,
         depth_max=float(depth.max(initial=0.0)),
     )
+
+
+def face_centers(mesh: TriangleMesh, values: np.ndarray) -> np.ndarray:
+    """(M, 3) mean over each face's corners of (N, 3) values at the vertices."""
+    a, b, c = mesh.faces.T
+    return (values[a] + values[b] + values[c]) / 3.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
-from smplxpp.assemble.layers import Obstacle
+from smplxpp.assemble.layers import Obstacle, face_centers
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
@@ -31,11 +31,11 @@ class PushConfig:
     max_depth: float = 0.015
 
     def __post_init__(self) -> None:
-        good = 1e-4 <= self.clearance < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0 < self.max_depth
+        good = 1e-4 <= self.clearance <= self.max_depth < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0
         if not good:
             raise InputError(
                 "push configuration",
-                expected="clearance >= 1e-4, damping in [0, 1], iterations >= 0, max_depth > 0",
+                expected="1e-4 <= clearance <= max_depth, damping in [0, 1], iterations >= 0",
                 received=str(self),
             )
 
@@ -106,49 +106,47 @@ class _Wall:
     """One obstacle as seen from one layer: signed distance where the layer began bounds it where it is now."""
 
     def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self.obstacle = obstacle
-        centers = mesh.triangles.mean(axis=1)
-        self._vertex_start, self._center_start = (obstacle.lower_bound(x) for x in (mesh.vertices, centers))
+        self._obstacle, self._mesh = obstacle, mesh
+        self._centers = face_centers(mesh, mesh.vertices)
+        self._vertex_start, self._center_start = (obstacle.lower_bound(x) for x in (mesh.vertices, self._centers))
         self._vertex_clearance = obstacle.clearance(mesh.vertices, mesh.vertex_normals, clearance)
-        self._center_clearance = obstacle.clearance(centers, mesh.face_normals, _CENTER_SHARE * clearance)
+        self._center_clearance = obstacle.clearance(self._centers, mesh.face_normals, _CENTER_SHARE * clearance)
 
-    def vertex_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
-        """(N, 3) that brings every vertex to its clearance."""
-        normals = (facing or mesh).vertex_normals
-        return self._push(mesh.vertices + d, normals, d, self._vertex_start, self._vertex_clearance, facing is None)
+    def vertex_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) vertices displaced by d (N, 3) that are too near, and (n, 3) what brings them to their clearance."""
+        normals = (facing or self._mesh).vertex_normals
+        start, clearance = self._vertex_start, self._vertex_clearance
+        return self._push(self._mesh.vertices, d, normals, start, clearance, facing is None)
 
-    def center_push(self, mesh: TriangleMesh, d: np.ndarray, facing: TriangleMesh | None) -> np.ndarray:
-        """(M, 3) that brings the centre of every face clear of the surface."""
-        moved = d[mesh.faces].mean(axis=1)
-        centers = mesh.triangles.mean(axis=1) + moved
-        normals = (facing or mesh).face_normals
-        return self._push(centers, normals, moved, self._center_start, self._center_clearance, facing is None)
+    def center_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) faces whose centres are too near, and (m, 3) what brings those clear."""
+        normals, moved = (facing or self._mesh).face_normals, face_centers(self._mesh, d)
+        return self._push(self._centers, moved, normals, self._center_start, self._center_clearance, facing is None)
 
-    def _push(self, points, normals, moved, start, clearance, facing_only):
+    def _push(self, origin, moved, normals, start, clearance, facing_only):
         # A signed distance changes by no more than the way travelled: the rest need not be asked again.
-        ask = np.flatnonzero(start - np.linalg.norm(moved, axis=1) < clearance)
-        found = self.obstacle.distance(points[ask], normals[ask])
-        missing = clearance[ask] - found.distance
+        ask = np.flatnonzero(start - np.sqrt(np.einsum("ij,ij->i", moved, moved)) < clearance)
+        distance, gradient = self._obstacle.distance(origin[ask] + moved[ask], normals[ask])
+        missing = clearance[ask] - distance
         near = missing > _TOLERANCE
         if facing_only:
-            near &= np.einsum("ij,ij->i", found.gradient, normals[ask]) > _FACING_COSINE
-        push = np.zeros_like(points)
-        push[ask[near]] = missing[near, None] * found.gradient[near]
-        return push
+            near &= np.einsum("ij,ij->i", gradient, normals[ask]) > _FACING_COSINE
+        return ask[near], missing[near, None] * gradient[near]
 
 
 def _project(
     mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing: TriangleMesh | None = None
 ) -> np.ndarray:
     """One round of pushes; without `facing` only those that do not lead to the far side of a limb."""
+    d = d.copy()
     for wall in walls:
-        d = d + wall.vertex_push(mesh, d, facing)
-        face_push = wall.center_push(mesh, d, facing)
-        pushed = (face_push != 0).any(axis=1)
-        corners = mesh.faces[pushed].ravel()
+        vertices, push = wall.vertex_push(d, facing)
+        d[vertices] += push
+        faces, push = wall.center_push(d, facing)
+        corners = mesh.faces[faces].ravel()
         count = np.bincount(corners, minlength=len(d))
         for axis in range(3):
-            total = np.bincount(corners, np.repeat(face_push[pushed, axis], 3), minlength=len(d))
+            total = np.bincount(corners, np.repeat(push[:, axis], 3), minlength=len(d))
             d[:, axis] += total / np.maximum(count, 1)
     return d
 
