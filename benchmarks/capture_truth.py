@@ -68,8 +68,9 @@ def read_capture_truth(folder: Path, *, cloth_faces: int = UPPER.face_budget) ->
         parts[label] = _true_part(
             cleaned[label].mesh, TriangleMesh(posed, faces), topology["weights"], topology["v_tpose"]
         )
-    exact = load_params(folder / "params" / "000000.npz")
     motion = folder / "params" / "params.npz"
+    single = folder / "params" / "000000.npz"
+    exact = load_params(single if single.exists() else motion)
     return CaptureTruth(
         folder.name,
         body,
