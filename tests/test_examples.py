@@ -1,0 +1,83 @@
+"""The examples run as a user runs them, and what they write is what they say."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from smplxpp import Template
+
+ROOT = Path(__file__).resolve().parents[1]
+# What each must write into its folder.
+FILES = {
+    "01_build_from_a_scan": {"smplxpp.npz", "template.glb"},
+    "02_transfer_weights": {"as_published.ply", "default.ply", "default_for_lower_clothes.ply"},
+    "03_metrics": {"comparison.json"},
+    "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
+}
+
+
+def run_example(name: str, out: Path) -> str:
+    """Run an example from the repository's root; its output."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", f"examples/{name}.py", "--out", str(out)],
+        cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def numbers(pattern: str, text: str) -> list[float]:
+    """The numbers that a pattern's groups find, in order."""
+    return [float(n) for found in re.findall(pattern, text) for n in (found if isinstance(found, tuple) else (found,))]
+
+
+def test_every_example_is_listed_and_short() -> None:
+    examples = sorted((ROOT / "examples").glob("*.py"))
+    assert {path.stem for path in examples} == set(FILES)
+    assert all(len(path.read_text().splitlines()) <= 60 for path in examples)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> None:
+    text = run_example(name, tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
+    check = {"01": check_build, "02": check_transfer, "03": check_metrics, "04": check_animate}[name[:2]]
+    check(text, tmp_path / "out")
+
+
+def check_build(text: str, out: Path) -> None:
+    template = Template.load(out / "smplxpp.npz")
+    assert set(template.part_names) == {"body", "hair", "shoe", "upper", "lower"}
+    assert numbers(r"(\d+) after", text) == [0]
+    assert max(numbers(r"round trip (\S+) m", text)) < 1e-9
+    assert set(trimesh.load(out / "template.glb").geometry) >= {"body", "upper"}
+
+
+def check_transfer(text: str, out: Path) -> None:
+    variation = numbers(r"variation (\S+);", text)
+    assert len(variation) == 3 and 0 < max(variation) < 0.15
+    published, default, labelled = numbers(r"p95 (\S+), edges", text)
+    assert max(default, labelled) < published
+
+
+def check_metrics(text: str, out: Path) -> None:
+    whole, visible = numbers(r"P2S (\S+), Chamfer \S+, Hausdorff", text)
+    assert visible < whole  # the naked body under the clothes does not count
+    scales = dict(re.findall(r"(icon-cm|pytorch3d) +P2S (\S+),", text))
+    assert set(scales) == {"icon-cm", "pytorch3d"}
+    assert "weights: valid True" in text
+
+
+def check_animate(text: str, out: Path) -> None:
+    assert numbers(r"motion.glb: (\d+) frames at (\S+) a second", text) == [24, 10]
+    squat = trimesh.load(out / "squat.ply", process=False)
+    standing = 1.5
+    assert 0.5 < squat.extents[1] < standing
