@@ -238,6 +238,7 @@ def _template(
         right_hand_mean=body.right_hand_mean,
         body_labels=body.part_labels,
         body_label_names=body.part_label_names,
+        expression_names=body.expression_names,
         body_index=np.concatenate([np.arange(count), nearest]),
         scan_index=np.concatenate(scan_index),
         metadata={"body": body.name, "smplxpp": metadata.version("smplxpp")},

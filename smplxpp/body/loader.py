@@ -25,6 +25,7 @@ _OPTIONAL = (
     "joint_names",
     "vertex_labels",
     "vertex_label_names",
+    "expr_names",
 )
 # SMPL-X's own files: from this many directions on, the first 300 are shape and the rest expression; shorter ones
 # hold 10 and 10.
@@ -109,7 +110,9 @@ class _Builder:
         for value in arrays.values():
             if value is not None:
                 value.setflags(write=False)
-        return BodyModel(name=self.path.stem, joint_names=names, part_label_names=label_names, **arrays)
+        expressions = (self._names("expr_names", exprdirs.shape[2]) or ())[: arrays["exprdirs"].shape[2]]
+        texts = {"joint_names": names, "part_label_names": label_names, "expression_names": expressions}
+        return BodyModel(name=self.path.stem, **texts, **arrays)
 
     def _error(self, key: str, expected: str, received: str, remedy: str = "") -> InputError:
         return InputError(f"body file {self.path}: {key}", expected=expected, received=received, remedy=remedy)

@@ -72,6 +72,7 @@ class BodyModel:
         left_hand_mean, right_hand_mean: (45,) axis-angle; None where absent.
         part_labels: (V,) int64 indices into `part_label_names`: the file's own labels, else the joint of most weight.
         part_label_names: names of the parts.
+        expression_names: E names; numbered where the file gives none.
     """
 
     name: str
@@ -90,8 +91,14 @@ class BodyModel:
     right_hand_mean: np.ndarray | None
     part_labels: np.ndarray
     part_label_names: tuple[str, ...]
+    expression_names: tuple[str, ...] = ()
     # Tensors of the arrays above, by (name, dtype, device).
     _tensors: dict = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if len(self.expression_names) != self.num_expressions:
+            numbered = tuple(f"expression_{k:02d}" for k in range(self.num_expressions))
+            object.__setattr__(self, "expression_names", numbered)
 
     @property
     def vertex_count(self) -> int:

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from smplxpp.core.rotations import matrix_from_rotvec
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.rotations import matrix_from_rotvec
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 

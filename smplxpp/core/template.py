@@ -56,6 +56,7 @@ class Template:
         body_label_names: their names.
         body_index: (V,) int64 the nearest body vertex at rest; its own index for a body vertex.
         scan_index: (V,) int64 vertex of the scan that a vertex comes from, or -1.
+        expression_names: E names; numbered where none are given.
         metadata: short texts: name of the body, versions.
 
     Raises:
@@ -84,6 +85,7 @@ class Template:
     body_label_names: tuple[str, ...]
     body_index: np.ndarray
     scan_index: np.ndarray
+    expression_names: tuple[str, ...] = ()
     metadata: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -93,8 +95,11 @@ class Template:
                 value = np.array(value, dtype=dtype, order="C")
                 value.setflags(write=False)
                 object.__setattr__(self, name, value)
-        for name in ("part_names", "joint_names", "body_label_names"):
+        for name in ("part_names", "joint_names", "body_label_names", "expression_names"):
             object.__setattr__(self, name, tuple(map(str, getattr(self, name))))
+        if len(self.expression_names) != self.expression_basis.shape[-1]:
+            numbered = tuple(f"expression_{k:02d}" for k in range(self.expression_basis.shape[-1]))
+            object.__setattr__(self, "expression_names", numbered)
         self._check()
 
     def _check(self) -> None:
@@ -207,6 +212,7 @@ class Template:
             right_hand_mean=self.right_hand_mean,
             part_labels=self.body_labels,
             part_label_names=self.body_label_names,
+            expression_names=self.expression_names,
         )
 
     @cached_property

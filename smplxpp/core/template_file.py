@@ -19,7 +19,7 @@ from smplxpp.core.template import Template
 SCHEMA = 1
 _SCHEMA_KEY = "smplxpp_template_schema"
 _WEIGHTS = "weights_"
-_TEXTS = ("part_names", "joint_names", "body_label_names")
+_TEXTS = ("part_names", "joint_names", "body_label_names", "expression_names")
 
 
 def save_template(template: Template, path: str | Path) -> None:

@@ -58,11 +58,6 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     return nodes
 
 
-def expression_names(template: Template) -> list[str]:
-    """Names of the morph targets: expressions are numbered, as in the parameters."""
-    return [f"expression_{k:02d}" for k in range(template.expression_basis.shape[2])]
-
-
 def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
     """(N, 3) uint8 sRGB -> (N, 4) uint16 linear RGB and full alpha.
 
@@ -83,7 +78,7 @@ def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib
         for target, rows in zip(offsets, moved, strict=True)
     ]
     mesh.weights = [0.0] * len(offsets)
-    mesh.extras = {"targetNames": expression_names(template)}
+    mesh.extras = {"targetNames": list(template.expression_names)}
 
 
 def _unit_normals(template: Template) -> np.ndarray:

@@ -152,3 +152,10 @@ def test_files_that_are_no_bodies(tmp_path):
     (tmp_path / "list.pkl").write_bytes(pickle.dumps([1, 2]))
     with pytest.raises(InputError, match="pickled dict"):
         load_body(tmp_path / "list.pkl")
+
+
+def test_expressions_have_the_files_names_or_numbers(tmp_path):
+    named = load_body()
+    assert named.expression_names[named.expression_names.index("jawOpen")] == "jawOpen"
+    assert len(load_body(num_expressions=5).expression_names) == 5
+    assert replace(named, expression_names=()).expression_names[:2] == ("expression_00", "expression_01")
