@@ -156,12 +156,12 @@ def _weights_section(run: Path, record: StageRecord, cameras: list, checks: tupl
     return Section(
         title="Skin weights",
         text=(
-            "Weights are copied where cloth lies on the body and faces as it does, and inpainted elsewhere. Left: the "
-            "joints' colours mixed by weight; right: where the weights come from.",
+            "Weights of the body reach into the space around it; cloth takes them where it lies close and faces alike, "
+            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches.",
         ),
         pictures=(
             Picture("joints mixed by weight", _sheet(mesh, cameras, vertex_colors=colors)),
-            Picture("copied (green) and inpainted (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
+            Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
         ),
         tables=(Table(("part", "matched share", "pieces", "policies"), rows, "transfer"),),
         checks=checks,

@@ -83,9 +83,9 @@ def register(folder: Path, run: Path, inputs: BuildInputs) -> StageOutput:
     inside = float(np.mean(distance < -5.0))
     overlap = float(np.mean(np.abs(distance) < 250.0))
     checks = [
-        Check("scan near the fitted body", overlap, "share", 0.98, 0.8, higher_is_better=True,
+        Check("share of the scan near the fitted body", overlap, "", 0.98, 0.8, higher_is_better=True,
               explanation="within 25 cm; low: another frame's parameters, or other units or axes"),
-        Check("scan inside the fitted body", inside, "share", 0.03, 0.25,
+        Check("share of the scan inside the fitted body", inside, "", 0.03, 0.25,
               explanation="deeper than 5 mm; high: the fit is off by centimetres"),
     ]  # fmt: skip
     if overlap < 0.2:
@@ -136,9 +136,9 @@ def segment(folder: Path, run: Path, inputs: BuildInputs) -> StageOutput:
     )
     areas = scan.face_areas / scan.face_areas.sum()
     checks = [
-        Check("label confidence", float(areas @ result.confidence), "mean", 0.8, 0.5, higher_is_better=True,
+        Check("label confidence, mean", float(areas @ result.confidence), "", 0.8, 0.5, higher_is_better=True,
               explanation="area-weighted; how clearly the labels speak for the answer"),
-        Check("surface no label saw", float(areas @ ~result.seen), "share", 0.25, 0.6,
+        Check("share of the surface no label saw", float(areas @ ~result.seen), "", 0.25, 0.6,
               explanation="labelled from its neighbours alone"),
     ]  # fmt: skip
     return StageOutput(checks, {"area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)}})
