@@ -1,0 +1,1 @@
+"""The trainer of the compact avatar; nothing is built here yet."""
