@@ -12,9 +12,12 @@ from typing import Any
 
 from pipelines import scan_stages, template_stages, validate_stage
 from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.run_folder import own_run_folder
+from smplxpp.body import load_params
 from smplxpp.core.artifact import StageOutput, StageRecord, code_digest, jsonable, require_stage, run_stage, sha256_file
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
+from smplxpp.segment import find_label_set
 
 log = logging.getLogger(__name__)
 METRICS_SCHEMA = 1
@@ -53,17 +56,27 @@ def build(
     Raises:
         InputError: unusable input; every finished stage is kept.
     """
-    _check_inputs(inputs)
     for name in (first, last):
         if name not in STAGES:
             raise InputError("stage", expected=f"one of {', '.join(STAGES)}", received=repr(name))
-    run.mkdir(parents=True, exist_ok=True)
+    if STAGES.index(first) > STAGES.index(last):
+        raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
+    _check_inputs(inputs)
+    with own_run_folder(run, (*STAGES, "metrics", "report")):
+        records = _run_stages(run, inputs, config, STAGES.index(first), STAGES.index(last), progress)
+        write_metrics(run, inputs, records)
+    return records
+
+
+def _run_stages(
+    run: Path, inputs: BuildInputs, config: BuildConfig, first: int, last: int, progress: Callable[[str, bool], None]
+) -> dict[str, StageRecord]:
     stages = _stages(run, inputs, config)
     code = code_digest("smplxpp", "pipelines")
     records: dict[str, StageRecord] = {}
-    for name in STAGES[: STAGES.index(last) + 1]:
+    for k, name in enumerate(STAGES[: last + 1]):
         stage = stages[name]
-        if STAGES.index(name) < STAGES.index(first):
+        if k < first:
             records[name] = require_stage(run, name)
             continue
         progress(name, False)
@@ -75,7 +88,6 @@ def build(
             digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
         records[name] = run_stage(run, name, stage.work, config=settings, inputs=digests, seed=config.seed)
         progress(name, True)
-    write_metrics(run, inputs, records)
     return records
 
 
@@ -122,15 +134,21 @@ def write_metrics(run: Path, inputs: BuildInputs, records: dict[str, StageRecord
 
 
 def _check_inputs(inputs: BuildInputs) -> None:
-    """All files must be there before the first stage starts."""
+    """What can be known before the first stage starts: files that are missing, and those only the last stages read."""
     for name in ("scan", "params", "labels", "cameras", "motion", "body"):
         path = getattr(inputs, name)
         if path is not None and not Path(path).exists():
             raise InputError(f"option {name}", expected="an existing file", received=str(path))
     if inputs.label_maps and inputs.cameras is None:
         raise InputError(
-            "label maps", expected="a camera file with them", received="none", remedy="name it with --cameras"
+            "label maps",
+            expected="a camera file with them",
+            received="none",
+            remedy="put cameras.json or calibration.csv into the capture",
         )
+    find_label_set(inputs.label_set)
+    if inputs.motion is not None:
+        load_params(inputs.motion)
 
 
 def _file_digests(name: str, value: Any) -> dict[str, str]:

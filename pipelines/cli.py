@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import warnings
 from importlib import import_module
 from importlib.metadata import version
+from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -35,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }
+HELP = ("-h", "--help")
 USER_ERROR, INTERRUPTED = 2, 130
 
 
@@ -42,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run one subcommand; returns the exit status (0, 2 for the user's errors, 1 for failed gates)."""
     args = list(sys.argv[1:] if argv is None else argv)
     console = Console(stderr=True)
-    if not args or args[0] in ("-h", "--help", "help"):
+    if not args or args[0] in (*HELP, "help"):
         _print_help()
         return 0
     if args[0] in ("-V", "--version"):
@@ -50,6 +53,9 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     name = next((n for n in COMMANDS if args[: len(n.split())] == n.split()), None)
     if name is None:
+        if args[-1] in HELP and any(n.split()[0] == args[0] for n in COMMANDS):
+            _print_help(args[0])
+            return 0
         groups = [n for n in COMMANDS if n.split()[0] == args[0]]
         known = ", ".join(groups or COMMANDS)
         console.print(Text("error: ", style="red") + Text(f"no command {' '.join(args[:2])!r}; known: {known}"))
@@ -59,11 +65,13 @@ def main(argv: list[str] | None = None) -> int:
         level=logging.INFO, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
     try:
-        return _run(name, rest)
-    except (InputError, MissingExtraError) as error:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return _run(name, rest)
+    except (InputError, MissingExtraError, OSError) as error:
         if "--json" in rest:
             sys.stdout.write(json.dumps({"error": _error_fields(error)}, indent=1) + "\n")
-        console.print(Text("error: ", style="red") + Text(str(error)), soft_wrap=True)
+        console.print(Text("error: ", style="red") + Text(_in_words(error)), soft_wrap=True)
         return USER_ERROR
     except KeyboardInterrupt:
         console.print("interrupted; every finished stage is kept")
@@ -76,6 +84,7 @@ def _run(name: str, args: list[str]) -> int:
     module, cls, description = COMMANDS[name]
     command = tyro.cli(
         getattr(import_module(module), cls), prog=f"smplxpp {name}", description=description, args=args,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
     result = command.run()
     if getattr(command, "json", False):
@@ -87,12 +96,27 @@ def _error_fields(error: Exception) -> dict[str, str]:
     fields = {
         name: getattr(error, name) for name in ("subject", "expected", "received", "remedy") if hasattr(error, name)
     }
-    return {"type": type(error).__name__, "message": str(error), **fields}
+    return {"type": type(error).__name__, "message": _in_words(error), **fields}
 
 
-def _print_help() -> None:
+def _in_words(error: Exception) -> str:
+    """The message of an error; what the system refused (a full disk, no permission) with the file it is about."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return str(error)
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Warnings in words, as errors are, without the line of code that gave them."""
+    logging.getLogger("smplxpp").warning("%s", message)
+
+
+def _print_help(group: str = "") -> None:
+    """All commands, or those that start with the word `group`."""
     table = Table(show_header=False, box=None, padding=(0, 2))
     for name, (_, _, line) in COMMANDS.items():
+        if group and name.split()[0] != group:
+            continue
         table.add_row(f"[bold]smplxpp {name}[/]", line)
     console = Console()
     console.print(

@@ -40,7 +40,15 @@ def capture(folder: Path, inputs: BuildInputs, config: BuildConfig) -> StageOutp
     """00: the scan in metres, +Y up, repaired; the frame's parameters."""
     raw = read_raw_mesh(inputs.scan)
     vertices = convert_points(raw.vertices, units=config.units, up=config.up)
-    clean = sanitize(vertices, raw.faces)
+    try:
+        clean = sanitize(vertices, raw.faces)
+    except InputError as error:
+        raise InputError(
+            f"scan {inputs.scan.name}: {error.subject}",
+            expected=error.expected,
+            received=error.received,
+            remedy=error.remedy,
+        ) from None
     check_human_scale(clean.mesh.vertices, subject=f"scan {inputs.scan.name}")
     colors = np.full((len(raw.vertices), 3), GREY, np.uint8) if raw.vertex_colors is None else raw.vertex_colors
     save_arrays(

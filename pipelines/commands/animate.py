@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from pipelines.commands.options import OptionalFloat, OptionalInt
 from pipelines.film import FRAME_FOLDER, SUFFIXES, write_film
 from pipelines.pictures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from smplxpp.core.camera import Camera
@@ -36,7 +37,7 @@ class Animate:
     """Body parameters, any layout that `smplxpp params convert` reads. Their shape is ignored: the template has one."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
-    fps: float | None = None
+    fps: OptionalFloat = None
     """Frames a second; by default those of the parameters (or 20) over --step, so that the speed is true."""
     view: Literal["front", "side", "back", "three-quarter", "turntable"] = "front"
     """Where the camera stands; turntable: once around over the whole film."""
@@ -44,11 +45,11 @@ class Animate:
     """Colours of the surface (pictures only; a GLB has those of the scan)."""
     height: int = 720
     """Height of the picture in pixels."""
-    width: int | None = None
+    width: OptionalInt = None
     """Width of the picture; by default as wide as the motion needs."""
     start: int = 0
     """First frame."""
-    stop: int | None = None
+    stop: OptionalInt = None
     """Frame after the last."""
     step: int = 1
     """Take every step-th frame."""

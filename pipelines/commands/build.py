@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json as jsonlib
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.commands.options import OptionalPath
 from pipelines.progress import stage_progress
 from smplxpp.capture import find_reference
 from smplxpp.core.errors import InputError
@@ -24,13 +26,13 @@ class Build:
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; stages that stand in it are not run again."""
-    capture: Path | None = None
+    capture: OptionalPath = None
     """Folder of a capture: scans/scan_FFFFFF.ply, params/, labels."""
-    scan: Path | None = None
+    scan: OptionalPath = None
     """Clothed scan of the reference frame (PLY, OBJ, GLB, STL, OFF, npz)."""
-    params: Path | None = None
+    params: OptionalPath = None
     """Body parameters of that frame, any layout that `smplxpp params convert` reads."""
-    labels: Path | None = None
+    labels: OptionalPath = None
     """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh."""
     label_set: str = "auto"
     """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
@@ -39,7 +41,7 @@ class Build:
     """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the scan's first."""
     frame: int = 0
     """Reference frame, near T-pose."""
-    body: Path | None = None
+    body: OptionalPath = None
     """SMPL-X-layout body file; the open body by default."""
     units: Literal["m", "cm", "mm", "inch"] = "m"
     """Units of the scan file."""
@@ -47,7 +49,9 @@ class Build:
     """Upward axis of the scan file."""
     method: Literal["ours", "paper"] = "ours"
     """Skin-weight transfer: ours, or robust transfer exactly as published."""
-    budgets: dict[str, int] = field(default_factory=dict)
+    budgets: Annotated[
+        dict[str, int], tyro.conf.arg(metavar="PART FACES [PART FACES ...]", help_behavior_hint="(optional)")
+    ] = field(default_factory=dict)
     """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
     clearance_mm: float = 1.0
     """Distance kept between layers."""
@@ -61,8 +65,8 @@ class Build:
     """First stage to run; earlier ones must stand."""
     until_stage: StageName = STAGES[-1]
     """Last stage to run."""
-    report: bool = True
-    """Write report.html."""
+    no_report: bool = False
+    """Leave out report.html, the pictures of every stage."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -72,10 +76,12 @@ class Build:
         from pipelines.build_template import build
         from pipelines.commands.inspect import Inspect
 
-        inputs, config = self.inputs(), self.config()
-        with stage_progress(len(STAGES) + int(self.report), enabled=not self.json) as step:
+        config, inputs = self.config(), self.inputs()
+        count = STAGES.index(self.until_stage) - STAGES.index(self.from_stage) + 1
+        whole = self.until_stage == STAGES[-1] and not self.no_report
+        with stage_progress(count + whole, enabled=not self.json) as step:
             records = build(self.out, inputs, config, first=self.from_stage, last=self.until_stage, progress=step)
-            if self.report and set(records) == set(STAGES):
+            if whole:
                 step("report", False)
                 write_build_report(self.out, inputs, config, records)
                 step("report", True)
@@ -133,9 +139,10 @@ class Build:
             )
         for name, value, least in (
             ("clearance-mm", self.clearance_mm, 0.0), ("max-influences", self.max_influences, 1),
-            ("samples", self.samples, 1000), ("budgets", min(self.budgets.values(), default=100), 100),
+            ("samples", self.samples, 1000), ("seed", self.seed, 0), ("frame", self.frame, 0),
+            ("budgets", min(self.budgets.values(), default=100), 100),
         ):  # fmt: skip
-            if not value >= least:
-                raise InputError(f"option {name}", expected=f"at least {least:g}", received=f"{value:g}")
+            if not least <= value < math.inf:
+                raise InputError(f"option {name}", expected=f"a finite number, at least {least:g}", received=f"{value:g}")
         names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets"}
         return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets)

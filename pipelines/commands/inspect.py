@@ -18,7 +18,7 @@ from smplxpp.core.artifact import read_manifest
 from smplxpp.core.errors import InputError
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
-_STATES = {"done": "green", "missing": "yellow", "incomplete": "red", "unreadable": "red"}
+_STATES = {"done": "green", "missing": "yellow", "outdated": "yellow", "incomplete": "red", "unreadable": "red"}
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
     run = Path(run)
     others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(STAGES))
     stages = [_stage(run, name) for name in sorted([*STAGES, *others])]
+    _mark_outdated(stages)
     metrics = _read_json(run / "metrics.json")
     if not metrics and all(stage["state"] == "missing" for stage in stages):
         raise InputError(
@@ -100,7 +101,24 @@ def _stage(run: Path, name: str) -> dict[str, Any]:
         "files": len(present),
         "counts": count_statuses([CheckRow.of(record) for record in records]),
         "records": records,
+        "inputs": manifest.get("inputs", {}),
+        "digests": {f"{name}/{file}": digest for file, digest in files.items()},
     }
+
+
+def _mark_outdated(stages: list[dict[str, Any]]) -> None:
+    """Tell the stages that read files of earlier ones which have been made anew since, or whose source has."""
+    digests: dict[str, str] = {}
+    outdated: set[str] = set()
+    for stage in stages:
+        inputs, own = stage.pop("inputs"), stage.pop("digests")
+        changed = any(digests.get(file, digest) != digest or file.split("/")[0] in outdated
+                      for file, digest in inputs.items())  # fmt: skip
+        if stage["state"] == "done" and changed:
+            stage["state"] = "outdated"
+        if changed:
+            outdated.add(stage["stage"])
+        digests |= own
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -143,7 +161,7 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
     verdict = Text("no checks", style="dim") if not checks else _counts(summary["counts"], zeros=True)
     console.print(Text("\nchecks  ") + verdict)
     if summary["unfinished"]:
-        console.print(Text("missing ", style="yellow") + Text(", ".join(summary["unfinished"])))
+        console.print(Text("to make ", style="yellow") + Text(", ".join(summary["unfinished"])))
         console.print(Text("make it ", style="yellow") + Text(summary["remedy"]), soft_wrap=True)
     if summary["report"]:
         console.print(Text("report  ") + Text(summary["report"]), soft_wrap=True)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from pipelines.commands.options import OptionalPath
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_io import MeshFile, read_mesh
@@ -51,14 +52,14 @@ class Metrics:
     """Of precision, recall and F-score."""
     units: Literal["m", "cm", "mm"] = "m"
     """Of both meshes' coordinates."""
-    labels_a: Path | None = None
+    labels_a: OptionalPath = None
     """Labels of A's faces or vertices (.npy, or .npz with face_labels, vertex_labels, labels or label), 0 skin, 1 hair,
     2 shoe, 3 upper, 4 lower, 5 outer; or a folder of such files. Without it, a PLY property `label` counts."""
-    labels_b: Path | None = None
+    labels_b: OptionalPath = None
     """The same for B."""
-    out: Path | None = None
+    out: OptionalPath = None
     """Write the result there as well: .json (all of it) or .csv (a row a frame)."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    json: bool = False
     """Print the result as JSON."""
 
     def run(self) -> dict[str, Any]:

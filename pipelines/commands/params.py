@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
 from smplxpp.body import load_body
 from smplxpp.body.importers import LayoutName, detect_layout, load_params
 from smplxpp.core.errors import InputError
@@ -27,17 +28,17 @@ class ParamsConvert:
     """npz file to write: SMPL-X names, stacked frames."""
     layout: LayoutName = "auto"
     """Layout of the input; auto tells it by its keys. 4D-Dress is smplx, THuman4 is avatarrex."""
-    body: Path | None = None
+    body: OptionalPath = None
     """Body model file that the parameters will pose; EasyMocap and TalkBody4D need its root joint (None: open body)."""
-    frames: str | None = None
+    frames: OptionalText = None
     """Frames to keep, as START:STOP or START:STOP:STEP (None: all)."""
-    person: int | None = None
+    person: OptionalInt = None
     """Id of the person, for files with several."""
     up: Literal["y", "z"] = "y"
     """Axis that points up in the input (AMASS: z); the output has y up."""
     flat_hand_mean: bool | None = None
     """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> dict:
