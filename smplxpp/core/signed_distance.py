@@ -76,14 +76,14 @@ class SignedDistanceField:
         self._index_edges()
 
     def _outer_faces(self, mesh: TriangleMesh) -> np.ndarray:
-        if np.einsum("ij,ij->", mesh.triangles.mean(axis=1) - mesh.vertices.mean(axis=0), mesh.face_cross) < 0:
+        if np.einsum("ij,ij->", mesh.face_centers - mesh.vertices.mean(axis=0), mesh.face_cross) < 0:
             raise InputError(
                 "signed distance", expected="a solid with outward faces", received="faces that point inward",
                 remedy="reverse the order of the corners of every face",
             )  # fmt: skip
         self._winding = igl.FastWindingNumberBVH()
         self._winding.init(mesh.vertices, mesh.faces)
-        before = mesh.triangles.mean(axis=1) + _BURIED_PROBE * mesh.bbox_diagonal * mesh.face_normals
+        before = mesh.face_centers + _BURIED_PROBE * mesh.bbox_diagonal * mesh.face_normals
         outer = np.flatnonzero(~self._inside(before))
         assert len(outer), "a solid with a positive volume has an outside"
         return outer

@@ -86,7 +86,7 @@ def penetration(outer: TriangleMesh | np.ndarray, inner: TriangleMesh, *, cleara
 
 def _check_outward(mesh: TriangleMesh) -> None:
     # Volume by the divergence theorem, about the area's centroid so that open borders cost least.
-    centroid = np.average(mesh.triangles.mean(axis=1), axis=0, weights=mesh.face_areas)
+    centroid = np.average(mesh.face_centers, axis=0, weights=mesh.face_areas)
     volume = np.einsum("ij,ij->", mesh.triangles[:, 0] - centroid, mesh.face_cross) / 6.0
     if volume < -1e-6 * mesh.bbox_diagonal**3:
         raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
     found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))
     ours, theirs = target.vertex_normals, normalize_rows(found.interpolate(source, source.vertex_normals))
     # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
-    angle = np.arctan2(np.linalg.norm(np.cross(ours, theirs), axis=1), np.einsum("ij,ij->i", ours, theirs))
+    angle = np.arctan2(row_lengths(np.cross(ours, theirs)), np.einsum("ij,ij->i", ours, theirs))
     missing = ~(ours.any(axis=1) & theirs.any(axis=1))
     angle[missing] = np.nan
     return Correspondence(face, barycentric, np.sqrt(squared), angle)

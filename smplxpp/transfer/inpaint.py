@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spl
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.laplacian import edge_lengths, laplacian_and_mass
@@ -47,15 +47,12 @@ def fit_smoothly(
     rows = stiffness.tocsr()[free]
     energy = (rows @ sp.diags(1.0 / mass) @ stiffness - rows / length**2).tocsc()
     right = data[free, None] * values[used[free]] - energy[:, ~free] @ values[used[~free]]
-    # Minimum degree on the symmetric pattern, pivots on the diagonal: SuperLU as a sparse Cholesky.
-    factor = spl.splu(
-        (energy[:, free] + sp.diags(data[free])).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    unconstrained, no_values = np.zeros(0, np.int64), np.zeros((0, values.shape[1]))
+    solver = igl.min_quad_with_fixed_data()  # a sparse Cholesky of a positive definite matrix
+    matrix = (energy[:, free] + sp.diags(data[free])).tocsc()
+    igl.min_quad_with_fixed_precompute(matrix, unconstrained, sp.csc_matrix((0, matrix.shape[0])), True, solver)
     out = np.array(values, dtype=np.float64)
-    out[used[free]] = factor.solve(right)
+    out[used[free]] = igl.min_quad_with_fixed_solve(solver, -right, no_values, no_values)
     return out
 
 

@@ -6,7 +6,7 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, row_lengths
 
 _SLACK = 1e-4  # of the mean edge: how far mollification keeps a face from collapsing
 _SMALL_ANGLE = np.radians(0.1)
@@ -15,7 +15,7 @@ _SMALL_ANGLE = np.radians(0.1)
 def edge_lengths(mesh: TriangleMesh) -> np.ndarray:
     """(M, 3) lengths of the edges opposite to each corner."""
     t = mesh.triangles
-    return np.stack([np.linalg.norm(t[:, (k + 1) % 3] - t[:, (k + 2) % 3], axis=1) for k in range(3)], axis=1)
+    return np.stack([row_lengths(t[:, (k + 1) % 3] - t[:, (k + 2) % 3]) for k in range(3)], axis=1)
 
 
 def mollify(lengths: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import igl
 import numpy as np
 
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, row_lengths
 
 _LARGEST, _SMALLEST = 3.0, 0.02  # a target's size against the source's
 _DOUBTFUL, _FARTHEST = 0.05, 0.25  # median distance of a target's vertices, against the source's size
@@ -42,7 +42,7 @@ def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
         raise InputError(
             "source weights", expected=f"shape ({source.vertex_count}, J)", received=f"shape {weights.shape}"
         )
-    used = np.unique(source.faces)
+    used = source.referenced
     rows = weights[used]
     bad = ~np.isfinite(rows).all(axis=1)
     if bad.any():
@@ -71,8 +71,8 @@ def extent(mesh: TriangleMesh) -> float:
 
     It is the bounding box's diagonal for a box, but unlike that it does not change with the mesh's orientation.
     """
-    centroid = (mesh.face_areas @ mesh.triangles.mean(axis=1)) / max(mesh.face_areas.sum(), np.finfo(float).tiny)
-    return 2.0 * float(np.linalg.norm(mesh.triangles.reshape(-1, 3) - centroid, axis=1).max())
+    centroid = (mesh.face_areas @ mesh.face_centers) / max(mesh.face_areas.sum(), np.finfo(float).tiny)
+    return 2.0 * float(row_lengths(mesh.vertices[mesh.referenced] - centroid).max())
 
 
 def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.ndarray) -> None:
@@ -93,11 +93,11 @@ def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.nda
         power = int(np.ceil(np.log10(ratio / 1.5)))
         remedy = f"the units differ: multiply the target's coordinates by {10.0**-power:g}"
     elif far > _DOUBTFUL:
-        remedy = _axes_remedy(source, target.vertices[np.unique(target.faces)], 0.5 * float(np.median(distance)))
+        remedy = _axes_remedy(source, target.vertices[target.referenced], 0.5 * float(np.median(distance)))
         if not remedy and far > _FARTHEST:
             remedy = "check units, axes (+Y up) and translation of both meshes"
     if remedy:
-        points = target.vertices[np.unique(target.faces)]
+        points = target.vertices[target.referenced]
         low, high = (np.array2string(f(points, axis=0), precision=3) for f in (np.min, np.max))
         raise InputError(
             "target mesh placement",
