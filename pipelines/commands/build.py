@@ -143,6 +143,8 @@ class Build:
             ("budgets", min(self.budgets.values(), default=100), 100),
         ):  # fmt: skip
             if not least <= value < math.inf:
-                raise InputError(f"option {name}", expected=f"a finite number, at least {least:g}", received=f"{value:g}")
+                raise InputError(
+                    f"option {name}", expected=f"a finite number, at least {least:g}", received=f"{value:g}"
+                )
         names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets"}
         return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets)
