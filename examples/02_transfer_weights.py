@@ -10,7 +10,7 @@ import smplxpp
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.metrics import stretch_report, weight_report
-from smplxpp.unpose import pose, unpose
+from smplxpp.inverse_skinning import pose, unpose
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 SETTINGS = {

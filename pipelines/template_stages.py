@@ -22,7 +22,7 @@ from smplxpp.core.template import Template
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.transfer import TransferConfig, transfer_weights
-from smplxpp.unpose import unpose
+from smplxpp.inverse_skinning import unpose
 
 
 def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:

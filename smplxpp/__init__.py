@@ -18,10 +18,10 @@ _EXPORTS: dict[str, str] = {
     "TriangleMesh": "smplxpp.core.mesh",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",
-    "pose": "smplxpp.unpose",
+    "pose": "smplxpp.inverse_skinning",
     "read_mesh": "smplxpp.core.mesh_io",
     "transfer_weights": "smplxpp.transfer",
-    "unpose": "smplxpp.unpose",
+    "unpose": "smplxpp.inverse_skinning",
     "write_glb": "smplxpp.export",
 }
 _MODULES = ("metrics",)

@@ -62,7 +62,7 @@ def load_template(path: str | Path) -> Template:
         weights["joint_count"] = int(weights["joint_count"])
         weights["policies"] = tuple(map(str, weights["policies"]))
         values = {f.name: arrays.get(f.name) for f in fields(Template)}
-        values |= {name: tuple(map(str, values[name])) for name in _TEXTS}
+        values |= {name: () if values[name] is None else tuple(map(str, values[name])) for name in _TEXTS}
         values |= {"weights": SkinWeights(**weights), "metadata": json.loads(str(arrays["metadata"]))}
         return Template(**values)
     except InputError:

@@ -13,7 +13,7 @@ from smplxpp.body.hard_poses import hard_poses
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.unpose import UnposeConfig, pose, unpose
+from smplxpp.inverse_skinning import UnposeConfig, pose, unpose
 
 
 def random_rig(seed: int, joints: int = 6, vertices: int = 40, max_angle: float = 1.2):
