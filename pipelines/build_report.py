@@ -20,7 +20,7 @@ from pipelines.pictures import (
 from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.scan_stages import MM, load_params_of_run, load_scan
 from pipelines.template_stages import load_parts, load_weights
-from smplxpp.body import load_params
+from smplxpp.body import load_body, load_params
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
 from smplxpp.core.artifact import StageRecord, jsonable, versions
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
@@ -232,7 +232,7 @@ def _poses_section(template: Template, reference: BodyParams, inputs: BuildInput
     for name, vertices in zip(HARD_POSES, template.pose(hard_poses(reference)), strict=True):
         pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
     if inputs.motion is not None:
-        motion = load_params(inputs.motion)
+        motion = load_params(inputs.motion, body=load_body(inputs.body))
         chosen = np.unique(np.linspace(0, len(motion) - 1, MOTION_PICTURES).round().astype(int))
         for k, vertices in zip(chosen, template.pose(motion.select(chosen)), strict=True):
             pictures.append(_pose_picture(template, vertices, f"motion, frame {k}"))

@@ -13,7 +13,7 @@ from typing import Any
 from pipelines import scan_stages, template_stages, validate_stage
 from pipelines.build_config import STAGES, BuildConfig, BuildInputs
 from pipelines.run_folder import own_run_folder
-from smplxpp.body import load_params
+from smplxpp.body import load_body, load_params
 from smplxpp.core.artifact import StageOutput, StageRecord, code_digest, jsonable, require_stage, run_stage, sha256_file
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
@@ -148,7 +148,7 @@ def _check_inputs(inputs: BuildInputs) -> None:
         )
     find_label_set(inputs.label_set)
     if inputs.motion is not None:
-        load_params(inputs.motion)
+        load_params(inputs.motion, body=load_body(inputs.body))
 
 
 def _file_digests(name: str, value: Any) -> dict[str, str]:

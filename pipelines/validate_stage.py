@@ -5,18 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from smplxpp.core.template import Template
 
 from pipelines.arrays import save_arrays
 from pipelines.build_config import BuildConfig, BuildInputs
 from pipelines.scan_stages import MM, load_params_of_run, load_scan
 from pipelines.template_stages import load_parts
-from smplxpp.body import load_params
+from smplxpp.body import load_body, load_params
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
 from smplxpp.core.artifact import Check, StageOutput
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.template import Template
 from smplxpp.metrics import (
     CompareConfig,
     directed_distances,
@@ -45,7 +45,7 @@ def validate(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
     checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
     poses = {"hard poses": hard_poses(reference)}
     if inputs.motion is not None:
-        motion = load_params(inputs.motion)
+        motion = load_params(inputs.motion, body=load_body(inputs.body))
         poses["motion"] = motion.select(np.unique(np.linspace(0, len(motion) - 1, MOTION_FRAMES).round().astype(int)))
     for title, params in poses.items():
         names = list(HARD_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]

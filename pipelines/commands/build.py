@@ -54,7 +54,7 @@ class Build:
     ] = field(default_factory=dict)
     """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
     clearance_mm: float = 1.0
-    """Distance kept between layers."""
+    """Distance kept between layers, 0.1 to 10."""
     max_influences: int = 8
     """Joints that a vertex may follow."""
     samples: int = 100_000
@@ -137,14 +137,15 @@ class Build:
             raise InputError(
                 "option budgets", expected=f"parts among {', '.join(default.budgets)}", received=", ".join(unknown)
             )
-        for name, value, least in (
-            ("clearance-mm", self.clearance_mm, 0.0), ("max-influences", self.max_influences, 1),
-            ("samples", self.samples, 1000), ("seed", self.seed, 0), ("frame", self.frame, 0),
-            ("budgets", min(self.budgets.values(), default=100), 100),
+        for name, value, least, most in (
+            ("clearance-mm", self.clearance_mm, 0.1, 10.0), ("max-influences", self.max_influences, 1, math.inf),
+            ("samples", self.samples, 1000, math.inf), ("seed", self.seed, 0, math.inf),
+            ("frame", self.frame, 0, math.inf), ("budgets", min(self.budgets.values(), default=100), 100, math.inf),
         ):  # fmt: skip
-            if not least <= value < math.inf:
+            if not (least <= value <= most and math.isfinite(value)):
+                limit = f" and at most {most:g}" if math.isfinite(most) else ""
                 raise InputError(
-                    f"option {name}", expected=f"a finite number, at least {least:g}", received=f"{value:g}"
+                    f"option {name}", expected=f"a finite number, at least {least:g}{limit}", received=f"{value:g}"
                 )
         names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets"}
         return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets)
