@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.metrics.distance import MM, point_to_surface
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.metrics.distance import MM
 
-# libigl's fast winding number works in float32: nearer to the surface than this share of the mesh's size, its sign is
-# noise.
+# Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
 SIGN_RESOLUTION = 1e-6
 
 
@@ -45,18 +44,15 @@ class PenetrationReport:
 def signed_distance(points: np.ndarray, mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance (P,) of (P, 3) points to `mesh`, negative inside; closest points (P, 3) and faces (P,).
 
-    Inside is where the generalized winding number (Jacobson et al. 2013; the fast tree of Barill et al. 2018) is above
-    1/2. A body has open borders, eyes and teeth inside the head and limbs that overlap: there the normal of the closest
-    face answers wrongly, the winding number answers for the union. Points on the surface to within float32 are outside.
+    Inside is where the generalised winding number is above 1/2, the distance is to the outer surface
+    (`SignedDistanceField`): a body has open borders, eyes and teeth inside the head and limbs that overlap, where the
+    normal of the closest face answers wrongly.
 
     Raises:
-        InputError: as `point_to_surface`; a mesh that is wound inside out.
+        InputError: NaN or infinite points, another shape, a mesh without area or wound inside out.
     """
-    distance, closest, face = point_to_surface(points, mesh)
-    _check_outward(mesh)
-    inside = igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(points, dtype=np.float64)) > 0.5
-    inside &= distance > SIGN_RESOLUTION * mesh.bbox_diagonal
-    return np.where(inside, -distance, distance), closest, face
+    found = SignedDistanceField(mesh, solid=True).query(points)
+    return found.distance, found.closest, found.face
 
 
 def penetration(outer: TriangleMesh | np.ndarray, inner: TriangleMesh, *, clearance: float = 0.0) -> PenetrationReport:
@@ -82,16 +78,3 @@ def penetration(outer: TriangleMesh | np.ndarray, inner: TriangleMesh, *, cleara
         signed_distance=signed,
         penetrating=penetrating,
     )
-
-
-def _check_outward(mesh: TriangleMesh) -> None:
-    # Volume by the divergence theorem, about the area's centroid so that open borders cost least.
-    centroid = np.average(mesh.face_centers, axis=0, weights=mesh.face_areas)
-    volume = np.einsum("ij,ij->", mesh.triangles[:, 0] - centroid, mesh.face_cross) / 6.0
-    if volume < -1e-6 * mesh.bbox_diagonal**3:
-        raise InputError(
-            "inner mesh",
-            expected="counter-clockwise faces seen from outside",
-            received=f"a signed volume of {volume:.4g} m^3",
-            remedy="reverse the faces: faces[:, ::-1]",
-        )
