@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.topology import edge_groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +142,13 @@ class TriangleMesh:
         """(B, 2) edges with one face."""
         edges, counts = self.edges_with_counts
         return edges[counts == 1]
+
+    @cached_property
+    def face_pairs(self) -> np.ndarray:
+        """(P, 2) pairs of faces at an edge that has exactly two."""
+        order, first, count = edge_groups(self.faces)
+        start = first[count == 2]
+        return np.stack([order[start], order[start + 1]], axis=1) // 3
 
     def with_vertices(self, vertices: np.ndarray) -> TriangleMesh:
         """The same faces on other positions."""

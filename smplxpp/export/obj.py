@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 
-from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.template import Template
 
 
@@ -21,10 +20,13 @@ def write_obj(path: str | Path, template: Template) -> None:
         path: of the file.
         template: body and parts.
     """
-    buffer = io.BytesIO()
     rows = np.hstack([template.vertices, template.vertex_colors / 255.0])
-    np.savetxt(buffer, rows, fmt="v %.7f %.7f %.7f %.4f %.4f %.4f")
+    text = [_lines("v %.7f %.7f %.7f %.4f %.4f %.4f\n", rows)]
     for name in template.part_names:
-        buffer.write(f"g {name}\n".encode())
-        np.savetxt(buffer, template.faces[template.part_faces(name)] + 1, fmt="f %d %d %d")
-    atomic_write_bytes(path, buffer.getvalue())
+        text += [f"g {name}\n", _lines("f %d %d %d\n", template.faces[template.part_faces(name)] + 1)]
+    atomic_write_text(path, "".join(text))
+
+
+def _lines(pattern: str, rows: np.ndarray) -> str:
+    """One line a row of (N, D); all in one formatting, several times as fast as `np.savetxt`."""
+    return pattern * len(rows) % tuple(rows.ravel().tolist())

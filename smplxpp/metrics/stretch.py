@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, row_lengths
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
     """
     _check_same_topology(rest, posed)
     i, j = rest.edges.T
-    before, after = (np.linalg.norm(m.vertices[j] - m.vertices[i], axis=1) for m in (rest, posed))
+    before, after = (row_lengths(m.vertices[j] - m.vertices[i]) for m in (rest, posed))
     return np.divide(after, before, out=np.full(len(before), np.nan), where=before > 0)
 
 
@@ -59,7 +59,7 @@ def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
         InputError: as `edge_stretch`.
     """
     _check_same_topology(rest, posed)
-    pairs = adjacent_faces(rest)
+    pairs = rest.face_pairs
 
     def agreement(mesh: TriangleMesh) -> np.ndarray:
         around = np.zeros((mesh.face_count, 3))
@@ -98,17 +98,6 @@ def stretch_report(rest: TriangleMesh, posed: TriangleMesh, *, limit: float = 3.
         flagged_edges=int((known > limit).sum()),
         flipped_faces=int(flipped_faces(rest, posed).sum()),
     )
-
-
-def adjacent_faces(mesh: TriangleMesh) -> np.ndarray:
-    """(A, 2) pairs of faces at an edge that has exactly two."""
-    f = mesh.faces
-    directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-    key = directed[:, 0] * mesh.vertex_count + directed[:, 1]
-    order = np.argsort(key, kind="stable")
-    _, start, count = np.unique(key[order], return_index=True, return_counts=True)
-    two = start[count == 2]
-    return np.stack([order[two], order[two + 1]], axis=1) % mesh.face_count
 
 
 def _check_same_topology(rest: TriangleMesh, posed: TriangleMesh) -> None:
