@@ -20,9 +20,9 @@ from smplxpp.core.mesh_io import write_ply
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.core.template import Template
 from smplxpp.export import write_glb, write_obj
+from smplxpp.inverse_skinning import unpose
 from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.transfer import TransferConfig, transfer_weights
-from smplxpp.inverse_skinning import unpose
 
 
 def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:
