@@ -57,7 +57,10 @@ class SkinWeights:
         used = int((clipped > 0).sum(axis=1).max(initial=1))
         k = max(1, min(used, max_influences or joint_count))
         # Stable order: larger weight first, then lower joint index.
-        order = np.argsort(-clipped, axis=1, kind="stable")[:, :k]
+        # Joints that no vertex follows need not be sorted; some may fill slots of weight 0.
+        joints = np.flatnonzero(clipped.any(axis=0)) if n else np.arange(joint_count)
+        joints = joints if len(joints) >= k else np.arange(joint_count)
+        order = joints[np.argsort(-clipped[:, joints], axis=1, kind="stable")[:, :k]]
         kept = np.take_along_axis(clipped, order, axis=1)
         total = kept.sum(axis=1, keepdims=True)
         if (total <= 0).any():

@@ -47,13 +47,31 @@ def fit_smoothly(
     rows = stiffness.tocsr()[free]
     energy = (rows @ sp.diags(1.0 / mass) @ stiffness - rows / length**2).tocsc()
     right = data[free, None] * values[used[free]] - energy[:, ~free] @ values[used[~free]]
-    unconstrained, no_values = np.zeros(0, np.int64), np.zeros((0, values.shape[1]))
-    solver = igl.min_quad_with_fixed_data()  # a sparse Cholesky of a positive definite matrix
-    matrix = (energy[:, free] + sp.diags(data[free])).tocsc()
-    igl.min_quad_with_fixed_precompute(matrix, unconstrained, sp.csc_matrix((0, matrix.shape[0])), True, solver)
+    matrix = (energy[:, free] + sp.diags(data[free])).tocsr()
     out = np.array(values, dtype=np.float64)
-    out[used[free]] = igl.min_quad_with_fixed_solve(solver, -right, no_values, no_values)
+    out[used[free]] = _solve_pieces(matrix, right)
     return out
+
+
+def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
+    """The solution (n, J) of a symmetric positive definite system; the joints that a piece knows differ by piece."""
+    piece = sp.csgraph.connected_components(matrix, directed=False)[1]
+    order = np.argsort(piece, kind="stable")
+    matrix, right = matrix[order][:, order], right[order]
+    out = np.zeros_like(right)
+    start = np.concatenate([[0], np.cumsum(np.bincount(piece))])
+    nobody = np.zeros(0, np.int64)
+    for low, high in zip(start[:-1], start[1:], strict=True):
+        occurring = right[low:high].any(axis=0)
+        no_values = np.zeros((0, int(occurring.sum())))
+        solver = igl.min_quad_with_fixed_data()  # a sparse Cholesky, minimum degree
+        block = sp.csc_matrix(matrix[low:high, low:high])
+        igl.min_quad_with_fixed_precompute(block, nobody, sp.csc_matrix((0, high - low)), True, solver)
+        linear = np.ascontiguousarray(-right[low:high, occurring])
+        out[low:high, occurring] = igl.min_quad_with_fixed_solve(solver, linear, no_values, no_values)
+    back = np.empty_like(out)
+    back[order] = out
+    return back
 
 
 def average_neighbours(mesh: TriangleMesh, values: np.ndarray, rows: np.ndarray, *, steps: int) -> np.ndarray:
