@@ -14,8 +14,8 @@ from pipelines.pictures.colors import (
 )
 from pipelines.pictures.overlay import render_overlay
 from pipelines.pictures.render import render_heat, render_shaded
-from pipelines.pictures.shading import ShadeStyle
 from pipelines.pictures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
+from pipelines.pictures.style import ShadeStyle
 from pipelines.pictures.viewpoints import VIEWS, body_cameras, fit_cameras, turntable_cameras
 
 __all__ = [

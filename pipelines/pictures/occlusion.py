@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.pictures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.raster.zbuffer import MeshMaps
-
-if TYPE_CHECKING:
-    from pipelines.pictures.shading import ShadeStyle
 
 _SAMPLES = 16
 _BIAS = np.float32(0.002)  # metres: below it lie the depth map's own steps

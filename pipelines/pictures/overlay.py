@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.pictures.colors import linear_from_srgb
-from pipelines.pictures.shading import ShadeStyle, resolve, shade_layer
+from pipelines.pictures.shading import resolve, shade_layer
+from pipelines.pictures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.pictures.colors import heat_colors
-from pipelines.pictures.shading import ShadeStyle, resolve, shade_layer
+from pipelines.pictures.shading import resolve, shade_layer
 from pipelines.pictures.sheets import color_bar
+from pipelines.pictures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipelines.pictures.colors import linear_from_srgb, srgb8_from_linear
 from pipelines.pictures.occlusion import unoccluded
+from pipelines.pictures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -22,31 +23,6 @@ _KEY, _SKY, _GROUND = 0.62, 0.46, 0.24
 _RIM, _GLOSS = 0.16, 0.05
 _BLOCK = 1 << 15  # pixels shaded at a time
 _BACK_SIDE = np.array([0.42, 0.46, 0.54], dtype=np.float32)  # inside of open surfaces: darker and cooler
-
-
-@dataclass(frozen=True)
-class ShadeStyle:
-    """How surfaces are drawn.
-
-    Attributes:
-        base_color: sRGB of surfaces without colours of their own.
-        background: sRGB.
-        supersampling: samples a pixel along each axis.
-        relief: 1 = full light and shadow, 0 = flat colours; lower where colours must be read exactly.
-        occlusion: strength of the ambient occlusion, 0 to 1.
-        occlusion_radius: metres.
-        smooth: interpolate vertex normals (else one normal a face).
-        wireframe: draw the faces' edges.
-    """
-
-    base_color: tuple[int, int, int] = (206, 200, 192)
-    background: tuple[int, int, int] = (255, 255, 255)
-    supersampling: int = 2
-    relief: float = 1.0
-    occlusion: float = 0.85
-    occlusion_radius: float = 0.07
-    smooth: bool = True
-    wireframe: bool = False
 
 
 @dataclass(frozen=True)
