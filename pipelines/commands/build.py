@@ -15,6 +15,7 @@ from pipelines.build_config import STAGES, BuildConfig, BuildInputs
 from pipelines.commands.options import OptionalPath
 from pipelines.progress import stage_progress
 from smplxpp.capture import find_reference
+from smplxpp.core.artifact import StageRecord
 from smplxpp.core.errors import InputError
 
 StageName = Literal[STAGES]  # type: ignore[valid-type]
@@ -81,7 +82,7 @@ class Build:
         whole = self.until_stage == STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
             records = build(self.out, inputs, config, first=self.from_stage, last=self.until_stage, progress=step)
-            if whole:
+            if whole and not self._report_stands(records):
                 step("report", False)
                 write_build_report(self.out, inputs, config, records)
                 step("report", True)
@@ -90,6 +91,12 @@ class Build:
         metrics = jsonlib.loads((self.out / "metrics.json").read_text())
         failed = sum(check["status"] == "fail" for check in metrics["checks"])
         return {**metrics, "failed": failed, "exit_status": 0}
+
+    def _report_stands(self, records: dict[str, StageRecord]) -> bool:
+        """Whether the report was written after every stage."""
+        report = self.out / "report.html"
+        made = [(record.folder / "manifest.json").stat().st_mtime_ns for record in records.values()]
+        return report.is_file() and report.stat().st_mtime_ns > max(made)
 
     def inputs(self) -> BuildInputs:
         """The files of this build.

@@ -70,6 +70,8 @@ class Metrics:
         """
         if self.out is not None and self.out.suffix.lower() not in (".json", ".csv"):
             raise InputError("output file", expected=".json or .csv", received=str(self.out))
+        if self.seed < 0:
+            raise InputError("option seed", expected="at least 0", received=str(self.seed))
         pairs, skipped = pair_frames(self.a, self.b)
         frames = []
         console = Console(stderr=True)
