@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import igl
 import numpy as np
 import scipy.sparse as sp
@@ -61,7 +63,7 @@ def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
     out = np.zeros_like(right)
     start = np.concatenate([[0], np.cumsum(np.bincount(piece))])
     nobody = np.zeros(0, np.int64)
-    for low, high in zip(start[:-1], start[1:], strict=True):
+    for low, high in itertools.pairwise(start):
         occurring = right[low:high].any(axis=0)
         no_values = np.zeros((0, int(occurring.sum())))
         solver = igl.min_quad_with_fixed_data()  # a sparse Cholesky, minimum degree
