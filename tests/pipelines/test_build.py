@@ -1,0 +1,304 @@
+"""`smplxpp build` from end to end: gates, files, resuming, invariance, and what it refuses."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.build_template import build
+from pipelines.cli import main
+from pipelines.commands.inspect import summarise_run
+from smplxpp.body import load_params
+from smplxpp.body.hard_poses import hard_poses
+from smplxpp.clean import simplify
+from smplxpp.core.artifact import StageRecord
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.template import Template
+
+FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+PARAMS = FIXTURE / "params" / "params.npz"
+BUDGETS = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500, "outer": 400}
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory) -> Path:
+    """One folder for all workers of a parallel test run."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def person_run(shared_folder) -> Path:
+    """The fixture's whole build by the command line, made once; nobody changes it."""
+    run = shared_folder / "person"
+    with open(shared_folder / "person.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (run / "report.html").is_file():
+            assert main(["build", "--capture", str(FIXTURE), "--out", str(run), "--json"]) == 0
+    return run
+
+
+@dataclass(frozen=True)
+class Small:
+    """A coarse copy of the fixture's scan, that builds in a few seconds."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    labels: np.ndarray
+    folder: Path
+
+    def inputs(self, **changes) -> BuildInputs:
+        """Write the scan, with `vertices`, `faces` or `labels` changed, and name its files."""
+        arrays = {name: changes.pop(name, getattr(self, name)) for name in ("vertices", "faces", "labels")}
+        np.savez(self.folder / "scan.npz", vertices=arrays["vertices"], faces=arrays["faces"])
+        np.savez(self.folder / "labels.npz", label=arrays["labels"])
+        files = {"scan": self.folder / "scan.npz", "params": PARAMS, "labels": self.folder / "labels.npz"}
+        return BuildInputs(**{"subject": "small", "label_set": "capture", **files, **changes})
+
+    def build(self, name: str, inputs: BuildInputs, last: str = "60_assemble", **choices) -> dict[str, StageRecord]:
+        config = BuildConfig(**{"budgets": BUDGETS, "samples": 2000, **choices})
+        return build(self.folder / name, inputs, config, last=last)
+
+
+@pytest.fixture(scope="session")
+def small_scan() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    result = simplify(read_mesh(FIXTURE / "scans" / "scan_000000.ply").mesh, 9000)
+    with np.load(FIXTURE / "scans" / "scan_000000_labels.npz") as labels:
+        return result.mesh.vertices, result.mesh.faces, labels["label"][result.source_vertex]
+
+
+@pytest.fixture
+def small(small_scan, tmp_path) -> Small:
+    return Small(*small_scan, tmp_path)
+
+
+def template_of(run: Path) -> Template:
+    return Template.load(run / "60_assemble" / "smplxpp.npz")
+
+
+# --- the whole build ------------------------------------------------------------------------------------------------
+
+
+def test_the_fixture_passes_its_gates(person_run):
+    metrics = json.loads((person_run / "metrics.json").read_text())
+    assert [c for c in metrics["checks"] if c["status"] == "fail"] == []
+    clothes = metrics["stages"]["65_validate"]["template_vs_scan"]["labels"]
+    for label in CLOTH_LABELS:
+        if label.name in clothes:
+            error = clothes[label.name]["pred_to_gt"]
+            assert error["mean"] <= 1.0 and error["p95"] <= 3.0, label.name
+    must_pass = ("outer vertices inside", "faces of the parts turned over", "partition of unity", "round trip")
+    for words in must_pass:
+        found = [c for c in metrics["checks"] if words in c["name"]]
+        assert found and all(c["status"] == "pass" for c in found), words
+
+
+def test_metrics_json_and_manifests_state_what_was_done(person_run):
+    metrics = json.loads((person_run / "metrics.json").read_text())
+    assert metrics["schema"] == 1 and metrics["subject"] == "person"
+    assert list(metrics["stages"]) == list(metrics["seconds"]) == list(STAGES)
+    for check in metrics["checks"]:
+        assert set(check) >= {"stage", "name", "value", "unit", "status", "gate"}
+        assert check["stage"] in STAGES and check["status"] in ("pass", "warn", "fail")
+    for name in STAGES:
+        manifest = json.loads((person_run / name / "manifest.json").read_text())
+        assert manifest["stage"] == name and manifest["files"] and "numpy" in manifest["versions"]
+        assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in manifest["inputs"].values())
+        # Nothing of the machine: paths differ from one to the other, the key must not.
+        assert str(FIXTURE) not in json.dumps(manifest)
+
+
+def test_the_report_stands_alone(person_run):
+    text = (person_run / "report.html").read_text()
+    assert text.count("data:image/") >= 10
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:|#)[^"']*""", text)
+    assert not re.findall(r"url\(\s*['\"]?(?!data:|#)", text)
+    assert "@import" not in text
+    assert "<script src" not in text
+
+
+def test_the_template_poses_onto_the_scan(person_run):
+    template, params = template_of(person_run), load_params(PARAMS)
+    assert {"body", "upper", "lower", "hair", "shoe"} == set(template.part_names)
+    posed = template.pose(params.frame(0))[0]
+    scan = read_mesh(FIXTURE / "scans" / "scan_000000.ply").mesh
+    np.testing.assert_allclose(posed.max(axis=0), scan.vertices.max(axis=0), atol=0.03)
+    assert np.isfinite(template.pose(hard_poses(params.frame(0)))).all()
+    shown = template.scan_index[template.scan_index >= 0]
+    assert shown.max() < scan.vertex_count
+
+
+def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
+    before = {p: p.stat().st_mtime_ns for p in person_run.rglob("*") if p.is_file() and p.name != ".lock"}
+    assert main(["build", "--capture", str(FIXTURE), "--out", str(person_run), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["failed"] == 0
+    after = {p: p.stat().st_mtime_ns for p in before}
+    changed = {p.name for p in before if before[p] != after[p]}
+    assert changed <= {"metrics.json"}
+
+
+# --- resuming -------------------------------------------------------------------------------------------------------
+
+
+def test_only_what_is_damaged_or_changed_runs_again(small):
+    inputs = small.inputs()
+    first = small.build("run", inputs)
+    assert all(record.ran for record in first.values())
+    run = small.folder / "run"
+    truth = (run / "60_assemble" / "smplxpp.npz").read_bytes()
+
+    def ran(**choices) -> list[str]:
+        return [name for name, record in small.build("run", inputs, **choices).items() if record.ran]
+
+    assert ran() == []
+    (run / "50_unpose" / "canonical.npz").unlink()
+    with open(run / "40_transfer" / "weights.npz", "ab") as file:
+        file.write(b"x")
+    (run / "20_segment" / "manifest.json").write_text("{")
+    shutil.rmtree(run / "60_assemble")
+    assert ran() == ["20_segment", "40_transfer", "50_unpose", "60_assemble"]
+    assert (run / "60_assemble" / "smplxpp.npz").read_bytes() == truth
+    assert ran(clearance_mm=2.0) == ["60_assemble"]
+    assert ran(last="30_clean", budgets=BUDGETS | {"upper": 1000}) == ["30_clean"]
+    states = {stage["stage"]: stage["state"] for stage in summarise_run(run)[0]["stages"]}
+    assert [states[name] for name in STAGES] == ["done"] * 4 + ["outdated"] * 3 + ["missing"]
+
+
+def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
+    run = small.folder / "run"
+    (run / ".10_register.abc").mkdir(parents=True)
+    (run / ".10_register.abc" / "body.npz").write_bytes(b"half")
+    (run / ".metrics.abc.json").write_text("{")
+    (run / ".notes").write_text("mine")
+    small.build("run", small.inputs(), last="00_capture")
+    assert sorted(p.name for p in run.iterdir()) == [".lock", ".notes", "00_capture", "metrics.json"]
+
+
+def test_two_builds_do_not_share_a_folder(small):
+    run = small.folder / "run"
+    run.mkdir()
+    with open(run / ".lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="no other build"):
+            small.build("run", small.inputs(), last="00_capture")
+    small.build("run", small.inputs(), last="00_capture")
+
+
+def test_a_build_from_a_late_stage_needs_the_earlier_ones(small):
+    with pytest.raises(InputError, match="00_capture"):
+        build(small.folder / "run", small.inputs(), BuildConfig(), first="40_transfer")
+    with pytest.raises(InputError, match="before the last"):
+        build(small.folder / "run", small.inputs(), BuildConfig(), first="40_transfer", last="20_segment")
+
+
+# --- invariance -----------------------------------------------------------------------------------------------------
+
+
+def test_units_and_axes_of_the_scan_do_not_matter(small):
+    small.build("metres", small.inputs())
+    truth = template_of(small.folder / "metres")
+    x, y, z = 100 * small.vertices.T
+    small.build("zup", small.inputs(vertices=np.stack([x, -z, y], axis=1)), units="cm", up="z")
+    other = template_of(small.folder / "zup")
+    np.testing.assert_array_equal(other.faces, truth.faces)
+    np.testing.assert_allclose(other.vertices, truth.vertices, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(other.weights.dense(), truth.weights.dense(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_template_is_the_same_bit_for_bit(small):
+    inputs = small.inputs()
+    for name in ("one", "two"):
+        small.build(name, inputs)
+    one, two = (small.folder / name / "60_assemble" for name in ("one", "two"))
+    for file in ("smplxpp.npz", "template.glb", "template.obj"):
+        assert (one / file).read_bytes() == (two / file).read_bytes(), file
+
+
+# --- repairs and refusals -------------------------------------------------------------------------------------------
+
+
+def test_a_broken_scan_is_repaired_and_said_so(small):
+    broken, faces = small.vertices.copy(), small.faces.copy()
+    broken[:5] = np.nan
+    faces[100::3] = faces[100::3, ::-1]
+    faces[-7:, 1] = faces[-7:, 0]
+    loose = np.full((20, 3), 30.0)
+    inputs = small.inputs(
+        vertices=np.concatenate([broken, loose]), faces=faces, labels=np.concatenate([small.labels, np.full(20, 1)])
+    )
+    with pytest.warns(GeometryWarning) as warned:
+        records = small.build("run", inputs, last="30_clean")
+    text = str(warned[0].message)
+    for words in ("nonfinite", "flipped", "zero area", "unreferenced"):
+        assert words in text
+    assert records["00_capture"].manifest["numbers"]["repairs"] in text
+    assert all(c["value"] == 0 for c in records["30_clean"].manifest["checks"] if "non-manifold" in c["name"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: {"vertices": 100 * s.vertices}, "--units cm"),
+        (lambda s: {"vertices": s.vertices[:, [1, 2, 0]]}, "--up x"),
+        (lambda s: {"vertices": s.vertices + 5.0}, "stands in the scan"),
+        (lambda s: {"vertices": s.vertices * np.nan}, "finite"),
+        (lambda s: {"faces": s.faces[:0]}, "not the point cloud"),
+        (lambda s: {"faces": s.faces + 1}, "1-based"),
+        (lambda s: {"labels": s.labels[:-3]}, "belong to this scan"),
+        (lambda s: {"labels": s.labels + 40}, "label set"),
+        (lambda s: {"labels": np.ones_like(s.labels)}, "at least one of hair"),
+        (lambda s: {"labels": s.labels + 0.5}, "integers"),
+        (lambda s: {"label_set": "nonsense"}, "label set"),
+        (lambda s: {"frame": 99}, "below 24"),
+        (lambda s: {"label_maps": {"Cam1": s.folder / "a.png"}}, "camera file"),
+    ],
+)
+def test_unusable_input_is_refused_in_words(small, change, words):
+    inputs = small.inputs(**change(small))
+    with pytest.raises(InputError) as caught:
+        small.build("run", inputs, last="30_clean")
+    assert words in str(caught.value)
+    assert list((small.folder / "run").glob(".[0-9]*")) == []
+
+
+@pytest.mark.parametrize("name", ["scan", "params", "labels", "motion", "body"])
+def test_missing_files_are_named_before_work_starts(small, name):
+    with pytest.raises(InputError, match=f"option {name}"):
+        small.build("run", replace(small.inputs(), **{name: small.folder / "nothing.npz"}))
+    assert not (small.folder / "run").exists()
+
+
+def test_a_pickle_that_calls_code_is_not_run(small):
+    trap = small.folder / "trap"
+    evil = small.folder / "labels.pkl"
+    evil.write_bytes(b"cposix\nsystem\n(S'touch " + str(trap).encode() + b"'\ntR.")
+    with pytest.raises(InputError, match="nothing was run"):
+        small.build("run", replace(small.inputs(), labels=evil), last="20_segment")
+    assert not trap.exists()
+
+
+# --- captures -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "options"), [("woman_casual", []), ("woman_casual", ["--label-source", "views"]), ("man_casual", [])]
+)
+def test_captures_build_within_their_gates(captures, tmp_path, capsys, name, options):
+    assert main(["build", "--capture", str(captures / name), "--out", str(tmp_path), "--json", *options]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["failed"] == 0, [c for c in summary["checks"] if c["status"] == "fail"]
+    assert (tmp_path / "report.html").is_file()

@@ -1,0 +1,147 @@
+"""The `smplxpp` command: help, errors in words, `--json`, the exit status."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.cli import COMMANDS, main
+from smplxpp.core.artifact import StageOutput, run_stage
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_io import write_ply
+
+FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+SCAN, PARAMS = FIXTURE / "scans" / "scan_000000.ply", FIXTURE / "params" / "params.npz"
+
+
+@pytest.fixture
+def cube(tmp_path) -> Path:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    write_ply(tmp_path / "cube.ply", TriangleMesh(corners, np.array(faces)))
+    return tmp_path / "cube.ply"
+
+
+def fails(capsys, *args: object) -> str:
+    """The words on stderr of a command that the user got wrong."""
+    assert main([str(arg) for arg in args]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and "Traceback" not in captured.err
+    return " ".join(captured.err.split())
+
+
+@pytest.mark.parametrize("args", [[], ["--help"], ["-h"], ["help"]])
+def test_help_names_every_command(args, capsys):
+    assert main(args) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name, (_, _, line) in COMMANDS.items():
+        assert f"smplxpp {name}" in text and line in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_of_a_command_is_explained(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as exit_:
+        main([*name.split(), "--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    # An option is its name and what it takes, then words on the same line or the next.
+    rows = [line.strip("│ ") for line in text.splitlines() if line.startswith("│")]
+    for row, after in pairwise([*rows, ""]):
+        if row.startswith("-"):
+            explained = re.search(r"\S {2,}[A-Z`].+", row) or not after.startswith("-")
+            assert explained and "{None}" not in row, row
+    assert "--json" in text
+
+
+def test_a_group_of_commands_has_help(capsys):
+    assert main(["params", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "params convert" in text and "smplxpp build" not in text
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"smplxpp {version('smplxpp')}\n"
+
+
+def test_unknown_commands_are_answered_with_the_known(capsys):
+    assert "known: build, inspect" in fails(capsys, "bild")
+    assert "known: params convert" in fails(capsys, "params", "converd")
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["build", "--out", "x"], "either --capture, or --scan with --params"),
+        (["build", "--out", "x", "--scan", SCAN], "--params with --scan"),
+        (["build", "--out", "x", "--capture", "nowhere"], "an existing folder, received nowhere"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--frame", "7"], "another frame with --frame"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--label-source", "views"], "--labels"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--budgets", "hat", "500"], "hat"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--clearance-mm", "nan"], "received nan"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--seed", "-1"], "at least 0"),
+        (["build", "--out", SCAN, "--capture", FIXTURE], "another with --out"),
+        (["inspect", "nowhere"], "smplxpp build"),
+        (["animate", "nowhere", "--params", PARAMS, "--out", "x.gif"], "smplxpp build"),
+        (["metrics", SCAN, "nowhere.ply"], "existing file"),
+        (["metrics", SCAN, FIXTURE], "two files or two folders"),
+        (["metrics", SCAN, SCAN, "--seed", "-1"], "at least 0"),
+        (["params", "convert", SCAN, "--out", "x.npz"], ".json"),
+        (["params", "convert", PARAMS, "--out", "x.npz", "--frames", "a:b"], "START:STOP"),
+    ],
+)
+def test_mistakes_are_named_with_what_helps(args, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = fails(capsys, *args)
+    assert "error: " in text and "expected" in text and "received" in text and words in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_option_ends_with_status_2_and_nothing_on_stdout(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["inspect", "run", "--jsn"])
+    captured = capsys.readouterr()
+    assert exit_.value.code == 2 and captured.out == "" and "--jsn" in captured.err
+
+
+def test_errors_of_the_system_are_words_too(capsys, cube):
+    assert "File exists" in fails(capsys, "metrics", cube, cube, "--samples", 50, "--out", cube / "x.csv")
+
+
+def test_an_error_is_json_when_json_was_asked_for(capsys):
+    assert main(["inspect", "nowhere", "--json"]) == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["type"] == "InputError" and error["remedy"] and error["received"] in error["message"]
+
+
+def test_json_is_all_that_stdout_gets(capsys, tmp_path, cube):
+    run_stage(tmp_path / "run", "00_capture", lambda folder: StageOutput(), config={}, inputs={})
+    for args in (
+        ["inspect", tmp_path / "run"],
+        ["metrics", cube, cube, "--samples", "100"],
+        ["params", "convert", PARAMS, "--out", tmp_path / "p.npz"],
+        ["build", "--capture", FIXTURE, "--out", tmp_path / "b", "--until-stage", "00_capture"],
+    ):
+        assert main([*map(str, args), "--json"]) == 0
+        assert isinstance(json.loads(capsys.readouterr().out), dict)
+
+
+def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
+    huge = tmp_path / "huge.ply"
+    write_ply(huge, TriangleMesh(np.array([[0, 0, 0], [500, 0, 0], [0, 500, 0]], float), np.array([[0, 1, 2]])))
+    done = subprocess.run(
+        [sys.executable, "-m", "pipelines.cli", "metrics", str(cube), str(huge), "--samples", "100"],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    text = " ".join(done.stderr.split())
+    assert "WARNING" in text and "units" in text and ".py:" not in text and "warnings.warn" not in text
