@@ -56,13 +56,14 @@ class Camera:
 
     def screen_from_world(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) world points -> (N, 4): x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
-        cam = np.asarray(points, dtype=np.float64) @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
-        z = cam[:, 2]
+        # Coordinates as rows: every step then runs along memory.
+        cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]
+        screen = np.empty((4, cam.shape[1]))
+        screen[2] = cam[2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            weight = np.ones_like(z) if self.orthographic else 1.0 / z
-        x = (self.K[0, 0] * cam[:, 0] + self.K[0, 1] * cam[:, 1]) * weight + self.K[0, 2]
-        y = self.K[1, 1] * cam[:, 1] * weight + self.K[1, 2]
-        return np.stack([x, y, z, weight], axis=1)
+            screen[3] = 1.0 if self.orthographic else 1.0 / cam[2]
+            screen[:2] = self.K[:2, :2] @ cam[:2] * screen[3] + self.K[:2, 2:]
+        return screen.T
 
     @staticmethod
     def look_at(
