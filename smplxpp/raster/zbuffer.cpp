@@ -20,6 +20,20 @@ struct Target {
     float* depth;       // (H,W), +inf = background
 };
 
+// First pixel whose centre is at or after v, last one at or before it; within [-1, size]. Without std::ceil, which is a
+// call on baseline x86-64. NaN gives an empty range.
+int first_pixel(double v, int size) {
+    if (!(v > -0.5)) return v <= -0.5 ? 0 : size;
+    if (v > size) return size;
+    const int i = int(v - 0.5 + 1.0) - 1;
+    return i + (i + 0.5 < v);
+}
+int last_pixel(double v, int size) {
+    if (!(v >= 0.5)) return -1;
+    if (v > size) return size - 1;
+    return std::min(size - 1, int(v - 0.5));
+}
+
 void clear_band(const Target& t, int y0, int y1) {
     const size_t begin = size_t(y0) * t.width, end = size_t(y1) * t.width;
     std::fill(t.face_id + begin, t.face_id + end, -1);
@@ -41,10 +55,8 @@ void raster_rows(const double* screen, const int32_t* faces, int64_t first, int6
         if (area == 0.0) continue;
         const double ymin = std::min({a[1], b[1], c[1]}), ymax = std::max({a[1], b[1], c[1]});
         const double xmin = std::min({a[0], b[0], c[0]}), xmax = std::max({a[0], b[0], c[0]});
-        if (!(ymax >= y_begin && ymin <= y_end && xmax >= 0 && xmin <= t.width)) continue;
-        const int y0 = std::max(y_begin, int(std::ceil(ymin - 0.5))), y1 = std::min(y_end - 1, int(std::floor(ymax - 0.5)));
-        const int x0 = std::max(0, int(std::ceil(xmin - 0.5)));
-        const int x1 = int(std::min(double(t.width - 1), std::floor(xmax - 0.5)));
+        const int y0 = std::max(y_begin, first_pixel(ymin, t.height)), y1 = std::min(y_end - 1, last_pixel(ymax, t.height));
+        const int x0 = first_pixel(xmin, t.width), x1 = last_pixel(xmax, t.width);
         const double inv = 1.0 / area;
         const double ax = (b[1] - c[1]) * inv, ay = (c[0] - b[0]) * inv;
         const double bx = (c[1] - a[1]) * inv, by = (a[0] - c[0]) * inv;
@@ -77,31 +89,30 @@ extern "C" __attribute__((visibility("default"))) void smplxpp_zbuffer(
     const Target target{width, height, face_id, barycentric, depth};
     const int bands = (height + kBandRows - 1) / kBandRows;
 
-    // Faces of each band, in index order (counting sort): small faces are touched by one band alone.
+    // Faces of each band, in index order (counting sort): small faces are touched by one band alone, and those that
+    // cover no pixel centre by none.
+    struct Span { int32_t first = 0, last = -1; };
+    std::vector<Span> spans(static_cast<size_t>(face_count));
     std::vector<int64_t> start(size_t(bands) + 1, 0);
-    auto span = [&](int64_t f, int& lo, int& hi) {
-        double ymin = std::numeric_limits<double>::infinity(), ymax = -ymin;
-        for (int k = 0; k < 3; ++k) {
-            const double y = screen[4 * size_t(faces[3 * size_t(f) + k]) + 1];
-            if (!std::isfinite(y)) return false;
-            ymin = std::min(ymin, y), ymax = std::max(ymax, y);
-        }
-        if (ymax < 0 || ymin > height) return false;
-        lo = int(std::max(0.0, ymin)) / kBandRows;
-        hi = std::min(bands - 1, int(std::min(double(height), ymax)) / kBandRows);
-        lo = std::min(lo, bands - 1);
-        return true;
-    };
-    int lo, hi;
-    for (int64_t f = 0; f < face_count; ++f)
-        if (span(f, lo, hi))
-            for (int b = lo; b <= hi; ++b) ++start[size_t(b) + 1];
+    for (int64_t f = 0; f < face_count; ++f) {
+        const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
+        const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
+        const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
+        // The sum is NaN or infinite where a coordinate is (a corner on the camera's plane).
+        if (!std::isfinite(a[0] + b[0] + c[0] + a[1] + b[1] + c[1])) continue;
+        const int y0 = first_pixel(std::min({a[1], b[1], c[1]}), height);
+        const int y1 = last_pixel(std::max({a[1], b[1], c[1]}), height);
+        if (y0 > y1) continue;
+        if (first_pixel(std::min({a[0], b[0], c[0]}), width) > last_pixel(std::max({a[0], b[0], c[0]}), width)) continue;
+        spans[size_t(f)] = {y0 / kBandRows, y1 / kBandRows};
+        for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k) ++start[size_t(k) + 1];
+    }
     for (int b = 0; b < bands; ++b) start[size_t(b) + 1] += start[size_t(b)];
     std::vector<int32_t> order(static_cast<size_t>(start[size_t(bands)]));
     std::vector<int64_t> cursor(start.begin(), start.end() - 1);
     for (int64_t f = 0; f < face_count; ++f)
-        if (span(f, lo, hi))
-            for (int b = lo; b <= hi; ++b) order[size_t(cursor[size_t(b)]++)] = int32_t(f);
+        for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k)
+            order[size_t(cursor[size_t(k)]++)] = int32_t(f);
 
     auto work = [&](int thread) {
         for (int b = thread; b < bands; b += threads) {
