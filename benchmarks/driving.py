@@ -30,10 +30,10 @@ from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.inverse_skinning import UnposeConfig, unpose
 from smplxpp.metrics import edge_stretch
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
-from smplxpp.inverse_skinning import UnposeConfig, unpose
 
 _ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)  # baselines may fold a vertex: measure it
 

@@ -51,11 +51,20 @@ def compare_on(truth: CaptureTruth, peer: ModuleType, repeats: int) -> dict[str,
         dense, matched = run_peer(peer, source, weights, target)
         return smooth_as_peer(peer, target, dense, matched), matched
 
+    def by_part():
+        # As a build does it: each part with the joints of its label.
+        results = [
+            transfer_weights(source, weights, part.mesh, config=TransferConfig.for_label(label))
+            for label, part in truth.parts.items()
+        ]
+        return np.concatenate([r.dense() for r in results]), np.concatenate([r.matched for r in results])
+
     methods = {
         "reference": lambda: run_peer(peer, source, weights, target),
         "reference + smoothing": smoothed_peer,
         "paper's method": lambda: ours(TransferConfig.paper()),
         "ours": lambda: ours(TransferConfig()),
+        "ours, part by part": by_part,
     }
     rows = {}
     for name, method in methods.items():
