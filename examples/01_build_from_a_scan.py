@@ -8,8 +8,8 @@ import smplxpp
 from smplxpp.assemble import CanonicalPart, assemble_template
 from smplxpp.clean import PartsConfig, check_human_scale, clean_parts, sanitize
 from smplxpp.core.mesh_io import read_raw_mesh
-from smplxpp.segment import read_labels, segment_scan
 from smplxpp.inverse_skinning import unpose
+from smplxpp.segment import read_labels, segment_scan
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 BUDGETS = {"upper": 4_000, "lower": 4_000, "hair": 1_500, "shoe": 1_500}  # faces; the defaults are larger and slower

@@ -9,8 +9,8 @@ import numpy as np
 import smplxpp
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
 from smplxpp.core.mesh_io import write_ply
-from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.inverse_skinning import pose, unpose
+from smplxpp.metrics import stretch_report, weight_report
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 SETTINGS = {

@@ -169,7 +169,11 @@ def recognise(content: Any, *, source: str) -> str:
             source,
             expected=f"the keys of one of the layouts {', '.join(LAYOUTS)}",
             received=f"{seen}, which fit {' and '.join(fitting) or 'none'}",
-            remedy="convert it with `smplxpp params convert --layout NAME`" if fitting else "check that this is a file of body parameters",
+            remedy=(
+                "convert it with `smplxpp params convert --layout NAME`"
+                if fitting
+                else "check that this is a file of body parameters"
+            ),
         )
     return fitting[0]
 
