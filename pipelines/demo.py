@@ -15,6 +15,8 @@ from pipelines.commands.animate import Animate
 from pipelines.commands.build import Build
 from smplxpp.core.errors import InputError
 
+# Below what the small scan has, so that simplification has something to do.
+BUDGETS = {"upper": 8_000, "lower": 8_000}
 FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 
 
@@ -36,7 +38,7 @@ class Demo:
         console = Console(stderr=True)
         if not self.capture.is_dir():
             raise InputError("fixture", expected="a folder", received=str(self.capture), remedy="run in a checkout")
-        Build(out=self.out, capture=self.capture).run()
+        Build(out=self.out, capture=self.capture, budgets=BUDGETS).run()
         film = self.out / "motion.mp4"
         Animate(run_folder=self.out, params=self.capture / "params" / "params.npz", out=film, height=540).run()
         report = self.out / "report.html"
