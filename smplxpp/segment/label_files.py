@@ -54,7 +54,15 @@ def read_labels(
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()
     check_element_count(values, vertex_count=vertex_count, face_count=face_count, subject=f"label file {path}")
-    return map_labels(values, label_set)
+    try:
+        return map_labels(values, label_set)
+    except InputError as error:
+        raise InputError(
+            f"label file {path}: {error.subject}",
+            expected=error.expected,
+            received=error.received,
+            remedy=error.remedy,
+        ) from None
 
 
 def check_element_count(values: np.ndarray, *, vertex_count: int, face_count: int, subject: str) -> bool:

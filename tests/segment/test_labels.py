@@ -121,3 +121,9 @@ def test_label_maps(tmp_path):
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "color.png")
     with pytest.raises(InputError, match="class indices"):
         read_label_map(tmp_path / "color.png", label_set="capture")
+
+
+def test_unknown_ids_of_a_file_are_reported_with_its_name(tmp_path):
+    np.save(tmp_path / "mine.npy", np.array([0, 1, 77]))
+    with pytest.raises(InputError, match=r"mine\.npy.*77"):
+        read_labels(tmp_path / "mine.npy", vertex_count=3, face_count=1)
