@@ -6,10 +6,9 @@ from dataclasses import asdict, dataclass
 
 import igl
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import component_labels
 from smplxpp.metrics.sampling import require_surface
 from smplxpp.metrics.self_intersection import self_intersections
 
@@ -92,7 +91,7 @@ def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> Mesh
         faces=mesh.face_count,
         unreferenced_vertices=mesh.vertex_count - len(used),
         duplicate_faces=_duplicate_face_count(mesh),
-        components=_components(edges, mesh.vertex_count)[0] - (mesh.vertex_count - len(used)),
+        components=len(np.unique(component_labels(edges, mesh.vertex_count)[used])),
         euler=len(used) - len(edges) + mesh.face_count,
         nonmanifold_edges=int((counts > 2).sum()),
         nonmanifold_vertices=int((fan_counts(mesh) > 1).sum()),
@@ -128,7 +127,7 @@ def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
         return np.zeros(0)
     nodes, local = np.unique(border, return_inverse=True)
     local = local.reshape(border.shape)
-    piece = _components(local, len(nodes))[1][local[:, 0]]
+    piece = component_labels(local, len(nodes))[local[:, 0]]
     length = np.linalg.norm(mesh.vertices[border[:, 1]] - mesh.vertices[border[:, 0]], axis=1)
     return np.bincount(piece, length)
 
@@ -145,7 +144,7 @@ def fan_counts(mesh: TriangleMesh) -> np.ndarray:
     low, high = low[order], high[order]
     same = (vertex[low][1:] == vertex[low][:-1]) & (vertex[high][1:] == vertex[high][:-1])
     links = np.concatenate([np.stack([end[:-1], end[1:]], axis=1)[same] for end in (low, high)])
-    fan = _components(links, 3 * m)[1]
+    fan = component_labels(links, 3 * m)
     first = np.unique(fan, return_index=True)[1]
     return np.bincount(vertex[first], minlength=mesh.vertex_count)
 
@@ -176,8 +175,3 @@ def _duplicate_face_count(mesh: TriangleMesh) -> int:
     corners = np.sort(mesh.faces, axis=1)
     corners = corners[np.lexsort(corners.T)]
     return int((corners[1:] == corners[:-1]).all(axis=1).sum())
-
-
-def _components(edges: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)

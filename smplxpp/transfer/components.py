@@ -5,19 +5,16 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-import scipy.sparse as sp
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
 
 
 def vertex_components(mesh: TriangleMesh) -> np.ndarray:
     """(N,) int32 component of every vertex, numbered from 0."""
-    n, e = mesh.vertex_count, mesh.edges
-    graph = sp.coo_matrix((np.ones(len(e), dtype=np.int8), (e[:, 0], e[:, 1])), shape=(n, n))
-    _, labels = sp.csgraph.connected_components(graph, directed=False)
-    return labels.astype(np.int32)
+    return component_labels(mesh.edges, mesh.vertex_count).astype(np.int32)
 
 
 def settle_unmatched(
