@@ -8,11 +8,11 @@ RUN ?= runs/demo
 
 .PHONY: demo test test-slow lint bench fixture clean
 
-$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/raster/*.cpp)
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*.cpp smplxpp/native/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[torch,video,dev]'
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[avatar,video,dev]'
 	touch $(STAMP)
 
 demo: $(STAMP)

@@ -10,7 +10,7 @@ import numpy as np
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.raster.native import native_library
+from smplxpp.native import native_library
 
 
 @dataclass(frozen=True)

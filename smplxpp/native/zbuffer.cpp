@@ -6,8 +6,9 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <thread>
 #include <vector>
+
+#include "parallel.hpp"
 
 namespace {
 
@@ -83,7 +84,7 @@ void raster_rows(const double* screen, const int32_t* faces, int64_t first, int6
 
 }  // namespace
 
-extern "C" __attribute__((visibility("default"))) void smplxpp_zbuffer(
+SMPLXPP_EXPORT void smplxpp_zbuffer(
     const double* screen, const int32_t* faces, int64_t face_count, double near, int width, int height,
     int32_t* face_id, float* barycentric, float* depth, int threads) {
     const Target target{width, height, face_id, barycentric, depth};
@@ -114,15 +115,11 @@ extern "C" __attribute__((visibility("default"))) void smplxpp_zbuffer(
         for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k)
             order[size_t(cursor[size_t(k)]++)] = int32_t(f);
 
-    auto work = [&](int thread) {
+    smplxpp::run_threads(threads, [&](int thread) {
         for (int b = thread; b < bands; b += threads) {
             const int y0 = b * kBandRows, y1 = std::min(height, y0 + kBandRows);
             clear_band(target, y0, y1);
             raster_rows(screen, faces, start[size_t(b)], start[size_t(b) + 1], order.data(), near, y0, y1, target);
         }
-    };
-    std::vector<std::thread> pool;
-    for (int k = 1; k < threads; ++k) pool.emplace_back(work, k);
-    work(0);
-    for (auto& t : pool) t.join();
+    });
 }

@@ -1,0 +1,1 @@
+"""Losses that the trainer minimises, and the image metrics it reports."""

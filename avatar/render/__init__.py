@@ -1,0 +1,1 @@
+"""Differentiable rasterisation: one signature, the backend chosen by the tensors' device."""

@@ -1,0 +1,55 @@
+"""What every rasteriser backend is asked for, and what it answers besides the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+ALPHA_MAX = 0.999
+"""Opacity of one Gaussian at a pixel is clamped to this."""
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian fainter than this at a pixel is skipped there."""
+TRANSMITTANCE_MIN = 1e-4
+"""Blending stops before the Gaussian that would bring the transmittance to this or below."""
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """Image size and constants of a rasterisation, the same for every camera of the batch.
+
+    Attributes:
+        width, height: pixels.
+        near, far: metres along the camera's z; Gaussians whose centre is outside are dropped.
+        eps2d: pixels squared, added to the diagonal of the projected covariance (the low-pass filter of 3DGS).
+        camera_gradients: also give gradients to `viewmats`.
+    """
+
+    width: int
+    height: int
+    near: float = 0.01
+    far: float = 1e10
+    eps2d: float = 0.3
+    camera_gradients: bool = False
+
+
+@dataclass(frozen=True)
+class RasterMeta:
+    """What a backend found on the way; none of it carries gradients, but `depth`.
+
+    Attributes:
+        means2d: (C, N, 2) projected centres in pixels; 0 where culled.
+        radii: (C, N, 2) half width and height in pixels of the box that can reach `ALPHA_MIN`; 0 where culled.
+        depths: (C, N) metres along the camera's z.
+        depth: (C, H, W, 1) accumulated or expected depth in metres, where it was asked for.
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    depths: Tensor
+    depth: Tensor | None = None
+
+    @property
+    def visible(self) -> Tensor:
+        """(C, N) bool: Gaussians that can reach some pixel of the image."""
+        return (self.radii > 0).all(-1)

@@ -1,0 +1,1 @@
+"""Optimisation: from a template and images to Gaussians."""
