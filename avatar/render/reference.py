@@ -1,0 +1,181 @@
+"""The rasteriser in plain torch, for any dtype and device: the truth that the fast backends are tested against.
+
+Read it as the definition. It is exact about every rule (what is skipped, where blending stops) and makes no attempt at
+speed beyond working on blocks of pixels, so that memory stays bounded and autograd can give all gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
+
+BLOCK = 32
+"""Side in pixels of the square blocks that are blended at once."""
+FRUSTUM_MARGIN = 0.3
+"""The Jacobian of the projection is taken no farther outside the image than this share of half its width and height."""
+
+
+def rasterize_reference(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    background: Tensor | None,
+    settings: RasterSettings,
+) -> tuple[Tensor, Tensor, RasterMeta]:
+    """Images of N-channel Gaussians by alpha blending front to back, with gradients to every tensor, `Ks` included.
+
+    The semantics are those of gsplat's classic mode: EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting
+    (Kerbl et al. 2023). See `docs/rendering.md` for the equations.
+
+    Args:
+        means: (N, 3) centres in the world, metres.
+        quats: (N, 4) rotations, wxyz, of any length but 0.
+        scales: (N, 3) standard deviations along the rotated axes, metres.
+        opacities: (N,) in [0, 1].
+        features: (N, D), or (C, N, D) for features of each camera.
+        viewmats: (C, 4, 4) world to camera, OpenCV's axes.
+        Ks: (C, 3, 3) intrinsics in pixels, without skew.
+        background: (C, D) or None for 0.
+        settings: image size and constants.
+
+    Returns:
+        Images (C, H, W, D), their alpha (C, H, W, 1), and what was found on the way.
+    """
+    views = [
+        _render_view(
+            _project(means, quats, scales, opacities, viewmat, K, settings),
+            opacities,
+            features if features.ndim == 2 else features[camera],
+            settings,
+        )
+        for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True))
+    ]
+    image, transmittance = (torch.stack(parts) for parts in zip(*(view[:2] for view in views), strict=True))
+    if background is not None:
+        image = image + transmittance * background[:, None, None, :]
+    means2d, radii, depths = (torch.stack(parts) for parts in zip(*(view[2] for view in views), strict=True))
+    return image, 1 - transmittance, RasterMeta(means2d=means2d, radii=radii, depths=depths)
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """The M of the N Gaussians that a camera can see, nearest first."""
+
+    index: Tensor  # (M,) which of the N
+    means2d: Tensor  # (M, 2) pixels
+    conics: Tensor  # (M, 3) inverse covariance in the image: xx, xy, yy
+    radii: Tensor  # (M, 2) half width and height of the box outside of which alpha < ALPHA_MIN, in whole pixels
+    depths: Tensor  # (N,) of all Gaussians, culled or not
+
+
+def rotation_from_quat(quats: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but 0."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    return torch.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ],
+        dim=-1,
+    ).reshape(-1, 3, 3)
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    settings: RasterSettings,
+) -> _Splats:
+    """Gaussians to the image of one camera; drops those that cannot reach a pixel, sorts the rest by depth."""
+    cam_from_world = viewmat[:3, :3]
+    centers = means @ cam_from_world.T + viewmat[:3, 3]
+    depths = centers[:, 2]
+    # Dropped before anything is divided by their depth: a NaN behind the camera would reach the gradients.
+    near_to_far = (depths >= settings.near) & (depths <= settings.far) & (opacities >= ALPHA_MIN)
+    index = near_to_far.nonzero()[:, 0]
+    index = index[torch.argsort(depths[index], stable=True)]
+
+    axes = rotation_from_quat(quats[index]) * scales[index, None, :]
+    half = _projection_jacobian(centers[index], K, settings) @ cam_from_world @ axes
+    covariance = half @ half.mT + settings.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    focal, principal = K.diagonal()[:2], K[:2, 2]
+    means2d = focal * centers[index, :2] / depths[index, None] + principal
+
+    determinant = xx * yy - xy * xy
+    # alpha = o exp(-sigma) reaches ALPHA_MIN where sigma = ln(o / ALPHA_MIN); its box has these half sides.
+    reach = (2 * torch.log(opacities[index].detach() / ALPHA_MIN)).sqrt()
+    radii = torch.ceil(reach[:, None] * torch.stack([xx, yy], -1).detach().sqrt())
+    size = means2d.new_tensor([settings.width, settings.height])
+    seen = (determinant > 0) & ((means2d + radii > 0) & (means2d - radii < size)).all(-1)
+    conics = torch.stack([yy[seen], -xy[seen], xx[seen]], -1) / determinant[seen, None]
+    return _Splats(index[seen], means2d[seen], conics, radii[seen], depths)
+
+
+def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -> Tensor:
+    """(M, 2, 3) derivative of the pixel by the point in camera space, at `centers` clamped to a widened frustum."""
+    size = centers.new_tensor([settings.width, settings.height])
+    focal, principal = K.diagonal()[:2], K[:2, 2]
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    z = centers[:, 2:]
+    slope = torch.clamp(centers[:, :2] / z, -principal / focal - margin, (size - principal) / focal + margin)
+    return torch.cat([torch.diag_embed(focal / z), (-focal * slope / z)[..., None]], dim=-1)
+
+
+def _render_view(
+    splats: _Splats, opacities: Tensor, features: Tensor, settings: RasterSettings
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """Blended features (H, W, D), what is left of the light (H, W, 1), and (means2d, radii, depths) of all N."""
+    rows = []
+    for top in range(0, settings.height, BLOCK):
+        bottom = min(top + BLOCK, settings.height)
+        blocks = [
+            _blend_block(splats, opacities, features, (left, top, min(left + BLOCK, settings.width), bottom))
+            for left in range(0, settings.width, BLOCK)
+        ]
+        rows.append([torch.cat(parts, dim=1) for parts in zip(*blocks, strict=True)])
+    image, transmittance = (torch.cat(parts, dim=0) for parts in zip(*rows, strict=True))
+
+    means2d = torch.zeros(len(opacities), 2, dtype=features.dtype, device=features.device)
+    radii = torch.zeros_like(means2d, dtype=torch.int32)
+    means2d[splats.index] = splats.means2d.detach()
+    radii[splats.index] = splats.radii.to(torch.int32)
+    return image, transmittance, (means2d, radii, splats.depths.detach())
+
+
+def _blend_block(
+    splats: _Splats, opacities: Tensor, features: Tensor, box: tuple[int, int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """Blends a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
+    left, top, right, bottom = box
+    low, high = splats.means2d.new_tensor([left, top]), splats.means2d.new_tensor([right, bottom])
+    reaching = ((splats.means2d + splats.radii > low) & (splats.means2d - splats.radii < high)).all(-1)
+    index = splats.index[reaching]
+
+    x = torch.arange(left, right, dtype=low.dtype, device=low.device) + 0.5
+    y = torch.arange(top, bottom, dtype=low.dtype, device=low.device) + 0.5
+    dx = x[None, :, None] - splats.means2d[reaching, 0]
+    dy = y[:, None, None] - splats.means2d[reaching, 1]
+    xx, xy, yy = splats.conics[reaching].unbind(-1)
+    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (h, w, M)
+    alpha = torch.clamp(opacities[index] * torch.exp(-sigma), max=ALPHA_MAX)
+    alpha = torch.where((alpha >= ALPHA_MIN) & (sigma >= 0), alpha, 0.0)
+
+    # A Gaussian that would leave TRANSMITTANCE_MIN or less is not blended, nor is any behind it: the running product
+    # over all Gaussians never grows again, so one comparison says both.
+    blended = torch.where(torch.cumprod(1 - alpha, dim=-1) > TRANSMITTANCE_MIN, alpha, 0.0)
+    behind = torch.cumprod(torch.cat([sigma.new_ones(*sigma.shape[:2], 1), 1 - blended], dim=-1), dim=-1)
+    weights = blended * behind[..., :-1]
+    return weights @ features[index], behind[..., -1:]
