@@ -76,6 +76,11 @@ class _Splats:
     depths: Tensor  # (N,) of all Gaussians, culled or not
 
 
+def camera_depths(means: Tensor, viewmats: Tensor) -> Tensor:
+    """(C, N) metres along each camera's z of points (N, 3), for `viewmats` (C, 4, 4)."""
+    return viewmats[:, 2, :3] @ means.T + viewmats[:, 2, 3, None]
+
+
 def rotation_from_quat(quats: Tensor) -> Tensor:
     """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but 0."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)

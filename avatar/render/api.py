@@ -1,0 +1,175 @@
+"""One differentiable rasteriser for the trainer: checked arguments, the backend chosen by device, depth on request."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from avatar.render.reference import camera_depths, rasterize_reference
+from avatar.render.settings import RasterMeta, RasterSettings
+from avatar.render.validation import check_layout, check_settings, check_values
+from smplxpp.core.errors import InputError
+
+BACKENDS = ("cpu", "gsplat", "reference")
+DEPTHS = ("accumulated", "expected")
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    near: float = 0.01,
+    far: float = 1e10,
+    eps2d: float = 0.3,
+    depth: Literal["accumulated", "expected"] | None = None,
+    camera_gradients: bool = False,
+    backend: Literal["cpu", "gsplat", "reference"] | None = None,
+    check: bool = True,
+) -> tuple[Tensor, Tensor, RasterMeta]:
+    """Images of 3D Gaussians with any number of channels, with gradients; gsplat's semantics on every backend.
+
+    A Gaussian's opacity at a pixel centre p is `alpha = min(0.999, o exp(-sigma))`,
+    `sigma = (p - m)^T S^-1 (p - m) / 2`, with m and S its projected centre and covariance (blurred by `eps2d`).
+    Gaussians are blended nearest first, `image = sum_i f_i alpha_i T_i + T background`,
+    `T_i = prod_{j<i} (1 - alpha_j)`; alpha below 1/255 is skipped, and blending stops before T would fall to 1e-4
+    (Kerbl et al. 2023; `docs/rendering.md` has every rule).
+
+    Gradients reach means, quats, scales, opacities, features and background, and viewmats if `camera_gradients`.
+    `backend="reference"` also gives those of Ks.
+
+    Args:
+        means: (N, 3) centres in the world, metres. N may be 0.
+        quats: (N, 4) rotations, wxyz, of any length but 0.
+        scales: (N, 3) standard deviations along the rotated axes, metres, positive.
+        opacities: (N,) in [0, 1].
+        features: (N, D), or (C, N, D) where they differ from camera to camera (colours that depend on the view).
+        viewmats: (C, 4, 4) world to camera: x right, y down, z forward.
+        Ks: (C, 3, 3) intrinsics in pixels, without skew; pixel centres at +0.5.
+        width, height: size of every image in pixels.
+        background: (D,) or (C, D); None is 0.
+        near, far: metres along z; a Gaussian whose centre is outside is dropped.
+        eps2d: pixels squared added to the diagonal of the projected covariance.
+        depth: also blend z in metres, as `meta.depth`: "accumulated" is `sum alpha_i T_i z_i`, "expected" that over
+            alpha, and 0 where alpha is 0. It has gradients to means (and viewmats).
+        camera_gradients: gradients to `viewmats`, which are constants otherwise.
+        backend: None takes "gsplat" for CUDA tensors and "cpu" for float32 tensors on the CPU. "reference" is the slow
+            oracle, in any dtype and on any device.
+        check: look for NaN and unusable values. Without it they give undefined images.
+
+    Returns:
+        Images (C, H, W, D), their alpha (C, H, W, 1) before the background, and the `RasterMeta`.
+
+    Raises:
+        InputError: an argument cannot be used; it says which, what was expected and what came.
+        MissingExtraError: CUDA tensors, and gsplat is not installed.
+
+    Example:
+        >>> image, alpha, meta = rasterize(means, quats, scales, opacities, colors, viewmats, Ks, 512, 512)
+        >>> (image - photograph).abs().mean().backward()
+    """
+    settings = RasterSettings(width, height, near, far, eps2d, camera_gradients)
+    tensors = dict(
+        zip(
+            ("means", "quats", "scales", "opacities", "features", "viewmats", "Ks"),
+            (means, quats, scales, opacities, features, viewmats, Ks),
+            strict=True,
+        )
+    )
+    check_settings(settings)
+    check_layout(tensors, background)
+    draw = _choose_backend(backend, means, Ks)
+    if depth is not None and depth not in DEPTHS:
+        raise InputError("depth", expected=f"None or one of {', '.join(DEPTHS)}", received=repr(depth))
+    if check:
+        check_values(tensors, background)
+
+    if not camera_gradients:
+        tensors["viewmats"] = viewmats.detach()
+    if background is not None:
+        background = background.expand(len(viewmats), -1)
+    if depth is not None:
+        tensors["features"], background = _with_depth_channel(tensors, background)
+    if len(means) == 0 or len(viewmats) == 0:
+        image, alpha, meta = _draw_nothing(tensors, background, settings)
+    else:
+        tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+        background = None if background is None else background.contiguous()
+        image, alpha, meta = draw(*tensors.values(), background, settings)
+    if depth is None:
+        return image, alpha, meta
+    image, blended = image[..., :-1], image[..., -1:]
+    return image, alpha, dataclasses.replace(meta, depth=blended if depth == "accumulated" else _divide(blended, alpha))
+
+
+def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[..., tuple[Tensor, Tensor, RasterMeta]]:
+    """The backend's function, imported when it is first needed."""
+    if name is not None and name not in BACKENDS:
+        raise InputError("backend", expected=f"None or one of {', '.join(BACKENDS)}", received=repr(name))
+    if name == "reference":
+        return rasterize_reference
+    chosen = name or ("gsplat" if means.is_cuda else "cpu")
+    device = "cuda" if chosen == "gsplat" else "cpu"
+    if means.device.type != device or means.dtype != torch.float32:
+        raise InputError(
+            "means",
+            expected=f"float32 on {device} for the backend {chosen}",
+            received=f"{means.dtype} on {means.device}",
+            remedy="call .float(), or name backend='reference' for float64 (slow)",
+        )
+    if Ks.requires_grad:
+        raise InputError(
+            "Ks",
+            expected=f"a constant: the backend {chosen} gives it no gradient",
+            received="requires_grad=True",
+            remedy="detach it, or name backend='reference'",
+        )
+    if chosen == "gsplat":
+        from avatar.render.gsplat_backend import rasterize_gsplat
+
+        return rasterize_gsplat
+    from avatar.render.cpu import rasterize_cpu
+
+    return rasterize_cpu
+
+
+def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Features with the Gaussians' z as one more channel, and the background with 0 there."""
+    features, depths = tensors["features"], camera_depths(tensors["means"], tensors["viewmats"])
+    cameras = len(depths)
+    if cameras == 1 and features.ndim == 2:
+        features = torch.cat([features, depths[0, :, None]], dim=-1)
+    else:
+        features = torch.cat([features.expand(cameras, -1, -1), depths[..., None]], dim=-1)
+    return features, None if background is None else torch.nn.functional.pad(background, (0, 1))
+
+
+def _draw_nothing(
+    tensors: dict[str, Tensor], background: Tensor | None, settings: RasterSettings
+) -> tuple[Tensor, Tensor, RasterMeta]:
+    """The background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
+    cameras, count, features = len(tensors["viewmats"]), len(tensors["means"]), tensors["features"]
+    nothing = sum(tensor.sum() for tensor in tensors.values()) * 0
+    image = nothing.expand(cameras, settings.height, settings.width, features.shape[-1])
+    if background is not None:
+        image = image + background[:, None, None, :]
+    alpha = nothing.expand(cameras, settings.height, settings.width, 1)
+    per_gaussian = features.new_zeros(cameras, count, 2)
+    return image, alpha, RasterMeta(per_gaussian, per_gaussian.int(), per_gaussian[..., 0])
+
+
+def _divide(blended: Tensor, alpha: Tensor) -> Tensor:
+    """`blended / alpha`, and 0 with gradient 0 where alpha is 0."""
+    seen = alpha > 0
+    return torch.where(seen, blended / torch.where(seen, alpha, 1.0), 0.0)

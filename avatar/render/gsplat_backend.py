@@ -1,0 +1,100 @@
+"""The CUDA backend: gsplat's kernels behind the signature that all backends share.
+
+gsplat compiles its kernels when it is imported, and fails to where there is no GPU: nothing here touches it before a
+CUDA tensor asks for it.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from avatar.render.reference import camera_depths
+from avatar.render.settings import RasterMeta, RasterSettings
+from smplxpp.core.errors import InputError, MissingExtraError
+
+SUPPORTED = "1.5."
+"""gsplat's releases with these semantics: from 1.6 on alpha is clamped to 0.99 rather than 0.999."""
+
+
+def rasterize_gsplat(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    background: Tensor | None,
+    settings: RasterSettings,
+) -> tuple[Tensor, Tensor, RasterMeta]:
+    """`rasterize_reference` on a GPU in float32; arguments and results as there, but no gradient to `Ks`.
+
+    Its gradients are summed by atomic additions: two runs differ in the last digits.
+
+    Raises:
+        MissingExtraError: gsplat is not installed.
+        InputError: the machine has no GPU that torch can use, or gsplat's version or its compiled kernels do not fit.
+    """
+    gsplat = _load_gsplat()
+    image, alpha, found = gsplat.rasterization(
+        means,
+        quats,
+        scales,
+        opacities,
+        features,
+        viewmats,
+        Ks,
+        settings.width,
+        settings.height,
+        near_plane=settings.near,
+        far_plane=settings.far,
+        radius_clip=0.0,
+        eps2d=settings.eps2d,
+        sh_degree=None,
+        packed=False,
+        backgrounds=background,
+        render_mode="RGB",
+        rasterize_mode="classic",
+        camera_model="pinhole",
+    )
+    radii = found["radii"]
+    # gsplat leaves what it culls uninitialised.
+    means2d = torch.where((radii > 0).all(-1, keepdim=True), found["means2d"].detach(), 0.0)
+    depths = camera_depths(means.detach(), viewmats.detach())
+    return image, alpha, RasterMeta(means2d=means2d, radii=radii, depths=depths)
+
+
+def _load_gsplat() -> ModuleType:
+    if not torch.cuda.is_available():
+        raise InputError(
+            "backend gsplat",
+            expected="a CUDA device that torch can use",
+            received="none",
+            remedy="leave the tensors on the CPU, which has a backend of its own",
+        )
+    try:
+        import gsplat
+    except ModuleNotFoundError as error:
+        if error.name != "gsplat":
+            raise
+        raise MissingExtraError("gsplat", extra="cuda", purpose="rasterising CUDA tensors") from error
+    if not gsplat.__version__.startswith(SUPPORTED):
+        raise InputError(
+            "gsplat",
+            expected=f"version {SUPPORTED}x, whose alpha is clamped to 0.999",
+            received=gsplat.__version__,
+            remedy="pip install 'gsplat>=1.5.3,<1.6'",
+        )
+    from gsplat.cuda import _backend
+
+    if _backend._C is None:
+        raise InputError(
+            "gsplat",
+            expected="compiled kernels",
+            received="none: no CUDA toolkit was found to compile them with",
+            remedy="install nvcc of the CUDA version that torch was built for, and set CUDA_HOME",
+        )
+    return gsplat
