@@ -1,6 +1,20 @@
-"""Captures on disk: cameras, and the reference frame that a template is built from."""
+"""Captures on disk: one type for all data sets, cameras, and the reference frame that a template is built from."""
 
 from smplxpp.capture.cameras import read_cameras
+from smplxpp.capture.capture import Capture
+from smplxpp.capture.recording import Problem
 from smplxpp.capture.reference import ReferenceFrame, find_reference
+from smplxpp.capture.registry import FORMATS, detect_format, open_capture
+from smplxpp.capture.splits import Splits
 
-__all__ = ["ReferenceFrame", "find_reference", "read_cameras"]
+__all__ = [
+    "FORMATS",
+    "Capture",
+    "Problem",
+    "ReferenceFrame",
+    "Splits",
+    "detect_format",
+    "find_reference",
+    "open_capture",
+    "read_cameras",
+]

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
 
 
@@ -54,13 +55,9 @@ def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | 
             received=f"scans of {', '.join(have[:5]) or 'no frame'}",
             remedy="choose another frame with --frame, or build with --scan, --params and --labels",
         )
-    if params is not None:
-        params_file, row = Path(params), frame
-        if not params_file.is_file() and (root / "params" / params_file.name).is_file():
-            params_file = root / "params" / params_file.name
-    else:
-        single = root / "params" / f"{number}.npz"
-        params_file, row = (single, 0) if single.is_file() else (root / "params" / "params.npz", frame)
+    single = root / "params" / f"{number}.npz"
+    own = params is None and single.is_file()
+    params_file, row = (single, 0) if own else (stacked_params(root, params), frame)
     if not params_file.is_file():
         raise InputError(
             f"capture {root.name}",

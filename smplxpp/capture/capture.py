@@ -1,0 +1,251 @@
+"""Capture: cameras, frames read when they are asked for, masks, labels, parameters, splits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.capture import views
+from smplxpp.capture.cache import ArrayCache
+from smplxpp.capture.recording import KINDS, Problem, Recording
+from smplxpp.capture.splits import Splits
+from smplxpp.capture.window import Window
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A recorded person. Made by `open_capture`; pickles, and works in the processes of a loader.
+
+    Images are decoded when they are asked for and kept in a cache bounded in bytes, one a process. `resized` and
+    `cropped` give captures of other pixels with cameras to match, over the same files and cache.
+
+    Attributes:
+        recording: what was found on disk.
+        splits: cameras and frames to train on and to hold out.
+        windows: the part of each camera's image that is shown, and its size.
+        cache: decoded images.
+    """
+
+    recording: Recording
+    splits: Splits
+    windows: Mapping[str, Window]
+    cache: ArrayCache
+    excluded: frozenset[tuple[str | None, int | None]] = field(default=frozenset())
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.recording.name
+
+    @property
+    def root(self) -> Path:
+        """The folder."""
+        return self.recording.root
+
+    @property
+    def format(self) -> str:
+        """Name of the layout that it was read as."""
+        return self.recording.format
+
+    @property
+    def label_set(self) -> str:
+        """What the numbers of `labels` mean."""
+        return self.recording.label_set
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second, None where the set does not say."""
+        return self.recording.fps
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """What was left out on opening; `find_problems` looks into the files too."""
+        return self.recording.problems
+
+    @cached_property
+    def cameras(self) -> dict[str, Camera]:
+        """Pinhole cameras of the images as they are given out (undistorted, resized, cropped)."""
+        return {name: self.windows[name].camera(camera) for name, camera in self.recording.cameras.items()}
+
+    @cached_property
+    def frames(self) -> tuple[int, ...]:
+        """Frames with an image in any camera, or without images those with parameters; ascending."""
+        dropped = {frame for camera, frame in self.excluded if camera is None}
+        return tuple(frame for frame in self.recording.frames() if frame not in dropped)
+
+    def file(self, camera: str, frame: int, kind: str = "image") -> Path | None:
+        """The file that a view is read from, None where there is none. Kinds: image, mask, label, normal."""
+        if kind not in KINDS:
+            raise InputError("kind", expected=f"one of {', '.join(KINDS)}", received=str(kind))
+        self._full_camera(camera)
+        if {(camera, frame), (None, frame), (camera, None)} & self.excluded:
+            return None
+        series = self.recording.series(kind, camera)
+        return None if series is None else series.path(frame)
+
+    def presence(self, kind: str = "image") -> np.ndarray:
+        """(C, F) bool: which cameras have a file of which frame, known without opening any."""
+        table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
+        numbers = np.array(self.frames, dtype=np.int64)
+        for row, camera in enumerate(self.recording.cameras):
+            series = self.recording.series(kind, camera)
+            if series is not None and (camera, None) not in self.excluded:
+                table[row] = series.has(numbers)
+        rows, columns = {c: i for i, c in enumerate(self.recording.cameras)}, {f: i for i, f in enumerate(self.frames)}
+        for camera, frame in self.excluded:
+            if camera is not None and frame in columns:
+                table[rows[camera], columns[frame]] = False
+        return table
+
+    def views(self, cameras: Iterable[str] | None = None, frames: Iterable[int] | None = None) -> list[tuple[str, int]]:
+        """(camera, frame) of every image there is, among the given cameras and frames (None: all), frame by frame."""
+        names = list(self.recording.cameras)
+        table = self.presence()
+        wanted_cameras = set(names if cameras is None else cameras)
+        for camera in wanted_cameras:
+            self._full_camera(camera)
+        wanted_frames = set(self.frames if frames is None else frames)
+        columns = [k for k, frame in enumerate(self.frames) if frame in wanted_frames]
+        rows = [k for k, name in enumerate(names) if name in wanted_cameras]
+        return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W, 3) uint8 sRGB as recorded, read-only.
+
+        Raises:
+            InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
+        """
+        path = self._required(camera, frame)
+        return self._cached("image", camera, frame, lambda full, window: (views.color(path, full, window),))[0]
+
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """(H, W) uint8 opacity of the person, 255 inside; None where there is no mask. Read-only.
+
+        Raises:
+            InputError: no such camera, a damaged file, or one of another size.
+        """
+        path = self.file(camera, frame, "mask")
+        if path is None:
+            return None
+        return self._cached("mask", camera, frame, lambda full, window: (views.alpha(path, full, window),))[0]
+
+    def labels(self, camera: str, frame: int) -> np.ndarray | None:
+        """(H, W) uint8 numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
+        path = self.file(camera, frame, "label")
+        if path is None:
+            return None
+        return self._cached("label", camera, frame, lambda full, window: (views.labels(path, full, window),))[0]
+
+    def normals(self, camera: str, frame: int) -> np.ndarray | None:
+        """(H, W, 3) float32 unit normals in the world, 0 on the background; None where there is no map."""
+        path = self.file(camera, frame, "normal")
+        if path is None:
+            return None
+        return self._cached("normal", camera, frame, lambda full, window: (views.normals(path, full, window),))[0]
+
+    def composited(self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """The person on a plain background: (H, W, 3) float32 sRGB in [0, 1].
+
+        `C = F + (1 - a) B` with a the mask and F the image times a, mixed in sRGB. For photographs F is formed before
+        resampling; for images that a capture declares as composited on a colour c, `F = I - (1 - a) c`.
+
+        Raises:
+            InputError: as `image` and `mask`; no mask; or images that are not on the colour the capture declares.
+        """
+        foreground, alpha = self.foreground(camera, frame)
+        out = foreground.astype(np.float32) / np.float32(255)
+        colour = np.asarray(background, dtype=np.float32).reshape(3)
+        if colour.any():
+            out += (1.0 - alpha.astype(np.float32) / np.float32(255))[..., None] * colour
+        return np.clip(out, 0.0, 1.0, out=out)
+
+    def foreground(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """The person alone: (H, W, 3) uint8 colour times opacity, and (H, W) uint8 opacity; both read-only.
+
+        Raises:
+            InputError: as `composited`.
+        """
+        image = self._required(camera, frame)
+        mask = self.file(camera, frame, "mask")
+        if mask is None:
+            raise InputError(
+                f"mask of camera {camera}, frame {frame}",
+                expected=f"a mask for the image {image}",
+                received="none",
+                remedy="give a folder of masks (open_capture(..., masks=DIR)), or make them with your matting model",
+            )
+        background = self.recording.background
+        return self._cached(
+            "foreground", camera, frame, lambda full, window: views.foreground(image, mask, background, full, window)
+        )
+
+    def params(self, frame: int) -> BodyParams | None:
+        """Body parameters of one frame, None where there are none.
+
+        Raises:
+            InputError: a damaged file, NaN or infinity in the frame.
+        """
+        source = self.recording.params
+        if source is None or (None, frame) in self.excluded or frame not in source.frames():
+            return None
+        return source.read(frame)
+
+    def truth_mesh(self, frame: int) -> TriangleMesh | None:
+        """The true surface of a frame as the images show it, where the set has one; else None."""
+        return None if self.recording.meshes is None else self.recording.meshes.read(frame)
+
+    def resized(self, scale: float) -> Capture:
+        """The same capture at `scale` times the resolution; sizes are rounded and the intrinsics follow."""
+        return replace(self, windows={name: window.resized(scale) for name, window in self.windows.items()})
+
+    def cropped(self, boxes: Mapping[str, tuple[int, int, int, int]]) -> Capture:
+        """The same capture with some cameras' images cut to x0, y0, x1, y1 (pixels of this capture's images)."""
+        for camera in boxes:
+            self._full_camera(camera)
+        cut = {name: self.windows[name].cropped(box) for name, box in boxes.items()}
+        return replace(self, windows={**self.windows, **cut})
+
+    def without(self, problems: Iterable[Problem]) -> Capture:
+        """Without the views, frames and cameras that the problems name."""
+        excluded = self.excluded | {(p.camera, p.frame) for p in problems if (p.camera, p.frame) != (None, None)}
+        dropped_cameras = {camera for camera, frame in excluded if frame is None}
+        dropped_frames = {frame for camera, frame in excluded if camera is None}
+        recording = replace(
+            self.recording,
+            cameras={name: c for name, c in self.recording.cameras.items() if name not in dropped_cameras},
+        )
+        kept_frames = [frame for frame in self.frames if frame not in dropped_frames]
+        splits = self.splits.restricted(list(recording.cameras), kept_frames)
+        return replace(self, recording=recording, splits=splits, excluded=frozenset(excluded))
+
+    def _full_camera(self, name: str) -> Camera:
+        if name not in self.recording.cameras:
+            have = ", ".join(self.recording.cameras) or "no camera"
+            raise InputError(
+                f"camera of capture {self.name}",
+                expected=f"one of {have}",
+                received=str(name),
+            )
+        return self.recording.cameras[name]
+
+    def _required(self, camera: str, frame: int) -> Path:
+        path = self.file(camera, frame)
+        if path is None:
+            raise InputError(
+                f"image of camera {camera}, frame {frame}",
+                expected="an image that was there on opening (see `presence`)",
+                received="none",
+            )
+        return path
+
+    def _cached(self, kind, camera, frame, make):
+        window, full = self.windows[camera], self._full_camera(camera)
+        return self.cache.get((kind, camera, frame, window), lambda: make(full, window))

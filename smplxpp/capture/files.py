@@ -1,0 +1,82 @@
+"""Numbered files of a folder, held compactly: a capture may have a million of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True, eq=False)
+class FileSeries:
+    """The file of each frame.
+
+    Attributes:
+        folder: what the names are relative to.
+        numbers: (F,) int64 frames, ascending.
+        names: (F,) bytes, the encoded path of each file below `folder`. Fixed-width bytes take a tenth of the memory
+            of a dictionary of paths.
+    """
+
+    folder: Path
+    numbers: np.ndarray
+    names: np.ndarray
+
+    @staticmethod
+    def from_names(folder: Path, names: Mapping[int, str]) -> FileSeries:
+        """From the file name of each frame."""
+        numbers = np.array(sorted(names), dtype=np.int64)
+        encoded = np.array([os.fsencode(names[int(n)]) for n in numbers], dtype=bytes)
+        return FileSeries(folder, numbers, encoded)
+
+    @staticmethod
+    def find(folder: Path, pattern: str) -> FileSeries:
+        """Files of `folder` whose whole name matches `pattern`; its group `frame` is the number. May be empty.
+
+        Of two files with one number the first in alphabetical order counts.
+        """
+        compiled, found = re.compile(pattern), {}
+        if folder.is_dir():
+            with os.scandir(folder) as entries:
+                for name in sorted(entry.name for entry in entries):
+                    if match := compiled.fullmatch(name):
+                        found.setdefault(int(match["frame"]), name)
+        return FileSeries.from_names(folder, found)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def path(self, frame: int) -> Path | None:
+        """The file of a frame, None where there is none."""
+        index = int(np.searchsorted(self.numbers, frame))
+        if index == len(self.numbers) or self.numbers[index] != frame:
+            return None
+        return self.folder / os.fsdecode(bytes(self.names[index]))
+
+    def has(self, frames: np.ndarray) -> np.ndarray:
+        """(N,) bool: which of the frames have a file."""
+        return np.isin(frames, self.numbers)
+
+    def only(self, keep: np.ndarray) -> FileSeries:
+        """The files selected by a (F,) bool array."""
+        return FileSeries(self.folder, self.numbers[keep], self.names[keep])
+
+
+def image_name(before: str = "") -> str:
+    """Pattern of an image file's name: `before`, the frame's digits, a suffix."""
+    suffixes = "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
+    return rf"{re.escape(before)}(?P<frame>\d+)\.(?i:{suffixes})"
+
+
+def subfolders(folder: Path) -> list[str]:
+    """Names of the folders in a folder, sorted; none if it does not exist."""
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        return sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))

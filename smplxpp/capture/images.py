@@ -1,0 +1,110 @@
+"""Image files: colours, masks, label maps, normal maps. Pillow is imported when the first one is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_REMEDY = "copy the file anew from its source, or remove it: the frame is then left out"
+
+
+def read_color(path: Path) -> Image:
+    """An RGB image of 8 bits a channel; an alpha channel is dropped, not applied."""
+    image = _read(path)
+    return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def read_alpha(path: Path) -> Image:
+    """An 8-bit mask ("L"): the alpha channel where the file has one (mattes, cut-outs), else its brightness."""
+    image = _read(path)
+    if image.mode in ("RGBA", "LA", "PA"):
+        return image.getchannel("A")
+    if image.mode.startswith("I"):
+        # 16-bit grey; Pillow's own conversion would clip.
+        return _from_array((np.asarray(image, dtype=np.float64) / 257.0 + 0.5).astype(np.uint8))
+    return image if image.mode == "L" else image.convert("L")
+
+
+def read_labels(path: Path) -> Image:
+    """An index map ("L"): the values of a grey or palette image, or of an integer `.npy`."""
+    if path.suffix.lower() == ".npy":
+        return _from_array(_read_npy_labels(path))
+    image = _read(path)
+    if image.mode not in ("L", "P", "1"):
+        raise InputError(
+            f"label map {path}",
+            expected="a grey or palette image of indices",
+            received=f"an image of mode {image.mode}",
+        )
+    return _from_array(np.array(image, dtype=np.uint8))
+
+
+def read_normals(path: Path) -> np.ndarray:
+    """(H, W, 3) float32 world normals of `n = value / max * 2 - 1`, unit length; 0 where the file is black.
+
+    Of 16-bit files Pillow gives the upper byte: the middle of its range is taken, 0.2 degrees off at most.
+    """
+    image = _read(path)
+    deep = "16" in str(image.info.get("raw_mode", ""))
+    value = np.asarray(image.convert("RGB"), dtype=np.float32)
+    normal = (value + 0.5) / 128.0 - 1.0 if deep else value / 127.5 - 1.0
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    seen = value.any(axis=-1, keepdims=True)
+    return np.where(seen, normal / np.maximum(length, 1e-6), 0.0).astype(np.float32)
+
+
+def check_size(image: Image, path: Path, size: tuple[int, int], *, of: str) -> Image:
+    """The image, if it has the expected width and height.
+
+    Raises:
+        InputError: another size.
+    """
+    if image.size != size:
+        raise InputError(
+            f"file {path}",
+            expected=f"{size[0]} x {size[1]} pixels, {of}",
+            received=f"{image.width} x {image.height}",
+            remedy="give images, masks and calibration of one resolution",
+        )
+    return image
+
+
+def _read(path: Path) -> Image:
+    import PIL.Image
+
+    try:
+        image = PIL.Image.open(path)
+        raw_mode = str(image.tile[0][3]) if image.tile else ""
+        image.load()
+    except FileNotFoundError:
+        raise InputError(f"image file {path}", expected="an existing file", received="none") from None
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+        raise InputError(f"image file {path}", expected="a whole image", received=f"{error}", remedy=_REMEDY) from None
+    image.info["raw_mode"] = raw_mode
+    return image
+
+
+def _read_npy_labels(path: Path) -> np.ndarray:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"label map {path}", expected="an integer array", received=str(error)) from None
+    if values.ndim != 2 or values.dtype.kind not in "iub" or values.min(initial=0) < 0 or values.max(initial=0) > 255:
+        raise InputError(
+            f"label map {path}", expected="integers from 0 to 255 of shape (H, W)",
+            received=f"{values.dtype} of shape {values.shape}",
+        )  # fmt: skip
+    return values.astype(np.uint8)
+
+
+def _from_array(array: np.ndarray) -> Image:
+    import PIL.Image
+
+    return PIL.Image.fromarray(array)

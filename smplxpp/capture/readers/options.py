@@ -1,0 +1,21 @@
+"""What `open_capture` passes on to every reader."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from smplxpp.body import BodyModel
+
+
+@dataclass(frozen=True, eq=False)
+class ReaderOptions:
+    """Choices of the user.
+
+    Attributes:
+        params: a parameter file or folder instead of the set's own.
+        body: the body model that the parameters are for; None: the open body.
+    """
+
+    params: Path | None = None
+    body: BodyModel | None = None

@@ -1,0 +1,183 @@
+"""The simple layout, our own: docs/captures.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.capture.cameras import read_cameras
+from smplxpp.capture.files import FileSeries, image_name, subfolders
+from smplxpp.capture.meshes import PosedTopology
+from smplxpp.capture.params import ParamFiles, StackedParams
+from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.recording import ParamSource, Problem, Recording
+from smplxpp.capture.splits import Splits
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+
+NAME = "simple"
+LOOKS_FOR = "capture.json, or cameras.json or calibration.csv beside rgbs/, or scans/ with params/"
+# Folder and part of the name of each kind of file: masks/CAM/CAM_maskFFFFFF.png.
+_FOLDERS = {"image": ("rgbs", "rgb"), "mask": ("masks", "mask"), "label": ("labels", "label"),
+            "normal": ("normals", "normal")}  # fmt: skip
+_CAMERA_FILES = ("cameras.json", "calibration.csv")
+# Written by hand, or by the tool that made the capture.
+_DESCRIPTIONS = ("capture.json", "manifest.json")
+_BLACK = (0.0, 0.0, 0.0)
+
+
+def detect(root: Path) -> bool:
+    """Whether a folder is in this layout. A calibration.csv without anything of ours is ActorsHQ's."""
+    if (root / "capture.json").is_file() or ((root / "cameras.json").is_file() and (root / "rgbs").is_dir()):
+        return True
+    return (root / "scans").is_dir() and (root / "params").is_dir()
+
+
+def read(root: Path, options: ReaderOptions) -> Recording:
+    """Find everything of a capture.
+
+    Raises:
+        InputError: images without a camera file, a broken camera file or description.
+    """
+    description = _describe(root)
+    cameras = _cameras(root)
+    files, problems = _files(root, cameras, description)
+    recording = Recording(
+        name=str(description.get("name", root.name)),
+        root=root,
+        format=NAME,
+        cameras=cameras,
+        files=files,
+        background=_background(description),
+        label_set=str(description.get("label_set", "capture")),
+        params=_params(root, options),
+        meshes=PosedTopology(
+            root / "geometry" / "topology.npz",
+            FileSeries.find(root / "geometry", r"frame_(?P<frame>\d{6})\.npz"),
+        ),
+        fps=description.get("fps"),
+        problems=tuple(problems),
+    )
+    return recording if not description else _with_splits(recording, description)
+
+
+def stacked_params(root: Path, name: str | Path | None = None) -> Path:
+    """The stacked parameter file of a capture: `params/params.npz`, or another by path or by its name in `params/`."""
+    if name is None:
+        return root / "params" / "params.npz"
+    path = Path(name)
+    inside = root / "params" / path.name
+    return inside if not path.is_file() and inside.is_file() else path
+
+
+def _params(root: Path, options: ReaderOptions) -> ParamSource | None:
+    if options.params is not None:
+        path = stacked_params(root, options.params)
+        if not path.is_file():
+            raise InputError(f"capture {root.name}", expected="an existing parameter file", received=str(path))
+        return StackedParams(path, body=options.body)
+    single = FileSeries.find(root / "params", r"(?P<frame>\d{6})\.npz")
+    if len(single):
+        return ParamFiles(single, body=options.body)
+    stacked = stacked_params(root)
+    return StackedParams(stacked, body=options.body) if stacked.is_file() else None
+
+
+def _describe(root: Path) -> dict[str, Any]:
+    path = next((root / name for name in _DESCRIPTIONS if (root / name).is_file()), None)
+    if path is None:
+        return {}
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"file {path}", expected="JSON", received=str(error)) from None
+    if not isinstance(content, dict):
+        raise InputError(f"file {path}", expected="a JSON object", received=type(content).__name__)
+    return content
+
+
+def _cameras(root: Path) -> dict[str, Camera]:
+    path = next((root / name for name in _CAMERA_FILES if (root / name).is_file()), None)
+    if path is None:
+        if (root / "rgbs").is_dir():
+            raise InputError(f"capture {root}", expected="cameras.json or calibration.csv", received="neither")
+        return {}
+    return {camera.name: camera for camera in read_cameras(path)}
+
+
+def _files(
+    root: Path, cameras: Mapping[str, Camera], description: Mapping[str, Any]
+) -> tuple[dict[str, dict[str, FileSeries]], list[Problem]]:
+    files: dict[str, dict[str, FileSeries]] = {}
+    problems = []
+    for kind, (folder, tag) in _FOLDERS.items():
+        pattern = {name: image_name(f"{name}_{tag}") for name in cameras}
+        if kind == "label":
+            pattern = {name: text.replace("jpg", "npy|jpg") for name, text in pattern.items()}
+        found = {name: FileSeries.find(root / folder / name, pattern[name]) for name in cameras}
+        files[kind] = {name: series for name, series in found.items() if len(series)}
+        for name in sorted(set(subfolders(root / folder)) - set(cameras)):
+            problems.append(
+                Problem(f"{root / folder / name}: a folder of camera {name}, which is not calibrated", name)
+            )
+        listed = description.get(f"{kind}s", {})
+        for name, frames in listed.items() if isinstance(listed, Mapping) else ():
+            if name in found:
+                missing = np.setdiff1d(frames, found[name].numbers).tolist()
+                problems += [Problem(f"{root / folder / name}: no {kind} of frame {f}", name, f) for f in missing]
+    return files, problems
+
+
+def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    value = description.get("background", _BLACK)
+    if value is None:
+        return None
+    colour = np.asarray(value, dtype=np.float64)
+    if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
+        raise InputError(
+            "background in capture.json", expected="null, or red, green, blue from 0 to 1", received=str(value)
+        )
+    return tuple(colour.tolist())
+
+
+def _with_splits(recording: Recording, description: Mapping[str, Any]) -> Recording:
+    from dataclasses import replace
+
+    cameras, frames = list(recording.cameras), recording.frames()
+    novel_views = _names(description, "novel_views", cameras) or []
+    train_views = _names(description, "train_views", cameras)
+    novel_frames = _ranges(description, "novel_pose_frames", frames) or []
+    train_frames = _ranges(description, "train_frames", frames)
+    splits = Splits(
+        tuple(train_views if train_views is not None else [c for c in cameras if c not in novel_views]),
+        tuple(novel_views),
+        tuple(train_frames if train_frames is not None else [f for f in frames if f not in set(novel_frames)]),
+        tuple(novel_frames),
+    )
+    return replace(recording, splits=splits)
+
+
+def _names(description: Mapping[str, Any], key: str, cameras: list[str]) -> list[str] | None:
+    if key not in description:
+        return None
+    unknown = sorted(set(description[key]) - set(cameras))
+    if unknown:
+        raise InputError(f"{key} of the capture", expected=f"cameras among {cameras}", received=f"{unknown}")
+    return list(description[key])
+
+
+def _ranges(description: Mapping[str, Any], key: str, frames: tuple[int, ...]) -> list[int] | None:
+    """Frames within the inclusive range [first, last], or within any of several ranges."""
+    if key not in description:
+        return None
+    try:
+        ranges = np.asarray(description[key], dtype=np.int64).reshape(-1, 2)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{key} of the capture", expected="[first, last], or a list of these", received=f"{description[key]}"
+        ) from None
+    return [frame for frame in frames if any(first <= frame <= last for first, last in ranges)]

@@ -1,0 +1,91 @@
+"""Recording: what a reader finds in a data set's folder, with nothing decoded yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from smplxpp.capture.files import FileSeries
+from smplxpp.capture.splits import Splits
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+
+KINDS = ("image", "mask", "label", "normal")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong in a capture that does not stop it from being used.
+
+    Attributes:
+        message: what is wrong, with the file's name.
+        camera, frame: what it concerns; None: all.
+    """
+
+    message: str
+    camera: str | None = None
+    frame: int | None = None
+
+
+class ParamSource(Protocol):
+    """Body parameters by frame."""
+
+    def frames(self) -> np.ndarray:
+        """(F,) int64 frames that have parameters, ascending."""
+
+    def read(self, frame: int) -> BodyParams:
+        """One frame that is among `frames()`."""
+
+
+class MeshSource(Protocol):
+    """Meshes by frame."""
+
+    def read(self, frame: int) -> TriangleMesh | None:
+        """The frame's mesh, None where there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A data set's folder, found by its reader.
+
+    Attributes:
+        name, root, format: the folder's name, the folder, the reader's name.
+        cameras: by name, in the set's order, for whole images of the sizes on disk.
+        files: for each kind ("image", "mask", "label", "normal") the series of each camera that has one. A mask's file
+            may be the image's: then its alpha channel counts.
+        background: (3,) sRGB in [0, 1] that the images are already composited on; None: photographs.
+        splits: as the set states them, or None.
+        label_set: numbers of the label maps, a name known to `smplxpp.segment.map_labels`.
+        params, meshes: or None.
+        fps: frames a second, or None where the set does not say.
+        problems: what the reader had to leave out.
+    """
+
+    name: str
+    root: Path
+    format: str
+    cameras: Mapping[str, Camera]
+    files: Mapping[str, Mapping[str, FileSeries]]
+    background: tuple[float, float, float] | None = None
+    splits: Splits | None = None
+    label_set: str = "capture"
+    params: ParamSource | None = None
+    meshes: MeshSource | None = None
+    fps: float | None = None
+    problems: tuple[Problem, ...] = field(default=())
+
+    def series(self, kind: str, camera: str) -> FileSeries | None:
+        """The files of a kind for a camera."""
+        return self.files.get(kind, {}).get(camera)
+
+    def frames(self) -> tuple[int, ...]:
+        """All frames with an image in any camera; without any image, those with parameters."""
+        images = [series.numbers for series in self.files.get("image", {}).values()]
+        if images:
+            return tuple(np.unique(np.concatenate(images)).tolist())
+        return () if self.params is None else tuple(self.params.frames().tolist())

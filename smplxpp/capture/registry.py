@@ -1,0 +1,77 @@
+"""open_capture: which reader a folder is for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from smplxpp.body import BodyModel
+from smplxpp.capture.cache import ArrayCache
+from smplxpp.capture.capture import Capture
+from smplxpp.capture.readers import simple
+from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.splits import Splits
+from smplxpp.capture.window import Window
+from smplxpp.core.errors import InputError
+
+READERS = {reader.NAME: reader for reader in (simple,)}
+FORMATS: tuple[str, ...] = tuple(READERS)
+
+
+def open_capture(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    params: str | Path | None = None,
+    body: BodyModel | None = None,
+    hold_out_every: int | None = None,
+    cache_bytes: int = 1 << 30,
+) -> Capture:
+    """Open a capture of any known layout; nothing but calibration and lists of files is read.
+
+    Args:
+        path: the folder (docs/captures.md says which, for each data set).
+        format: name of the layout; None: told by the files that are there.
+        params: body parameters to take instead of the capture's own (a tracker's, say).
+        body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
+        hold_out_every: hold out every n-th training camera as a novel view.
+        cache_bytes: bound of the decoded images kept, in each process that reads.
+
+    Raises:
+        InputError: no such folder, no layout that fits or several, or what the reader refuses.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise InputError("capture", expected="an existing folder", received=str(root))
+    if format is not None and format not in READERS:
+        raise InputError("format of the capture", expected=f"one of {', '.join(FORMATS)}", received=str(format))
+    reader = READERS[format or detect_format(root)]
+    options = ReaderOptions(params=None if params is None else Path(params), body=body)
+    recording = reader.read(root, options)
+    splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
+    if hold_out_every is not None:
+        splits = splits.hold_out_cameras(hold_out_every)
+    recording = replace(recording, name=recording.name or root.resolve().name)
+    windows = {name: Window.full(camera) for name, camera in recording.cameras.items()}
+    return Capture(recording, splits, windows, ArrayCache(cache_bytes))
+
+
+def detect_format(path: str | Path) -> str:
+    """Name of the one layout that a folder is in.
+
+    Raises:
+        InputError: none fits, or several.
+    """
+    root = Path(path)
+    fitting = [name for name, reader in READERS.items() if reader.detect(root)]
+    if len(fitting) == 1:
+        return fitting[0]
+    looked_for = "; ".join(f"{name}: {reader.LOOKS_FOR}" for name, reader in READERS.items())
+    have = sorted(entry.name for entry in root.iterdir())
+    raise InputError(
+        f"capture {root}",
+        expected=f"the files of one layout ({looked_for})",
+        received=f"a folder with {', '.join(have[:12]) or 'nothing'}"
+        + (f", which fits {' and '.join(fitting)}" if fitting else ""),
+        remedy="name the layout (format=...)" if fitting else "see docs/captures.md for what each layout needs",
+    )

@@ -1,0 +1,83 @@
+"""The part of an image that a capture shows, and its resolution: pixels and intrinsics change together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of the full image, resampled to a size.
+
+    With pixel centres at +0.5 the image spans [0, width] x [0, height], and a point at x in the full image is at
+    `(x - x0) * width / (x1 - x0)` in the window: principal point and focal lengths follow.
+
+    Attributes:
+        box: x0, y0, x1, y1 in pixels of the full image.
+        width, height: of the result.
+    """
+
+    box: tuple[float, float, float, float]
+    width: int
+    height: int
+
+    @staticmethod
+    def full(camera: Camera) -> Window:
+        """The whole image as it is."""
+        return Window((0.0, 0.0, float(camera.width), float(camera.height)), camera.width, camera.height)
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Pixels of the result a pixel of the full image, in x and y."""
+        x0, y0, x1, y1 = self.box
+        return self.width / (x1 - x0), self.height / (y1 - y0)
+
+    def resized(self, scale: float) -> Window:
+        """At `scale` times the resolution; the size is rounded, and the intrinsics follow the rounded size."""
+        size = (round(self.width * scale), round(self.height * scale))
+        if not scale > 0 or min(size) < 1:
+            raise InputError("scale", expected="a factor that leaves at least 1 x 1 pixels", received=str(scale))
+        return replace(self, width=size[0], height=size[1])
+
+    def cropped(self, box: tuple[int, int, int, int]) -> Window:
+        """The rectangle x0, y0, x1, y1 in pixels of this window, which must hold it."""
+        x0, y0, x1, y1 = map(int, box)
+        if not (0 <= x0 < x1 <= self.width and 0 <= y0 < y1 <= self.height):
+            raise InputError(
+                "crop box",
+                expected=f"x0 < x1 <= {self.width} and y0 < y1 <= {self.height}, from 0",
+                received=f"{tuple(box)}",
+            )
+        sx, sy = self.scale
+        left, top = self.box[:2]
+        return Window((left + x0 / sx, top + y0 / sy, left + x1 / sx, top + y1 / sy), x1 - x0, y1 - y0)
+
+    def camera(self, full: Camera) -> Camera:
+        """The camera of the window's pixels."""
+        sx, sy = self.scale
+        x0, y0 = self.box[:2]
+        window_from_full = np.array([[sx, 0.0, -x0 * sx], [0.0, sy, -y0 * sy], [0.0, 0.0, 1.0]])
+        return replace(full, K=window_from_full @ full.K, width=self.width, height=self.height)
+
+    def apply(self, image: Image, *, labels: bool = False) -> Image:
+        """Cut and resample an image: the mean over the area of a pixel where that is a whole number of pixels each way
+        (what a coarser sensor would have seen), else Lanczos; labels take the nearest pixel."""
+        from PIL.Image import Resampling
+
+        if self == Window((0.0, 0.0, float(image.width), float(image.height)), image.width, image.height):
+            return image
+        whole_box = all(edge == int(edge) for edge in self.box)
+        if whole_box and self.scale == (1.0, 1.0):
+            return image.crop(tuple(int(edge) for edge in self.box))
+        area = whole_box and all((1.0 / scale).is_integer() for scale in self.scale)
+        resample = Resampling.NEAREST if labels else Resampling.BOX if area else Resampling.LANCZOS
+        return image.resize((self.width, self.height), resample, box=self.box)
