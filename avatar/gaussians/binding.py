@@ -1,0 +1,183 @@
+"""Gaussians bound to the triangles of a mesh: local attributes, and their way to the world."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.gaussians.frames import TriangleFrames, triangle_frames
+from avatar.gaussians.quaternions import multiply_quats
+from smplxpp.core.errors import InputError
+
+THICKNESS = 0.01
+"""Scale of every Gaussian along its normal, in mean edge lengths of its triangle (TaoAvatar's epsilon)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoundGaussians:
+    """N Gaussians in the frames of their triangles (`TriangleFrames`); make variants with `dataclasses.replace`.
+
+    Attributes:
+        face_index: (N,) int64 the triangle.
+        barycentric: (N, 2) weights u of the first corner and v of the second; 1 - u - v is the third's.
+        normal_offset: (N,) gamma, metres along the triangle's normal.
+        offset: (N, 3) metres in the triangle's frame: (normal, median, their cross product).
+        log_scales: (N, 2) logarithms of the two tangential standard deviations, in mean edge lengths.
+        quats: (N, 4) wxyz, any length but zero: from the Gaussian's axes to the triangle's frame.
+        opacity_logits: (N,) opacities before the sigmoid.
+        dc: (N, 3) colour that does not depend on the view, in sRGB as the images.
+        sh: (N, K, 3) real spherical harmonics of degree 1 and up in the triangle's frame; K = 0, 3, 8 or 15.
+        face_count: triangles of the mesh.
+        topology: digest of the mesh's faces, see `topology_digest`.
+
+    Raises:
+        InputError: tensors that do not fit each other.
+    """
+
+    face_index: Tensor
+    barycentric: Tensor
+    normal_offset: Tensor
+    offset: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    opacity_logits: Tensor
+    dc: Tensor
+    sh: Tensor
+    face_count: int
+    topology: str
+
+    def __post_init__(self) -> None:
+        N, K = len(self.face_index), self.sh.shape[1] if self.sh.ndim == 3 else -1
+        shapes = {
+            "face_index": (N,), "barycentric": (N, 2), "normal_offset": (N,), "offset": (N, 3), "log_scales": (N, 2),
+            "quats": (N, 4), "opacity_logits": (N,), "dc": (N, 3), "sh": (N, K, 3),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise _misfit(name, f"shape {shape}", f"shape {tuple(value.shape)}")
+            dtype = torch.int64 if name == "face_index" else self.offset.dtype
+            if value.dtype != dtype or value.device != self.offset.device:
+                raise _misfit(name, f"{dtype} on {self.offset.device}", f"{value.dtype} on {value.device}")
+        if K not in (0, 3, 8, 15):
+            raise _misfit("sh", "0, 3, 8 or 15 coefficients (degrees 0 to 3)", str(K))
+
+    def __len__(self) -> int:
+        return len(self.face_index)
+
+    @property
+    def sh_degree(self) -> int:
+        return int((self.sh.shape[1] + 1) ** 0.5) - 1
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("face_count", "topology")}
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,) in (0, 1)."""
+        return torch.sigmoid(self.opacity_logits)
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) standard deviations in mean edge lengths: `[THICKNESS, exp, exp]`."""
+        tangential = torch.exp(self.log_scales)
+        return torch.cat([torch.full_like(tangential[:, :1], THICKNESS), tangential], 1)
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BoundGaussians:
+        """The same Gaussians on another device or with floats of another type."""
+        moved = {
+            name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+            for name, value in self.tensors.items()
+        }
+        return replace(self, **moved)
+
+    def select(self, index: Tensor) -> BoundGaussians:
+        """The Gaussians of a mask or index tensor, in its order."""
+        return replace(self, **{name: value[index] for name, value in self.tensors.items()})
+
+    def check_topology(self, faces: np.ndarray | Tensor, subject: str = "mesh") -> None:
+        """Raise InputError unless `faces` are those that the Gaussians were bound to."""
+        if len(faces) != self.face_count or topology_digest(faces) != self.topology:
+            raise InputError(
+                subject,
+                expected=f"the {self.face_count} faces that the Gaussians are bound to",
+                received=f"{len(faces)} other faces",
+                remedy="use the template that the Gaussians were sampled on, or sample anew",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class WorldGaussians:
+    """N Gaussians in the world, in a pose.
+
+    Attributes:
+        means: (..., N, 3) metres.
+        quats: (..., N, 4) wxyz, as long as the local ones: from the Gaussian's axes to the world.
+        scales: (..., N, 3) standard deviations, metres.
+        opacities: (N,) in (0, 1).
+        normals: (..., N, 3) unit: the first axis.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    normals: Tensor
+
+
+def topology_digest(faces: np.ndarray | Tensor) -> str:
+    """SHA-256 of the (F, 3) faces as little-endian int64."""
+    array = faces.cpu().numpy() if isinstance(faces, Tensor) else np.asarray(faces)
+    return hashlib.sha256(np.ascontiguousarray(array, dtype="<i8").tobytes()).hexdigest()
+
+
+def world_from_local(bound: BoundGaussians, vertices: Tensor, faces: Tensor) -> WorldGaussians:
+    """Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
+
+    Args:
+        bound: the local attributes.
+        vertices: (..., V, 3) of the posed mesh, metres.
+        faces: (F, 3) int64.
+    """
+    return world_from_frames(bound, triangle_frames(vertices, faces))
+
+
+def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
+    """Gaussians in the world, with gradients to their attributes and to the vertices.
+
+    `u_w = u v1 + v v2 + (1 - u - v) v3 + R (gamma [1, 0, 0] + du)`, `r_w = R r`, `s_w = e s` with
+    `s = [THICKNESS, exp, exp]`, and `normal = R r [1, 0, 0]` (TaoAvatar; offsets are metres, scales are edges).
+
+    Raises:
+        InputError: frames of another number of faces.
+    """
+    if frames.face_count != bound.face_count:
+        raise InputError("frames", expected=f"{bound.face_count} triangles", received=str(frames.face_count))
+    rotations = frames.rotations[..., bound.face_index, :, :]
+    corners = frames.corners[..., bound.face_index, :, :]
+    u, v = bound.barycentric.unbind(-1)
+    weights = torch.stack([u, v, 1 - u - v], -1)
+    normal, median, binormal = bound.offset.unbind(-1)
+    local = torch.stack([normal + bound.normal_offset, median, binormal], -1)
+    means = (weights[:, :, None] * corners).sum(-2) + (rotations * local[:, None, :]).sum(-1)
+    quats = multiply_quats(frames.quats[..., bound.face_index, :], bound.quats)
+    scales = frames.lengths[..., bound.face_index, None] * bound.scales
+    return WorldGaussians(means, quats, scales, bound.opacities, _first_axes(quats))
+
+
+def _first_axes(quats: Tensor) -> Tensor:
+    """The x axes turned by quaternions of any length: (..., 4) -> (..., 3) unit."""
+    w, x, y, z = quats.unbind(-1)
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    axes = torch.stack([ww + xx - yy - zz, 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    return axes / (ww + xx + yy + zz)[..., None]
+
+
+def _misfit(name: str, expected: str, received: str) -> InputError:
+    return InputError(f"bound Gaussians: {name}", expected=expected, received=received)

@@ -1,0 +1,55 @@
+"""Quaternions (w, x, y, z) and rotation matrices in torch, differentiable everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def quat_from_matrix(matrix: Tensor) -> Tensor:
+    """Unit quaternions of rotation matrices.
+
+    `4 q q^T` is linear in the matrix. The row of its largest diagonal entry, normalised, is q: that entry is at least
+    1, so that neither the value nor the gradient has a weak spot (Shepperd 1978, without the branches).
+
+    Args:
+        matrix: (..., 3, 3) rotations.
+
+    Returns:
+        (..., 4) wxyz of length 1; the sign is free.
+    """
+    a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
+    wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
+    diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    ww, xx, yy, zz = diagonal
+    rows = ((ww, wx, wy, wz), (wx, xx, xy, xz), (wy, xy, yy, yz), (wz, xz, yz, zz))
+    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    best = torch.stack(diagonal, -1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return row / row.norm(dim=-1, keepdim=True)
+
+
+def matrix_from_quat(quat: Tensor) -> Tensor:
+    """Rotation matrices of quaternions of any length but zero: (..., 4) wxyz -> (..., 3, 3)."""
+    w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product: first turn by `b`, then by `a`; (..., 4) each, broadcast."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )

@@ -1,0 +1,27 @@
+"""Penalties that keep Gaussians small and near their triangles (GaussianAvatars, Qian et al. 2024)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.frames import TriangleFrames
+
+MAX_SCALE = 0.6
+"""Mean edge lengths; larger standard deviations are penalised."""
+MAX_OFFSET = 1.0
+"""Mean edge lengths; Gaussians farther from their place on the triangle are penalised."""
+OFFSET_WEIGHT = 0.01
+"""Of the offsets' penalty against the scales'."""
+
+
+def scale_penalty(bound: BoundGaussians) -> Tensor:
+    """Mean over the Gaussians of `|relu(s - 0.6)|`, s the tangential scales in mean edge lengths."""
+    return torch.relu(torch.exp(bound.log_scales) - MAX_SCALE).norm(dim=-1).mean()
+
+
+def offset_penalty(bound: BoundGaussians, frames: TriangleFrames) -> Tensor:
+    """0.01 times the mean of `relu(|du + gamma [1, 0, 0]| / e - 1)`: offsets are metres, the bound is an edge."""
+    total = torch.cat([bound.offset[:, :1] + bound.normal_offset[:, None], bound.offset[:, 1:]], 1)
+    return OFFSET_WEIGHT * torch.relu(total.norm(dim=-1) / frames.lengths[bound.face_index] - MAX_OFFSET).mean()

@@ -1,0 +1,133 @@
+"""Colour that depends on the view: real spherical harmonics of degrees 0 to 3, as 3D Gaussian Splatting orders them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.frames import TriangleFrames
+from smplxpp.core.errors import InputError
+
+C0 = 0.28209479177387814
+"""1 / (2 sqrt(pi)), the harmonic of degree 0."""
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+MAX_DEGREE = 3
+
+
+def coefficient_count(degree: int) -> int:
+    """Coefficients of degrees 1 to `degree`: 0, 3, 8, 15.
+
+    Raises:
+        InputError: a degree outside 0 to 3.
+    """
+    if degree not in range(MAX_DEGREE + 1):
+        raise InputError("degree of spherical harmonics", expected="0, 1, 2 or 3", received=str(degree))
+    return (degree + 1) ** 2 - 1
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Harmonics of degrees 1 to `degree` at unit directions, in 3DGS's order and with its signs.
+
+    Order m = -l..l in every degree; Condon-Shortley phase, so that degree 1 is `C1 (-y, z, -x)` (Sloan 2008, appendix
+    A2). Degree 0 is not among them: its colour is a plain number.
+
+    Args:
+        directions: (..., 3) unit.
+        degree: 0 to 3.
+
+    Returns:
+        (..., K), K = (degree + 1)^2 - 1.
+    """
+    coefficient_count(degree)
+    x, y, z = directions.unbind(-1)
+    terms: list[Tensor] = []
+    if degree > 0:
+        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [
+            _C2[0] * x * y,
+            -_C2[0] * y * z,
+            _C2[1] * (2 * zz - xx - yy),
+            -_C2[0] * x * z,
+            _C2[2] * (xx - yy),
+        ]
+    if degree > 2:
+        terms += [
+            -_C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            -_C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -_C3[2] * x * (4 * zz - xx - yy),
+            _C3[4] * z * (xx - yy),
+            -_C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(terms, -1) if terms else x.new_zeros((*x.shape, 0))
+
+
+def sh_color(dc: Tensor, sh: Tensor, directions: Tensor) -> Tensor:
+    """Colours seen along unit directions: `max(0, dc + sum_k sh_k Y_k(d))`.
+
+    3DGS's colour is the same with `dc = 0.5 + C0 f_dc`.
+
+    Args:
+        dc: (..., 3). sh: (..., K, 3). directions: (..., 3), in the frame of the coefficients; all broadcast.
+    """
+    degree = int((sh.shape[-2] + 1) ** 0.5) - 1
+    if not degree:
+        return dc.clamp_min(0.0).expand(torch.broadcast_shapes(dc.shape, directions.shape))
+    basis = sh_basis(directions, degree)
+    return (dc + (basis[..., None] * sh).sum(-2)).clamp_min(0.0)
+
+
+def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, camera_positions: Tensor) -> Tensor:
+    """Colours of Gaussians as C cameras see them: `SH(sh, R^-1 d) + dc`, not below 0, R the triangle's rotation.
+
+    Args:
+        bound: N Gaussians.
+        frames: (F) frames of one pose.
+        means: (N, 3) world, as `world_from_frames` gives them.
+        camera_positions: (C, 3) centres of projection in the world.
+
+    Returns:
+        (C, N, 3), with gradients to the colours, the means, the frames and the positions.
+    """
+    directions = torch.nn.functional.normalize(means - camera_positions[:, None], dim=-1)
+    rotations = frames.rotations[bound.face_index]
+    # R^T d: the sum runs over rows.
+    local = (rotations * directions[..., :, None]).sum(-2)
+    return sh_color(bound.dc, bound.sh, local)
+
+
+def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
+    """Coefficients after a turn of the function: `sum_k out_k Y_k(R d) = sum_k sh_k Y_k(d)` for every direction.
+
+    A rotation mixes harmonics of one degree among themselves. Their new coefficients are found from values at fixed
+    directions by least squares, which is exact: the turned function is in the span.
+
+    Args:
+        sh: (N, K, 3). rotations: (N, 3, 3), a rotation for each Gaussian.
+    """
+    degree = int((sh.shape[-2] + 1) ** 0.5) - 1
+    if not degree:
+        return sh
+    directions, solve = (torch.as_tensor(array).to(sh) for array in _samples(degree))
+    # Values at d of the turned function are values at R^T d of the function as it was.
+    basis = sh_basis(torch.einsum("sj,njk->nsk", directions, rotations), degree)
+    return solve @ (basis @ sh)
+
+
+@cache
+def _samples(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (S, 3) spread over the sphere, and (K, S) that takes values there to coefficients."""
+    k = np.arange(32) + 0.5
+    z = 1.0 - 2.0 * k / len(k)
+    angle, radius = np.pi * (1.0 + 5.0**0.5) * k, np.sqrt(1.0 - z * z)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    return directions, np.linalg.pinv(sh_basis(torch.as_tensor(directions), degree).numpy())
