@@ -10,6 +10,7 @@ import math
 import numbers
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -84,8 +85,8 @@ def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
         values["background"] = background.detach()
     for name in _suspects(values):
         _check_exactly(name, values[name])
-    _check_viewmats(values["viewmats"])
-    _check_Ks(values["Ks"])
+    _check_viewmats(values["viewmats"].cpu().double().numpy())
+    _check_Ks(values["Ks"].cpu().double().numpy())
 
 
 def _check_shape(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | str, ...]) -> dict[str, int]:
@@ -163,12 +164,10 @@ def _raise_if_any(name: str, bad: Tensor, expected: str, fault: str, remedy: str
         raise InputError(name, expected=expected, received=received, remedy=remedy)
 
 
-def _check_viewmats(viewmats: Tensor) -> None:
-    matrices = viewmats.to("cpu", torch.float64)
-    rotations = matrices[:, :3, :3]
-    off = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
-    mirrored = torch.linalg.det(rotations) <= 0
-    for camera in ((off > ROTATION_TOLERANCE) | mirrored).nonzero()[:1, 0].tolist():
+def _check_viewmats(viewmats: np.ndarray) -> None:
+    rotations = viewmats[:, :3, :3]
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
+    for camera in np.flatnonzero((off > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0))[:1]:
         fault = f"R R^T - I up to {off[camera]:.2g}" if off[camera] > ROTATION_TOLERANCE else "a mirror image"
         raise InputError(
             "viewmats",
@@ -176,33 +175,30 @@ def _check_viewmats(viewmats: Tensor) -> None:
             received=f"{fault} in camera {camera}",
             remedy="scale the scene rather than the camera",
         )
-    _check_last_row("viewmats", matrices)
+    _check_last_row("viewmats", viewmats)
 
 
-def _check_Ks(Ks: Tensor) -> None:
-    matrices = Ks.to("cpu", torch.float64)
-    focal = matrices.diagonal(dim1=1, dim2=2)[:, :2]
-    for camera in (focal <= 0).any(1).nonzero()[:1, 0].tolist():
+def _check_Ks(Ks: np.ndarray) -> None:
+    focal, skew = Ks[:, [0, 1], [0, 1]], np.abs(Ks[:, [0, 1], [1, 0]])
+    for camera in np.flatnonzero((focal <= 0).any(1))[:1]:
         received = f"{focal[camera].tolist()} in camera {camera}"
         raise InputError("Ks", expected="positive focal lengths in pixels", received=received)
-    skew = torch.stack([matrices[:, 0, 1], matrices[:, 1, 0]], -1).abs()
-    for camera in (skew > SKEW_TOLERANCE * focal).any(1).nonzero()[:1, 0].tolist():
+    for camera in np.flatnonzero((skew > SKEW_TOLERANCE * focal).any(1))[:1]:
         raise InputError(
             "Ks",
             expected="intrinsics without skew (K[0, 1] = K[1, 0] = 0)",
             received=f"{skew[camera].max():.3g} in camera {camera}",
             remedy="resample the image to square axes",
         )
-    _check_last_row("Ks", matrices)
+    _check_last_row("Ks", Ks)
 
 
-def _check_last_row(name: str, matrices: Tensor) -> None:
-    size = matrices.shape[-1]
-    wanted = torch.eye(size, dtype=matrices.dtype)[-1]
-    for camera in (matrices[:, -1] != wanted).any(1).nonzero()[:1, 0].tolist():
+def _check_last_row(name: str, matrices: np.ndarray) -> None:
+    wanted = np.eye(matrices.shape[-1])[-1]
+    for camera in np.flatnonzero((matrices[:, -1] != wanted).any(1))[:1]:
         raise InputError(
             name,
-            expected=f"last row {[int(v) for v in wanted]}",
+            expected=f"last row {wanted.astype(int).tolist()}",
             received=f"{matrices[camera, -1].tolist()} in camera {camera}",
             remedy="transpose it if its translation stands in the last row" if name == "viewmats" else "",
         )
