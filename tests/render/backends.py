@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 import torch
 
@@ -14,5 +16,9 @@ GSPLAT = pytest.param(
     "gsplat",
     marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device"),
 )
-FAST_BACKENDS = [pytest.param("cpu"), GSPLAT]
+CPU = pytest.param(
+    "cpu",
+    marks=pytest.mark.skipif(find_spec("avatar.render.cpu") is None, reason="the CPU backend is not there"),
+)
+FAST_BACKENDS = [CPU, GSPLAT]
 ALL_BACKENDS = [pytest.param("reference"), *FAST_BACKENDS]
