@@ -1,7 +1,7 @@
 // Undistortion of 8-bit images: every output pixel looks up the lens model and interpolates; no map is stored.
-#include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 #include "parallel.hpp"
 
@@ -11,7 +11,7 @@ namespace {
 struct Lens {
     double k[6], p[2];
 
-    void distort(double x, double y, double& xd, double& yd) const {
+    void distort(double x, double y, double& xd, double& yd) const {  // no branch: the row's loop is vectorised
         const double r2 = x * x + y * y;
         const double radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))) / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])));
         xd = x * radial + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x);
@@ -34,35 +34,41 @@ void nearest(const Image& source, double u, double v, uint8_t* out) {
 
 template <int channels>
 void bilinear(const Image& source, double u, double v, uint8_t* out) {
-    const double x = u - 0.5, y = v - 0.5;  // pixel centres are at +0.5
-    const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));
-    const float fx = static_cast<float>(x - x0), fy = static_cast<float>(y - y0);
-    const int left = x0 < 0 ? 0 : x0, right = x0 + 1 > source.width - 1 ? source.width - 1 : x0 + 1;
-    const int top = y0 < 0 ? 0 : y0, bottom = y0 + 1 > source.height - 1 ? source.height - 1 : y0 + 1;
+    // Pixel centres are at +0.5; u and v are not negative, so that the cast, which rounds towards zero, is a floor.
+    const double x = u + 0.5, y = v + 0.5;
+    const int x1 = static_cast<int>(x), y1 = static_cast<int>(y), x0 = x1 - 1, y0 = y1 - 1;
+    // Weights of 11 bits: an 8-bit value times two of them fits in 31 bits.
+    const int fx = static_cast<int>((x - x1) * 2048 + 0.5), fy = static_cast<int>((y - y1) * 2048 + 0.5);
+    const int left = x0 < 0 ? 0 : x0, right = x1 > source.width - 1 ? source.width - 1 : x1;
+    const int top = y0 < 0 ? 0 : y0, bottom = y1 > source.height - 1 ? source.height - 1 : y1;
     const uint8_t* upper = source.data + static_cast<int64_t>(top) * source.width * channels;
     const uint8_t* lower = source.data + static_cast<int64_t>(bottom) * source.width * channels;
+    const uint8_t *a = upper + left * channels, *b = upper + right * channels;
+    const uint8_t *d = lower + left * channels, *e = lower + right * channels;
     for (int c = 0; c < channels; ++c) {
-        const float a = upper[left * channels + c], b = upper[right * channels + c];
-        const float d = lower[left * channels + c], e = lower[right * channels + c];
-        const float above = a + (b - a) * fx, below = d + (e - d) * fx;
-        out[c] = static_cast<uint8_t>(above + (below - above) * fy + 0.5f);
+        const int above = a[c] * (2048 - fx) + b[c] * fx, below = d[c] * (2048 - fx) + e[c] * fx;
+        out[c] = static_cast<uint8_t>((above * (2048 - fy) + below * fy + (1 << 21)) >> 22);
     }
 }
 
 template <int channels, void (*sample)(const Image&, double, double, uint8_t*)>
 void undistort(const Image& source, const Lens& lens, const double* inverse, const double* K, uint8_t* out, int width,
                int height) {
+    std::vector<double> u(width), v(width);
     for (int j = 0; j < height; ++j) {
+        const double t = j + 0.5;
+        const double row_x = inverse[1] * t + inverse[2], row_y = inverse[4] * t + inverse[5];
+        double *us = u.data(), *vs = v.data();
         for (int i = 0; i < width; ++i) {
-            const double s = i + 0.5, t = j + 0.5;
-            const double x = inverse[0] * s + inverse[1] * t + inverse[2];
-            const double y = inverse[3] * s + inverse[4] * t + inverse[5];
             double xd, yd;
-            lens.distort(x, y, xd, yd);
-            const double u = K[0] * xd + K[1] * yd + K[2], v = K[3] * xd + K[4] * yd + K[5];
-            uint8_t* pixel = out + (static_cast<int64_t>(j) * width + i) * channels;
-            if (u >= 0 && v >= 0 && u <= source.width && v <= source.height)  // false for NaN too
-                sample(source, u, v, pixel);
+            lens.distort(inverse[0] * (i + 0.5) + row_x, inverse[3] * (i + 0.5) + row_y, xd, yd);
+            us[i] = K[0] * xd + K[1] * yd + K[2];
+            vs[i] = K[3] * xd + K[4] * yd + K[5];
+        }
+        uint8_t* pixel = out + static_cast<int64_t>(j) * width * channels;
+        for (int i = 0; i < width; ++i, pixel += channels) {
+            if (us[i] >= 0 && vs[i] >= 0 && us[i] <= source.width && vs[i] <= source.height)  // false for NaN too
+                sample(source, us[i], vs[i], pixel);
             else
                 std::memset(pixel, 0, channels);
         }
