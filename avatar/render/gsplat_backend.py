@@ -86,7 +86,7 @@ def _load_gsplat() -> ModuleType:
             "gsplat",
             expected=f"version {SUPPORTED}x, whose alpha is clamped to 0.999",
             received=gsplat.__version__,
-            remedy="pip install 'gsplat>=1.5.3,<1.6'",
+            remedy="run pip install 'gsplat>=1.5.3,<1.6'",
         )
     from gsplat.cuda import _backend
 
