@@ -166,7 +166,7 @@ def _draw_nothing(
         image = image + background[:, None, None, :]
     alpha = nothing.expand(cameras, settings.height, settings.width, 1)
     per_gaussian = features.new_zeros(cameras, count, 2)
-    return image, alpha, RasterMeta(per_gaussian, per_gaussian.int(), per_gaussian[..., 0])
+    return image, alpha, RasterMeta(means2d=per_gaussian, radii=per_gaussian, depths=per_gaussian[..., 0])
 
 
 def _divide(blended: Tensor, alpha: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ def rasterize_gsplat(
         rasterize_mode="classic",
         camera_model="pinhole",
     )
-    radii = found["radii"]
+    radii = found["radii"].to(means.dtype)
     # gsplat leaves what it culls uninitialised.
     means2d = torch.where((radii > 0).all(-1, keepdim=True), found["means2d"].detach(), 0.0)
     depths = camera_depths(means.detach(), viewmats.detach())

@@ -72,7 +72,7 @@ class _Splats:
     index: Tensor  # (M,) which of the N
     means2d: Tensor  # (M, 2) pixels
     conics: Tensor  # (M, 3) inverse covariance in the image: xx, xy, yy
-    radii: Tensor  # (M, 2) half width and height of the box outside of which alpha < ALPHA_MIN, in whole pixels
+    radii: Tensor  # (M, 2) half width and height in pixels of the box outside of which alpha < ALPHA_MIN
     depths: Tensor  # (N,) of all Gaussians, culled or not
 
 
@@ -122,7 +122,7 @@ def _project(
     determinant = xx * yy - xy * xy
     # alpha = o exp(-sigma) reaches ALPHA_MIN where sigma = ln(o / ALPHA_MIN); its box has these half sides.
     reach = (2 * torch.log(opacities[index].detach() / ALPHA_MIN)).sqrt()
-    radii = torch.ceil(reach[:, None] * torch.stack([xx, yy], -1).detach().sqrt())
+    radii = reach[:, None] * torch.stack([xx, yy], -1).detach().sqrt()
     size = means2d.new_tensor([settings.width, settings.height])
     seen = (determinant > 0) & ((means2d + radii > 0) & (means2d - radii < size)).all(-1)
     conics = torch.stack([yy[seen], -xy[seen], xx[seen]], -1) / determinant[seen, None]
@@ -154,9 +154,9 @@ def _render_view(
     image, transmittance = (torch.cat(parts, dim=0) for parts in zip(*rows, strict=True))
 
     means2d = torch.zeros(len(opacities), 2, dtype=features.dtype, device=features.device)
-    radii = torch.zeros_like(means2d, dtype=torch.int32)
+    radii = torch.zeros_like(means2d)
     means2d[splats.index] = splats.means2d.detach()
-    radii[splats.index] = splats.radii.to(torch.int32)
+    radii[splats.index] = splats.radii
     return image, transmittance, (means2d, radii, splats.depths.detach())
 
 

@@ -39,8 +39,9 @@ class RasterMeta:
 
     Attributes:
         means2d: (C, N, 2) projected centres in pixels; 0 where culled.
-        radii: (C, N, 2) half width and height in pixels of the box that can reach `ALPHA_MIN`; 0 where culled.
-        depths: (C, N) metres along the camera's z.
+        radii: (C, N, 2) half width and height in pixels of the box that can reach `ALPHA_MIN` (gsplat rounds them up);
+            0 where culled.
+        depths: (C, N) metres along the camera's z, of culled Gaussians too.
         depth: (C, H, W, 1) accumulated or expected depth in metres, where it was asked for.
     """
 

@@ -57,7 +57,7 @@ def stand_in(
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
     image, alpha, meta = rasterize_reference(*tensors, settings)
     garbage = torch.where(meta.visible[..., None], meta.means2d, float("nan"))
-    return image, alpha, {"radii": meta.radii, "means2d": garbage + 0 * means.sum(), "depths": meta.depths}
+    return image, alpha, {"radii": meta.radii.ceil().int(), "means2d": garbage + 0 * means.sum(), "depths": meta.depths}
 
 
 @pytest.fixture
