@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.render.reference import camera_depths, rasterize_reference
 from avatar.render.settings import RasterMeta, RasterSettings
-from avatar.render.validation import check_layout, check_settings, check_values
+from avatar.render.validation import check_layout, check_values, checked_settings
 from smplxpp.core.errors import InputError
 
 BACKENDS = ("cpu", "gsplat", "reference")
@@ -79,7 +79,7 @@ def rasterize(
         >>> image, alpha, meta = rasterize(means, quats, scales, opacities, colors, viewmats, Ks, 512, 512)
         >>> (image - photograph).abs().mean().backward()
     """
-    settings = RasterSettings(width, height, near, far, eps2d, camera_gradients)
+    settings = checked_settings(RasterSettings(width, height, near, far, eps2d, camera_gradients))
     tensors = dict(
         zip(
             ("means", "quats", "scales", "opacities", "features", "viewmats", "Ks"),
@@ -87,7 +87,6 @@ def rasterize(
             strict=True,
         )
     )
-    check_settings(settings)
     check_layout(tensors, background)
     draw = _choose_backend(backend, means, Ks)
     if depth is not None and depth not in DEPTHS:

@@ -6,6 +6,7 @@ Every message names the argument, what was expected and what came. The checks of
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Mapping
@@ -25,8 +26,8 @@ SKEW_TOLERANCE = 1e-6
 """Skew accepted as rounding, as a share of the focal length."""
 
 
-def check_settings(settings: RasterSettings) -> None:
-    """Image size, clipping planes and blur.
+def checked_settings(settings: RasterSettings) -> RasterSettings:
+    """Image size, clipping planes and blur as Python's own numbers (numpy's are welcome).
 
     Raises:
         InputError: one of them cannot be used.
@@ -42,6 +43,9 @@ def check_settings(settings: RasterSettings) -> None:
         raise InputError("near, far", expected="0 < near < far, in metres", received=f"{settings.near}, {settings.far}")
     if settings.eps2d < 0:
         raise InputError("eps2d", expected="0 or more, in pixels squared", received=repr(settings.eps2d))
+    numbers_ = {name: int(getattr(settings, name)) for name in ("width", "height")}
+    numbers_ |= {name: float(getattr(settings, name)) for name in ("near", "far", "eps2d")}
+    return dataclasses.replace(settings, **numbers_)
 
 
 def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> None:

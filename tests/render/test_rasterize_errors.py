@@ -140,6 +140,7 @@ def test_intrinsics_that_are_not_supported(scene, row, column, value):
         ({"height": -3}, "height"),
         ({"width": 8.0}, "width"),
         ({"height": True}, "height"),
+        ({"width": np.float32(8)}, "width"),
         ({"near": 0.0}, "near, far"),
         ({"near": 2.0, "far": 1.0}, "near, far"),
         ({"far": float("inf")}, "far"),
@@ -153,6 +154,12 @@ def test_wrong_options(scene, options, subject):
     size = {name: options[name] for name in ("width", "height") if name in options}
     rest = {name: value for name, value in options.items() if name not in size}
     assert refused(scene.replace(**size), **rest).subject == subject
+
+
+def test_numpy_numbers_are_welcome(scene):
+    sized = scene.replace(width=np.int64(8), height=np.int32(6))
+    image, _, _ = rasterize(**vars(sized), backend="reference", near=np.float32(0.5), eps2d=np.int64(1))
+    assert image.shape == (2, 6, 8, 4)
 
 
 def test_features_without_channels(scene):
