@@ -9,7 +9,7 @@ from tests.render.backends import CPU
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "rendering.md"
 
-pytestmark = CPU.marks
+pytestmark = list(CPU.marks)
 
 
 def test_example_of_the_docs():
