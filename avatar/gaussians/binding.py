@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.frames import TriangleFrames, triangle_frames
+from avatar.gaussians.native_kernels import WorldFunction, is_native
 from avatar.gaussians.quaternions import multiply_quats
 from smplxpp.core.errors import InputError
 
@@ -35,7 +36,7 @@ class BoundGaussians:
         topology: digest of the mesh's faces, see `topology_digest`.
 
     Raises:
-        InputError: tensors that do not fit each other.
+        InputError: tensors that do not fit each other, or triangles out of range (looked at on the CPU only).
     """
 
     face_index: Tensor
@@ -63,6 +64,10 @@ class BoundGaussians:
             dtype = torch.int64 if name == "face_index" else self.offset.dtype
             if value.dtype != dtype or value.device != self.offset.device:
                 raise _misfit(name, f"{dtype} on {self.offset.device}", f"{value.dtype} on {value.device}")
+        if N and self.face_index.device.type == "cpu":
+            low, high = (int(bound) for bound in self.face_index.aminmax())
+            if low < 0 or high >= self.face_count:
+                raise _misfit("face_index", f"indices in [0, {self.face_count})", f"[{low}, {high}]")
         if K not in (0, 3, 8, 15):
             raise _misfit("sh", "0, 3, 8 or 15 coefficients (degrees 0 to 3)", str(K))
 
@@ -153,12 +158,29 @@ def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGau
 
     `u_w = u v1 + v v2 + (1 - u - v) v3 + R (gamma [1, 0, 0] + du)`, `r_w = R r`, `s_w = e s` with
     `s = [THICKNESS, exp, exp]`, and `normal = R r [1, 0, 0]` (TaoAvatar; offsets are metres, scales are edges).
+    float32 on the CPU goes through the native library.
 
     Raises:
-        InputError: frames of another number of faces.
+        InputError: frames of another number of faces, type or device.
     """
     if frames.face_count != bound.face_count:
         raise InputError("frames", expected=f"{bound.face_count} triangles", received=str(frames.face_count))
+    if frames.lengths.dtype != bound.offset.dtype or frames.lengths.device != bound.offset.device:
+        raise InputError(
+            "frames",
+            expected=f"{bound.offset.dtype} on {bound.offset.device}, as the Gaussians",
+            received=f"{frames.lengths.dtype} on {frames.lengths.device}",
+        )
+    if is_native(bound.offset):
+        local = (bound.barycentric, bound.normal_offset, bound.offset, bound.log_scales, bound.quats)
+        of_frames = (frames.corners, frames.rotations, frames.quats, frames.lengths)
+        means, quats, scales, normals = WorldFunction.apply(THICKNESS, bound.face_index, *local, *of_frames)
+        return WorldGaussians(means, quats, scales, bound.opacities, normals)
+    return world_from_frames_reference(bound, frames)
+
+
+def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
+    """`world_from_frames` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
     u, v = bound.barycentric.unbind(-1)

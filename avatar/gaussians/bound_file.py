@@ -58,9 +58,6 @@ def load_bound(path: str | Path, *, faces: np.ndarray | None = None) -> BoundGau
     for name, value in bound.tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise InputError(f"{subject}: {name}", expected="finite values", received="NaN or infinity")
-    index = bound.face_index
-    if len(index) and not 0 <= int(index.min()) <= int(index.max()) < bound.face_count:
-        raise InputError(f"{subject}: face_index", expected=f"indices below {bound.face_count}", received="others")
     if faces is not None:
         bound.check_topology(faces, subject)
     return bound

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avatar.gaussians.native_kernels import FramesFunction, is_native
 from avatar.gaussians.quaternions import quat_from_matrix
 from smplxpp.core.errors import GeometryWarning, InputError
 
@@ -45,14 +46,14 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     inward and is not unit). q lies in the triangle's plane, so that R is a rotation.
 
     A triangle whose height is lost in rounding gets some normal across its longest direction, constant for gradients,
-    with a GeometryWarning; mean edges below `MIN_EDGE` are clamped.
+    with a GeometryWarning; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes through the native library.
 
     Args:
         vertices: (..., V, 3) floating point, metres.
         faces: (F, 3) int64 on the same device.
 
     Raises:
-        InputError: other shapes or types.
+        InputError: other shapes or types, indices out of range.
     """
     if vertices.ndim < 2 or vertices.shape[-1] != 3 or not vertices.is_floating_point():
         raise InputError(
@@ -64,38 +65,47 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
         raise InputError(
             "faces", expected="int64 of shape (F, 3)", received=f"{faces.dtype} of shape {tuple(faces.shape)}"
         )
+    if faces.device.type == "cpu" and faces.numel():
+        low, high = (int(bound) for bound in faces.aminmax())
+        if low < 0 or high >= vertices.shape[-2]:
+            raise InputError("faces", expected=f"indices in [0, {vertices.shape[-2]})", received=f"[{low}, {high}]")
+    if is_native(vertices):
+        *arrays, degenerate = FramesFunction.apply(vertices, faces)
+    else:
+        *arrays, degenerate = triangle_frames_reference(vertices, faces)
+    if degenerate:
+        warnings.warn(
+            f"{int(degenerate)} triangles without area: Gaussians on them get some normal across the longest direction",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    return TriangleFrames(*arrays)
+
+
+def triangle_frames_reference(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
+
+    The oracle of the native kernel, and the way for other types and devices.
+    """
     corners = vertices[..., faces, :]
     v1, v2, v3 = corners.unbind(-2)
     to_second, to_third = v2 - v1, v3 - v1
     cross = torch.linalg.cross(to_second, to_third)
     median = 0.5 * (to_second + to_third)
     lengths = (to_second.norm(dim=-1) + to_third.norm(dim=-1) + (v3 - v2).norm(dim=-1)) / 3.0
-    cross, median = _clamp_degenerate(cross, median, to_second, lengths)
-    n = cross / cross.norm(dim=-1, keepdim=True)
-    q = median / median.norm(dim=-1, keepdim=True)
-    rotations = torch.stack([n, q, torch.linalg.cross(n, q)], -1)
-    return TriangleFrames(corners, rotations, quat_from_matrix(rotations), lengths.clamp_min(MIN_EDGE))
-
-
-def _clamp_degenerate(cross: Tensor, median: Tensor, side: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals and medians with constants in the place of those that rounding has eaten."""
     with torch.no_grad():
         # Corners a metre from the origin carry an error of one epsilon: about 1e-4 of a 1 mm edge in float32.
         tolerance = 100.0 * torch.finfo(cross.dtype).eps
         degenerate = cross.norm(dim=-1) <= tolerance * lengths.clamp_min(MIN_EDGE) ** 2
-        count = int(degenerate.sum())
-        if not count:
-            return cross, median
-        along = torch.where((median.norm(dim=-1) > tolerance * lengths)[..., None], median, side)
+        along = torch.where((median.norm(dim=-1) > tolerance * lengths)[..., None], median, to_second)
         short = along.norm(dim=-1, keepdim=True) <= tolerance * MIN_EDGE
         along = torch.where(short, along.new_tensor([1.0, 0.0, 0.0]), along)
         # The axis that is farthest from `along`, so that the cross product is long.
         axis = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along)
         across = torch.linalg.cross(along, axis)
-    warnings.warn(
-        f"{count} triangles without area: Gaussians on them get some normal across the longest direction",
-        GeometryWarning,
-        stacklevel=3,
-    )
-    mask = degenerate[..., None]
-    return torch.where(mask, across, cross), torch.where(mask, along, median)
+    cross = torch.where(degenerate[..., None], across, cross)
+    median = torch.where(degenerate[..., None], along, median)
+    n = cross / cross.norm(dim=-1, keepdim=True)
+    q = median / median.norm(dim=-1, keepdim=True)
+    rotations = torch.stack([n, q, torch.linalg.cross(n, q)], -1)
+    return corners, rotations, quat_from_matrix(rotations), lengths.clamp_min(MIN_EDGE), degenerate.sum()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.frames import TriangleFrames
+from avatar.gaussians.native_kernels import ColorsFunction, is_native
 from smplxpp.core.errors import InputError
 
 C0 = 0.28209479177387814
@@ -97,7 +98,26 @@ def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, ca
 
     Returns:
         (C, N, 3), with gradients to the colours, the means, the frames and the positions.
+
+    Raises:
+        InputError: shapes that do not fit, as those of batches of poses.
     """
+    expected = {"rotations": (bound.face_count, 3, 3), "means": (len(bound), 3), "camera positions": (None, 3)}
+    received = {"rotations": frames.rotations, "means": means, "camera positions": camera_positions}
+    for name, shape in expected.items():
+        value = tuple(received[name].shape)
+        if len(value) != len(shape) or any(b not in (None, a) for a, b in zip(value, shape, strict=True)):
+            raise InputError(f"colours: {name}", expected=f"shape {shape}", received=f"shape {value}")
+    inputs = (frames.rotations, bound.dc, bound.sh, means, camera_positions)
+    if is_native(*inputs):
+        return ColorsFunction.apply(bound.face_index, *inputs)
+    return view_colors_reference(bound, frames, means, camera_positions)
+
+
+def view_colors_reference(
+    bound: BoundGaussians, frames: TriangleFrames, means: Tensor, camera_positions: Tensor
+) -> Tensor:
+    """`view_colors` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
     directions = torch.nn.functional.normalize(means - camera_positions[:, None], dim=-1)
     rotations = frames.rotations[bound.face_index]
     # R^T d: the sum runs over rows.

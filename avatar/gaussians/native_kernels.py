@@ -1,0 +1,173 @@
+"""Kernels of the native library for bound Gaussians: float32 on the CPU, with gradients.
+
+The torch formulas in `frames`, `binding` and `spherical_harmonics` are what they compute, and their oracle in tests.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from smplxpp.native import native_library
+
+_LOCAL = ("barycentric", "normal_offset", "offset", "log_scales", "quats")
+_FRAMES = ("corners", "rotations", "frame_quats", "lengths")
+
+
+class _Binding(ctypes.Structure):
+    """SmplxppBinding of binding.cpp."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("face", *_LOCAL, *_FRAMES)] + [
+        ("N", ctypes.c_int64),
+        ("F", ctypes.c_int64),
+        ("B", ctypes.c_int64),
+        ("thickness", ctypes.c_float),
+    ]
+
+
+class _BindingGradients(ctypes.Structure):
+    """SmplxppBindingGradients of binding.cpp."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("means", "out_quats", "scales", "normals", *_LOCAL, *_FRAMES)]
+
+
+def is_native(*tensors: Tensor) -> bool:
+    """Whether the kernels take these tensors: all float32 on the CPU."""
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+
+
+class FramesFunction(torch.autograd.Function):
+    """(..., V, 3) vertices, (F, 3) faces -> tensors of `TriangleFrames`, and how many have no area."""
+
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
+        vertices, faces = vertices.contiguous(), faces.contiguous()
+        batch, V, F = vertices.shape[:-2], vertices.shape[-2], len(faces)
+        out = [vertices.new_empty((*batch, F, *tail)) for tail in ((3, 3), (3, 3), (4,), ())]
+        library = native_library()
+        library.smplxpp_frames_forward.restype = ctypes.c_int64
+        degenerate = library.smplxpp_frames_forward(
+            _pointer(vertices),
+            _pointer(faces),
+            *map(ctypes.c_int64, (batch.numel(), V, F)),
+            *map(_pointer, out),
+            _threads(),
+        )
+        count = torch.tensor(degenerate)
+        ctx.mark_non_differentiable(count)
+        ctx.save_for_backward(vertices, faces, out[1])
+        ctx.set_materialize_grads(False)
+        return *out, count
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor, None]:
+        vertices, faces, rotations = ctx.saved_tensors
+        batch, V = vertices.shape[:-2], vertices.shape[-2]
+        gradients = _contiguous(gradients[:4])
+        out = torch.zeros_like(vertices)
+        native_library().smplxpp_frames_backward(
+            *map(_pointer, (vertices, faces, rotations, *gradients)),
+            *map(ctypes.c_int64, (batch.numel(), V, len(faces))),
+            _pointer(out),
+            _threads(),
+        )
+        return out, None
+
+
+class WorldFunction(torch.autograd.Function):
+    """Local attributes and frames, in the order of `_LOCAL` and `_FRAMES` -> means, quats, scales, normals."""
+
+    @staticmethod
+    def forward(ctx: Any, thickness: float, face: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        face, inputs = face.contiguous(), _contiguous(inputs)
+        lengths = inputs[-1]
+        batch = lengths.shape[:-1]
+        out = [lengths.new_empty((*batch, len(face), width)) for width in (3, 4, 3, 3)]
+        native_library().smplxpp_world_forward(
+            ctypes.byref(_binding(thickness, face, inputs)), *map(_pointer, out), _threads()
+        )
+        ctx.save_for_backward(face, *inputs)
+        ctx.thickness = thickness
+        ctx.set_materialize_grads(False)
+        return tuple(out)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        face, *inputs = ctx.saved_tensors
+        gradients = _contiguous(gradients)
+        wanted = ctx.needs_input_grad[2:]
+        # The kernel writes gradients of Gaussians and adds to those of faces.
+        local = [torch.empty_like(t) if want else None for t, want in zip(inputs, wanted, strict=True)][: len(_LOCAL)]
+        frames = [torch.zeros_like(t) if want else None for t, want in zip(inputs, wanted, strict=True)][len(_LOCAL) :]
+        native_library().smplxpp_world_backward(
+            ctypes.byref(_binding(ctx.thickness, face, inputs)),
+            ctypes.byref(_BindingGradients(*map(_pointer, (*gradients, *local, *frames)))),
+            _threads(),
+        )
+        return None, None, *local, *frames
+
+
+class ColorsFunction(torch.autograd.Function):
+    """Faces of the Gaussians, rotations of the faces, dc, sh, means, camera positions -> (C, N, 3) colours."""
+
+    @staticmethod
+    def forward(ctx: Any, face: Tensor, *inputs: Tensor) -> Tensor:
+        face, inputs = face.contiguous(), _contiguous(inputs)
+        sh, cameras = inputs[2], inputs[4]
+        out = sh.new_empty((len(cameras), len(face), 3))
+        native_library().smplxpp_colors_forward(
+            *map(_pointer, (face, *inputs)),
+            ctypes.c_int64(len(face)),
+            ctypes.c_int64(len(cameras)),
+            sh.shape[1],
+            _pointer(out),
+            _threads(),
+        )
+        ctx.save_for_backward(face, *inputs)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        face, *inputs = ctx.saved_tensors
+        rotations, dc, sh, means, cameras = inputs
+        wanted = ctx.needs_input_grad[1:]
+        threads = _threads()
+        to_rotations = torch.zeros_like(rotations) if wanted[0] else None
+        to_dc, to_sh, to_means = (
+            torch.empty_like(t) if want else None for t, want in zip((dc, sh, means), wanted[1:4], strict=True)
+        )
+        to_cameras = cameras.new_zeros((threads, *cameras.shape)) if wanted[4] else None
+        gradient = gradient.contiguous()
+        native_library().smplxpp_colors_backward(
+            *map(_pointer, (face, *inputs, gradient)),
+            *map(ctypes.c_int64, (len(face), len(rotations), len(cameras))),
+            sh.shape[1],
+            *map(_pointer, (to_dc, to_sh, to_means, to_rotations, to_cameras)),
+            threads,
+        )
+        return None, to_rotations, to_dc, to_sh, to_means, None if to_cameras is None else to_cameras.sum(0)
+
+
+def _binding(thickness: float, face: Tensor, inputs: list[Tensor]) -> _Binding:
+    lengths = inputs[-1]
+    sizes = (len(face), lengths.shape[-1], lengths.shape[:-1].numel())
+    return _Binding(*map(_pointer, (face, *inputs)), *sizes, thickness)
+
+
+def _contiguous(tensors: tuple[Tensor | None, ...]) -> list[Tensor | None]:
+    return [None if t is None else t.contiguous() for t in tensors]
+
+
+def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def _threads() -> int:
+    return torch.get_num_threads()
