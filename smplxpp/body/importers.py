@@ -65,7 +65,7 @@ def load_params(
     parts: list[Frames] = []
     absent: list[str] = []
     for file in files:
-        frames = _read_file(file, name, person)
+        frames = _read_content(_content(file), name, person, f"file {file}")
         parts += [frames] if frames else []
         absent += [] if frames else [file.name]
     if not parts:
@@ -75,6 +75,27 @@ def load_params(
             f"{path}: person {person} is missing in {len(absent)} of {len(files)} frames, left out "
             f"(first {absent[0]})", GeometryWarning, stacklevel=2,
         )  # fmt: skip
+    params = _joined(parts, body, up)
+    return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
+
+
+def params_from_content(
+    content: Any, *, source: str, layout: LayoutName = "auto", body: BodyModel | None = None
+) -> BodyParams:
+    """Body parameters of a file that is read already: its arrays by name, or its JSON; see `load_params`.
+
+    Args:
+        content: what the file holds.
+        source: the file, for messages.
+
+    Raises:
+        InputError: as `load_params`; more than one person.
+    """
+    name = recognise(content, source=source) if layout == "auto" else layout
+    return _joined([_read_content(content, name, None, source)], body, "y")
+
+
+def _joined(parts: list[Frames], body: BodyModel | None, up: str) -> BodyParams:
     params = BodyParams.concatenate([part.params for part in parts])
     outer = [part.outer for part in parts if part.outer]
     if outer or up == "z":
@@ -83,7 +104,7 @@ def load_params(
         params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
     if up == "z":
         params = _moved(params, body, _Y_UP_FROM_Z_UP, np.zeros(3))
-    return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
+    return params
 
 
 def detect_layout(path: str | Path) -> str:
@@ -108,17 +129,16 @@ def _moved(params: BodyParams, body: BodyModel, rotvec: np.ndarray, shift: np.nd
     )
 
 
-def _read_file(path: Path, layout: str, person: int | None) -> Frames | None:
-    content = _content(path)
+def _read_content(content: Any, layout: str, person: int | None, source: str) -> Frames | None:
     try:
         return LAYOUTS[layout].read(content, person)
     except InputError as error:
         raise InputError(
-            f"file {path}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
+            f"{source}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
         ) from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"file {path}", expected=f"the layout {layout}", received=f"{type(error).__name__}: {error}",
+            source, expected=f"the layout {layout}", received=f"{type(error).__name__}: {error}",
             remedy="see the layouts in `smplxpp params convert --help`",
         ) from error  # fmt: skip
 

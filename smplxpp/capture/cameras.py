@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.readers.common import inverted, pinhole
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.rotations import matrix_from_rotvec
@@ -21,8 +23,20 @@ def read_cameras(path: str | Path) -> list[Camera]:
     ActorsHQ stores camera-to-world rotation vectors and positions, and intrinsics in units of the image's size.
 
     Raises:
-        InputError: missing file, unknown layout, fields missing.
+        InputError: missing file, unknown layout, fields missing, a camera with distortion.
     """
+    lenses = read_lenses(path)
+    distorted = [camera.name for camera, distortion in lenses if distortion is not None]
+    if distorted:
+        raise InputError(
+            f"camera file {path}", expected="cameras without distortion", received=f"distortion of {distorted[:5]}",
+            remedy="undistort the images; a capture that is opened whole is undistorted on reading",
+        )  # fmt: skip
+    return [camera for camera, _ in lenses]
+
+
+def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
+    """As `read_cameras`, with the distortion of each camera (`dist` in OpenCV's order); None: a pinhole."""
     path = Path(path)
     if not path.is_file():
         raise InputError("camera file", expected="an existing file", received=str(path))
@@ -42,35 +56,26 @@ def read_cameras(path: str | Path) -> list[Camera]:
     raise InputError(f"camera file {path}", expected="a .json or .csv file", received=path.suffix or "no suffix")
 
 
-def _read_opencv(path: Path) -> list[Camera]:
+def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
     content = json.loads(path.read_text())
-    entries = content["cameras"] if isinstance(content, dict) else content
-    cameras = []
-    for entry in entries:
-        pose = np.eye(4)
-        pose[:3, :3] = np.asarray(entry["R"], float).reshape(3, 3)
-        pose[:3, 3] = np.asarray(entry["T"], float).reshape(3)
-        K = np.asarray(entry["K"], float).reshape(3, 3)
-        cameras.append(Camera(K, pose, int(entry["w"]), int(entry["h"]), name=str(entry["name"])))
-    return cameras
+    lenses = []
+    for entry in content["cameras"] if isinstance(content, dict) else content:
+        name = str(entry["name"])
+        camera = pinhole(name, entry["K"], entry["R"], entry["T"], (int(entry["w"]), int(entry["h"])))
+        lenses.append((camera, Distortion.from_opencv(entry.get("dist", []), subject=f"camera {name!r}")))
+    return lenses
 
 
-def _read_actorshq(path: Path) -> list[Camera]:
-    cameras = []
+def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
+    lenses = []
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
             width, height = int(row["w"]), int(row["h"])
             value = {key: float(row[key]) for key in _CSV_FIELDS[3:]}
-            cam_from_world = np.eye(4)
-            rotation = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]])).T
-            cam_from_world[:3, :3] = rotation
-            cam_from_world[:3, 3] = -rotation @ np.array([value["tx"], value["ty"], value["tz"]])
-            K = np.array(
-                [
-                    [value["fx"] * width, 0, value["px"] * width],
-                    [0, value["fy"] * height, value["py"] * height],
-                    [0, 0, 1.0],
-                ]
-            )
-            cameras.append(Camera(K, cam_from_world, width, height, name=row["name"]))
-    return cameras
+            world_from_cam = np.eye(4)
+            world_from_cam[:3, :3] = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]]))
+            world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]
+            K = np.diag([value["fx"] * width, value["fy"] * height, 1.0])
+            K[:2, 2] = value["px"] * width, value["py"] * height
+            lenses.append((pinhole(row["name"], K, *inverted(world_from_cam), (width, height)), None))
+    return lenses

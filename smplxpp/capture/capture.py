@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from smplxpp.capture import views
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.recording import KINDS, Problem, Recording
 from smplxpp.capture.splits import Splits
+from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
@@ -124,7 +124,7 @@ class Capture:
             InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
         """
         path = self._required(camera, frame)
-        return self._cached("image", camera, frame, lambda full, window: (views.color(path, full, window),))[0]
+        return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
         """(H, W) uint8 opacity of the person, 255 inside; None where there is no mask. Read-only.
@@ -135,21 +135,21 @@ class Capture:
         path = self.file(camera, frame, "mask")
         if path is None:
             return None
-        return self._cached("mask", camera, frame, lambda full, window: (views.alpha(path, full, window),))[0]
+        return self._cached("mask", camera, frame, lambda reader: (reader.alpha(path),))[0]
 
     def labels(self, camera: str, frame: int) -> np.ndarray | None:
         """(H, W) uint8 numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
         path = self.file(camera, frame, "label")
         if path is None:
             return None
-        return self._cached("label", camera, frame, lambda full, window: (views.labels(path, full, window),))[0]
+        return self._cached("label", camera, frame, lambda reader: (reader.labels(path),))[0]
 
     def normals(self, camera: str, frame: int) -> np.ndarray | None:
         """(H, W, 3) float32 unit normals in the world, 0 on the background; None where there is no map."""
         path = self.file(camera, frame, "normal")
         if path is None:
             return None
-        return self._cached("normal", camera, frame, lambda full, window: (views.normals(path, full, window),))[0]
+        return self._cached("normal", camera, frame, lambda reader: (reader.normals(path),))[0]
 
     def composited(self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
         """The person on a plain background: (H, W, 3) float32 sRGB in [0, 1].
@@ -182,10 +182,7 @@ class Capture:
                 received="none",
                 remedy="give a folder of masks (open_capture(..., masks=DIR)), or make them with your matting model",
             )
-        background = self.recording.background
-        return self._cached(
-            "foreground", camera, frame, lambda full, window: views.foreground(image, mask, background, full, window)
-        )
+        return self._cached("foreground", camera, frame, lambda reader: reader.foreground(image, mask))
 
     def params(self, frame: int) -> BodyParams | None:
         """Body parameters of one frame, None where there are none.
@@ -246,6 +243,9 @@ class Capture:
             )
         return path
 
-    def _cached(self, kind, camera, frame, make):
-        window, full = self.windows[camera], self._full_camera(camera)
-        return self.cache.get((kind, camera, frame, window), lambda: make(full, window))
+    def _cached(
+        self, kind: str, camera: str, frame: int, make: Callable[[ViewReader], tuple[np.ndarray, ...]]
+    ) -> tuple[np.ndarray, ...]:
+        recording, window = self.recording, self.windows[camera]
+        reader = ViewReader(self._full_camera(camera), window, recording.distortions.get(camera), recording.background)
+        return self.cache.get((kind, camera, frame, window), lambda: make(reader))

@@ -46,18 +46,10 @@ def read_labels(path: Path) -> Image:
     return _from_array(np.array(image, dtype=np.uint8))
 
 
-def read_normals(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 world normals of `n = value / max * 2 - 1`, unit length; 0 where the file is black.
-
-    Of 16-bit files Pillow gives the upper byte: the middle of its range is taken, 0.2 degrees off at most.
-    """
+def read_normals(path: Path) -> tuple[Image, bool]:
+    """An RGB image of encoded normals, and whether the file has 16 bits a channel (Pillow gives the upper 8)."""
     image = _read(path)
-    deep = "16" in str(image.info.get("raw_mode", ""))
-    value = np.asarray(image.convert("RGB"), dtype=np.float32)
-    normal = (value + 0.5) / 128.0 - 1.0 if deep else value / 127.5 - 1.0
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    seen = value.any(axis=-1, keepdims=True)
-    return np.where(seen, normal / np.maximum(length, 1e-6), 0.0).astype(np.float32)
+    return image.convert("RGB"), "16" in image.info["raw_mode"]
 
 
 def check_size(image: Image, path: Path, size: tuple[int, int], *, of: str) -> Image:

@@ -8,17 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from smplxpp.body import BodyModel, load_params
+from smplxpp.body import BodyModel, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
+from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
+from smplxpp.core.safe_pickle import safe_npz
 
 
 @dataclass(frozen=True, eq=False)
 class StackedParams:
-    """One file whose row is the frame's number.
+    """An npz file whose row is the frame's number. Rows with NaN or infinity spoil themselves alone.
 
     Attributes:
-        path: the file. layout: as `load_params` takes it.
+        path: the file.
+        layout: as `load_params` takes it.
         body: gives the root joint where a layout needs it.
     """
 
@@ -27,16 +30,39 @@ class StackedParams:
     body: BodyModel | None = None
 
     @cached_property
-    def _all(self) -> BodyParams:
-        return load_params(self.path, layout=self.layout, body=self.body)
+    def _rows(self) -> tuple[BodyParams | None, np.ndarray]:
+        """The good rows, and for every row its index among them (-1: bad)."""
+        arrays = safe_npz(self.path)
+        rows = max((len(a) for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 2), default=0)
+        stacked = {
+            name: array
+            for name, array in arrays.items()
+            if isinstance(array, np.ndarray) and array.ndim == 2 and len(array) == rows and array.dtype.kind == "f"
+        }
+        good = np.ones(rows, dtype=bool)
+        if rows > 1:
+            for array in stacked.values():
+                good &= np.isfinite(array).all(axis=1)
+        kept = arrays if good.all() else {**arrays, **{name: array[good] for name, array in stacked.items()}}
+        if not good.any():
+            raise InputError(f"file {self.path}", expected="finite values", received="NaN or infinity in every row")
+        params = params_from_content(kept, source=f"file {self.path}", layout=self.layout, body=self.body)
+        return params, np.where(good, np.cumsum(good) - 1, -1)
 
     def frames(self) -> np.ndarray:
         """(F,) rows of the file."""
-        return np.arange(len(self._all))
+        return np.arange(len(self._rows[1]))
 
     def read(self, frame: int) -> BodyParams:
-        """One row."""
-        return self._all.frame(frame)
+        """One row.
+
+        Raises:
+            InputError: NaN or infinity in it.
+        """
+        params, index = self._rows
+        if index[frame] < 0:
+            raise InputError(f"file {self.path}: row {frame}", expected="finite values", received="NaN or infinity")
+        return params.frame(int(index[frame]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,3 +80,23 @@ class ParamFiles:
     def read(self, frame: int) -> BodyParams:
         """One file."""
         return load_params(self.files.path(frame), layout=self.layout, body=self.body)
+
+
+def find_params(path: Path, *, body: BodyModel | None, layout: str = "auto") -> StackedParams | ParamFiles:
+    """Parameters that the user names: an npz file with a row a frame, or a folder with a numbered file a frame.
+
+    Raises:
+        InputError: neither.
+    """
+    if path.is_dir():
+        files = FileSeries.find(path, r"\D*(?P<frame>\d+)\D*\.(json|npz|pkl)")
+        if len(files):
+            return ParamFiles(files, layout, body)
+    elif path.is_file() and path.suffix.lower() == ".npz":
+        return StackedParams(path, layout, body)
+    raise InputError(
+        "body parameters of the capture",
+        expected="an npz file with a row a frame, or a folder with a numbered json, npz or pkl file a frame",
+        received=f"{path}" + ("" if path.exists() else ", which does not exist"),
+        remedy="convert other files with `smplxpp params convert`",
+    )

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
@@ -56,6 +57,8 @@ class Recording:
     Attributes:
         name, root, format: the folder's name, the folder, the reader's name.
         cameras: by name, in the set's order, for whole images of the sizes on disk.
+        distortions: lenses of the cameras whose images are distorted on disk; `cameras` holds the pinhole cameras of
+            the undistorted images, which keep the intrinsics and the size of the distorted ones.
         files: for each kind ("image", "mask", "label", "normal") the series of each camera that has one. A mask's file
             may be the image's: then its alpha channel counts.
         background: (3,) sRGB in [0, 1] that the images are already composited on; None: photographs.
@@ -71,6 +74,7 @@ class Recording:
     format: str
     cameras: Mapping[str, Camera]
     files: Mapping[str, Mapping[str, FileSeries]]
+    distortions: Mapping[str, Distortion] = field(default_factory=dict)
     background: tuple[float, float, float] | None = None
     splits: Splits | None = None
     label_set: str = "capture"

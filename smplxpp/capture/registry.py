@@ -8,13 +8,25 @@ from pathlib import Path
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
-from smplxpp.capture.readers import simple
+from smplxpp.capture.masks import with_masks
+from smplxpp.capture.readers import (
+    actorshq,
+    avatarrex,
+    colmap,
+    dress4d,
+    easymocap,
+    neus2,
+    simple,
+    talkbody4d,
+    thuman4,
+)
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.window import Window
 from smplxpp.core.errors import InputError
 
-READERS = {reader.NAME: reader for reader in (simple,)}
+_MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap)
+READERS = {reader.NAME: reader for reader in _MODULES}
 FORMATS: tuple[str, ...] = tuple(READERS)
 
 
@@ -22,6 +34,7 @@ def open_capture(
     path: str | Path,
     *,
     format: str | None = None,
+    masks: str | Path | None = None,
     params: str | Path | None = None,
     body: BodyModel | None = None,
     hold_out_every: int | None = None,
@@ -32,6 +45,7 @@ def open_capture(
     Args:
         path: the folder (docs/captures.md says which, for each data set).
         format: name of the layout; None: told by the files that are there.
+        masks: a folder of mattes to take instead of the capture's own masks, matched to the images by their names.
         params: body parameters to take instead of the capture's own (a tracker's, say).
         body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
         hold_out_every: hold out every n-th training camera as a novel view.
@@ -48,6 +62,8 @@ def open_capture(
     reader = READERS[format or detect_format(root)]
     options = ReaderOptions(params=None if params is None else Path(params), body=body)
     recording = reader.read(root, options)
+    if masks is not None:
+        recording = with_masks(recording, Path(masks))
     splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
     if hold_out_every is not None:
         splits = splits.hold_out_cameras(hold_out_every)

@@ -1,82 +1,120 @@
-"""From files to the arrays that a capture gives out: decoded, checked, cut and resampled."""
+"""From files to the arrays that a capture gives out: decoded, checked, undistorted, cut and resampled."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smplxpp.capture.distortion import Distortion, undistort
 from smplxpp.capture.images import check_size, read_alpha, read_color, read_labels, read_normals
 from smplxpp.capture.window import Window
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 # Median difference, of 255, between the declared background and the pixels without any opacity: JPEG's is about 1.
 _BACKGROUND_TOLERANCE = 16
 
 
-def color(path: Path, camera: Camera, window: Window) -> np.ndarray:
-    """(H, W, 3) uint8."""
-    return np.array(window.apply(_sized(read_color(path), path, camera)))
+@dataclass(frozen=True)
+class ViewReader:
+    """Reads the images of one camera into its window.
 
-
-def alpha(path: Path, camera: Camera, window: Window) -> np.ndarray:
-    """(H, W) uint8."""
-    return np.array(window.apply(_sized(read_alpha(path), path, camera)))
-
-
-def labels(path: Path, camera: Camera, window: Window) -> np.ndarray:
-    """(H, W) uint8."""
-    return np.array(window.apply(_sized(read_labels(path), path, camera), labels=True))
-
-
-def normals(path: Path, camera: Camera, window: Window) -> np.ndarray:
-    """(H, W, 3) float32. Taken from the nearest pixel, as labels: an average over an edge is no normal."""
-    from PIL import Image
-
-    value = read_normals(path)
-    channels = [Image.fromarray(np.ascontiguousarray(value[..., k])) for k in range(3)]
-    return np.stack([np.asarray(window.apply(_sized(c, path, camera), labels=True)) for c in channels], axis=-1)
-
-
-def foreground(
-    image_path: Path, mask_path: Path, background: tuple[float, float, float] | None, camera: Camera, window: Window
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colour times opacity (H, W, 3) uint8 and opacity (H, W) uint8.
-
-    The product is formed on the full image: resampled apart, a photograph's background would bleed into the edges.
+    Attributes:
+        camera: of the whole image on disk, as a pinhole.
+        window: what is shown of it.
+        distortion: the lens that drew the image; None where it is a pinhole's already.
+        background: (3,) in [0, 1] that images are already composited on; None: photographs.
     """
-    from PIL import Image
 
-    image = _sized(read_color(image_path), image_path, camera)
-    opacity = _sized(read_alpha(mask_path), mask_path, camera)
-    if background is None:
-        image = Image.composite(image, Image.new("RGB", image.size), opacity)
-    else:
-        _check_background(image, opacity, background, image_path)
-        if any(background):
-            share = 1.0 - np.asarray(opacity, dtype=np.float32)[..., None] / 255.0
-            colour = np.asarray(background, dtype=np.float32) * 255.0
-            image = Image.fromarray(np.clip(np.asarray(image) - share * colour + 0.5, 0, 255).astype(np.uint8))
-    return np.array(window.apply(image)), np.array(window.apply(opacity))
+    camera: Camera
+    window: Window
+    distortion: Distortion | None = None
+    background: tuple[float, float, float] | None = None
 
+    def color(self, path: Path) -> np.ndarray:
+        """(H, W, 3) uint8."""
+        return self._shown(self._sized(read_color(path), path))
 
-def _sized(image, path: Path, camera: Camera):
-    return check_size(image, path, (camera.width, camera.height), of=f"the size of camera {camera.name}")
+    def alpha(self, path: Path) -> np.ndarray:
+        """(H, W) uint8."""
+        return self._shown(self._sized(read_alpha(path), path))
 
+    def labels(self, path: Path) -> np.ndarray:
+        """(H, W) uint8."""
+        return self._shown(self._sized(read_labels(path), path), labels=True)
 
-def _check_background(image, opacity, background: tuple[float, float, float], path: Path) -> None:
-    """An image that is not on the declared colour would be composited wrong without a sign of it."""
-    # Every fourth pixel each way is enough for a median.
-    outside = np.asarray(image)[::4, ::4][np.asarray(opacity)[::4, ::4] == 0]
-    if not len(outside):
-        return
-    found = np.median(outside, axis=0)
-    declared = np.asarray(background) * 255.0
-    if np.abs(found - declared).max() > _BACKGROUND_TOLERANCE:
-        raise InputError(
-            f"image file {path}",
-            expected=f"an image composited on RGB {declared.round().astype(int).tolist()}, as the capture declares",
-            received=f"RGB {found.astype(int).tolist()} outside the mask",
-            remedy='photographs are declared with `"background": null` in capture.json',
+    def normals(self, path: Path) -> np.ndarray:
+        """(H, W, 3) float32. Resampled to the nearest pixel, as labels: an average over an edge is no normal."""
+        image, deep = read_normals(path)
+        value = self._shown(self._sized(image, path), labels=True).astype(np.float32)
+        # Of 16-bit files Pillow gives the upper byte: the middle of its range is 0.2 degrees off at most.
+        normal = (value + 0.5) / 128.0 - 1.0 if deep else value / 127.5 - 1.0
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        seen = value.any(axis=-1, keepdims=True)
+        return np.where(seen, normal / np.maximum(length, 1e-6), 0.0).astype(np.float32)
+
+    def foreground(self, image_path: Path, mask_path: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Colour times opacity (H, W, 3) uint8 and opacity (H, W) uint8.
+
+        The product is formed on the full image: resampled apart, a photograph's background would bleed into the edges.
+        """
+        import PIL.Image
+
+        image = self._sized(read_color(image_path), image_path)
+        opacity = self._sized(read_alpha(mask_path), mask_path)
+        if self.background is None:
+            image = PIL.Image.composite(image, PIL.Image.new("RGB", image.size), opacity)
+        else:
+            self._check_background(image, opacity, image_path)
+            if any(self.background):
+                share = 1.0 - np.asarray(opacity, dtype=np.float32)[..., None] / 255.0
+                colour = np.asarray(self.background, dtype=np.float32) * 255.0
+                product = np.asarray(image) - share * colour + 0.5
+                image = PIL.Image.fromarray(np.clip(product, 0, 255).astype(np.uint8))
+        return self._shown(image), self._shown(opacity)
+
+    def _sized(self, image: Image, path: Path) -> Image:
+        return check_size(
+            image, path, (self.camera.width, self.camera.height), of=f"the size of camera {self.camera.name}"
         )
+
+    def _shown(self, image: Image, *, labels: bool = False) -> np.ndarray:
+        if self.distortion is None:
+            return np.array(self.window.apply(image, labels=labels))
+        # Where the window shrinks, the distorted image is shrunk first, as a whole: the lens works on the plane z = 1
+        # and does not mind, and the bilinear look-up then skips no pixel.
+        whole = Window.full(self.camera)
+        if not labels and min(self.window.scale) < 1:
+            sx, sy = (min(scale, 1.0) for scale in self.window.scale)
+            size = (max(1, round(whole.width * sx)), max(1, round(whole.height * sy)))
+            whole = Window(whole.box, *size)
+        return undistort(
+            np.asarray(whole.apply(image)),
+            self.distortion,
+            source_K=whole.camera(self.camera).K,
+            target_K=self.window.camera(self.camera).K,
+            size=(self.window.width, self.window.height),
+            nearest=labels,
+        )
+
+    def _check_background(self, image: Image, opacity: Image, path: Path) -> None:
+        """An image that is not on the declared colour would be composited wrong without a sign of it."""
+        # Every fourth pixel each way is enough for a median.
+        outside = np.asarray(image)[::4, ::4][np.asarray(opacity)[::4, ::4] == 0]
+        if not len(outside):
+            return
+        found = np.median(outside, axis=0)
+        declared = np.asarray(self.background) * 255.0
+        if np.abs(found - declared).max() > _BACKGROUND_TOLERANCE:
+            raise InputError(
+                f"image file {path}",
+                expected=f"an image composited on RGB {declared.round().astype(int).tolist()}, as the capture declares",
+                received=f"RGB {found.astype(int).tolist()} outside the mask",
+                remedy='photographs are declared with `"background": null` in capture.json',
+            )

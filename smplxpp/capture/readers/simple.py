@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from smplxpp.capture.cameras import read_cameras
+from smplxpp.capture.cameras import read_lenses
+from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries, image_name, subfolders
 from smplxpp.capture.meshes import PosedTopology
-from smplxpp.capture.params import ParamFiles, StackedParams
+from smplxpp.capture.params import ParamFiles, find_params
+from smplxpp.capture.readers.common import read_json
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.capture.splits import Splits
@@ -44,13 +46,15 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         InputError: images without a camera file, a broken camera file or description.
     """
     description = _describe(root)
-    cameras = _cameras(root)
+    lenses = _lenses(root)
+    cameras = {camera.name: camera for camera, _ in lenses}
     files, problems = _files(root, cameras, description)
     recording = Recording(
         name=str(description.get("name", root.name)),
         root=root,
         format=NAME,
         cameras=cameras,
+        distortions={camera.name: distortion for camera, distortion in lenses if distortion is not None},
         files=files,
         background=_background(description),
         label_set=str(description.get("label_set", "capture")),
@@ -76,37 +80,29 @@ def stacked_params(root: Path, name: str | Path | None = None) -> Path:
 
 def _params(root: Path, options: ReaderOptions) -> ParamSource | None:
     if options.params is not None:
-        path = stacked_params(root, options.params)
-        if not path.is_file():
-            raise InputError(f"capture {root.name}", expected="an existing parameter file", received=str(path))
-        return StackedParams(path, body=options.body)
+        return find_params(stacked_params(root, options.params), body=options.body)
     single = FileSeries.find(root / "params", r"(?P<frame>\d{6})\.npz")
     if len(single):
         return ParamFiles(single, body=options.body)
     stacked = stacked_params(root)
-    return StackedParams(stacked, body=options.body) if stacked.is_file() else None
+    return find_params(stacked, body=options.body) if stacked.is_file() else None
 
 
 def _describe(root: Path) -> dict[str, Any]:
     path = next((root / name for name in _DESCRIPTIONS if (root / name).is_file()), None)
-    if path is None:
-        return {}
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"file {path}", expected="JSON", received=str(error)) from None
+    content = {} if path is None else read_json(path)
     if not isinstance(content, dict):
         raise InputError(f"file {path}", expected="a JSON object", received=type(content).__name__)
     return content
 
 
-def _cameras(root: Path) -> dict[str, Camera]:
+def _lenses(root: Path) -> list[tuple[Camera, Distortion | None]]:
     path = next((root / name for name in _CAMERA_FILES if (root / name).is_file()), None)
     if path is None:
         if (root / "rgbs").is_dir():
             raise InputError(f"capture {root}", expected="cameras.json or calibration.csv", received="neither")
-        return {}
-    return {camera.name: camera for camera in read_cameras(path)}
+        return []
+    return read_lenses(path)
 
 
 def _files(
@@ -145,8 +141,6 @@ def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | 
 
 
 def _with_splits(recording: Recording, description: Mapping[str, Any]) -> Recording:
-    from dataclasses import replace
-
     cameras, frames = list(recording.cameras), recording.frames()
     novel_views = _names(description, "novel_views", cameras) or []
     train_views = _names(description, "train_views", cameras)

@@ -1,0 +1,66 @@
+"""AvatarReX (Zheng et al. 2023): `calibration_full.json`, `CAM/00000000.jpg`, `CAM/mask/pha/00000000.jpg`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.readers.common import chosen_params, numbered_images, pinhole, read_json, required
+from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.recording import Recording
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+
+NAME = "avatarrex"
+LOOKS_FOR = "calibration_full.json"
+_FPS = 30.0
+
+
+def detect(root: Path) -> bool:
+    """Whether a folder is a subject of AvatarReX."""
+    return (root / "calibration_full.json").is_file()
+
+
+def read(root: Path, options: ReaderOptions) -> Recording:
+    """Find a subject: photographs, mattes, `smpl_params.npz` with a row a frame.
+
+    Raises:
+        InputError: a broken calibration.
+    """
+    cameras, distortions = read_calibration(root / "calibration_full.json")
+    return Recording(
+        name=root.name,
+        root=root,
+        format=NAME,
+        cameras=cameras,
+        distortions=distortions,
+        files={
+            "image": numbered_images({name: root / name for name in cameras}),
+            "mask": numbered_images({name: root / name / "mask" / "pha" for name in cameras}),
+        },
+        params=chosen_params(options, root / "smpl_params.npz"),
+        fps=_FPS,
+    )
+
+
+def read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distortion]]:
+    """Cameras of `{name: {K, R, T, imgSize, distCoeff}}`, as AvatarReX and THuman4 write them.
+
+    The authors' own code takes pixel centres at whole numbers (it rounds projected points to indices).
+
+    Raises:
+        InputError: broken, or fields missing.
+    """
+    content = read_json(path)
+    if not isinstance(content, Mapping) or not content:
+        raise InputError(f"file {path}", expected="an object of cameras", received=type(content).__name__)
+    cameras, distortions = {}, {}
+    for name, entry in content.items():
+        source = f"file {path}: camera {name}"
+        K, R, T, size = (required(entry, key, source=source) for key in ("K", "R", "T", "imgSize"))
+        cameras[name] = pinhole(name, K, R, T, tuple(size), opencv_pixels=True)
+        distortion = Distortion.from_opencv(entry.get("distCoeff", []), subject=source)
+        if distortion is not None:
+            distortions[name] = distortion
+    return cameras, distortions

@@ -1,0 +1,69 @@
+"""4D-Dress (Wang et al. 2024): `Capture/cameras.pkl`, `Capture/CAM/{images,masks}`, `Meshes_pkl/`, `SMPLX/`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.capture.files import FileSeries, image_name
+from smplxpp.capture.meshes import MeshFiles
+from smplxpp.capture.params import ParamFiles
+from smplxpp.capture.readers.common import chosen_params, pinhole, required, size_of_first_image
+from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.recording import Recording
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.safe_pickle import safe_load
+
+NAME = "4ddress"
+LOOKS_FOR = "Capture/cameras.pkl beside Meshes_pkl/"
+
+
+def detect(root: Path) -> bool:
+    """Whether a folder is a take."""
+    return (root / "Capture" / "cameras.pkl").is_file()
+
+
+def read(root: Path, options: ReaderOptions) -> Recording:
+    """Find a take: photographs with rendered masks, scans as true meshes, SMPL-X fits. No pickle is executed.
+
+    The file's `intrinsics` and `extrinsics` (3, 4) are OpenCV's: it is the authors' loader that negates the first two
+    rows, which turns them into PyTorch3D's axes (x left, y up). Pixel centres are at +0.5, as the masks are rendered.
+
+    Raises:
+        InputError: a broken camera file.
+    """
+    path = root / "Capture" / "cameras.pkl"
+    content = safe_load(path)
+    if not isinstance(content, Mapping):
+        raise InputError(f"file {path}", expected="a dictionary of cameras", received=type(content).__name__)
+    files = {
+        kind: {
+            str(name): FileSeries.find(root / "Capture" / str(name) / folder, image_name(before)) for name in content
+        }
+        for kind, folder, before in (("image", "images", "capture-f"), ("mask", "masks", "mask-f"))
+    }
+    files = {kind: {name: s for name, s in series.items() if len(s)} for kind, series in files.items()}
+    meshes = FileSeries.find(root / "Meshes_pkl", r"mesh-f(?P<frame>\d+)\.pkl")
+    fits = FileSeries.find(root / "SMPLX", r"mesh-f(?P<frame>\d+)_smplx\.pkl")
+    fitted = ParamFiles(fits, "smplx", options.body) if len(fits) else None
+    return Recording(
+        name="_".join(root.resolve().parts[-3:]),
+        root=root,
+        format=NAME,
+        cameras={str(name): _camera(str(name), entry, path, files["image"]) for name, entry in content.items()},
+        files=files,
+        params=chosen_params(options) or fitted,
+        meshes=MeshFiles(meshes),
+    )
+
+
+def _camera(name: str, entry: Mapping, path: Path, images: Mapping[str, FileSeries]) -> Camera:
+    source = f"file {path}: camera {name}"
+    K = required(entry, "intrinsics", source=source)
+    extrinsics = np.asarray(required(entry, "extrinsics", source=source), dtype=np.float64)
+    if extrinsics.shape not in ((3, 4), (4, 4)):
+        raise InputError(source, expected="extrinsics of shape (3, 4)", received=f"shape {extrinsics.shape}")
+    return pinhole(name, K, extrinsics[:3, :3], extrinsics[:3, 3], size_of_first_image(name, images))

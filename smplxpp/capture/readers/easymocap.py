@@ -1,0 +1,94 @@
+"""EasyMocap: `intri.yml`, `extri.yml`, `images/CAM/000000.jpg`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.files import FileSeries
+from smplxpp.capture.params import ParamFiles
+from smplxpp.capture.readers.common import (
+    chosen_params,
+    first_folder,
+    numbered_images,
+    pinhole,
+    required,
+    size_of_first_image,
+)
+from smplxpp.capture.readers.opencv_yaml import read_opencv_yaml
+from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.recording import Recording
+from smplxpp.core.errors import InputError
+from smplxpp.core.rotations import matrix_from_rotvec
+
+NAME = "easymocap"
+LOOKS_FOR = "intri.yml and extri.yml"
+# Where its programs put fitted parameters, in the order of their worth to us.
+_PARAMS = ("output/smplx/smpl", "output/smplx", "output/smpl/smpl", "output/smpl", "smplx", "smpl")
+
+
+def detect(root: Path) -> bool:
+    """Whether a folder holds both camera files."""
+    return (root / "intri.yml").is_file() and (root / "extri.yml").is_file()
+
+
+def read(root: Path, options: ReaderOptions) -> Recording:
+    """Find a recording: distorted photographs, undistorted on reading; masks in `masks/` or `mask/`.
+
+    OpenCV's calibration, with pixel centres at whole numbers. The images' size is `H_CAM`, `W_CAM`, or that of the
+    camera's first image.
+
+    Raises:
+        InputError: a broken camera file, a camera in one of the two alone.
+    """
+    intri, extri = read_opencv_yaml(root / "intri.yml"), read_opencv_yaml(root / "extri.yml")
+    names = required(intri, "names", source=f"file {root / 'intri.yml'}")
+    images = numbered_images({name: root / "images" / name for name in names})
+    masks = first_folder(root, ("masks", "mask"))
+    cameras, distortions = {}, {}
+    for name in names:
+        size = (intri.get(f"W_{name}"), intri.get(f"H_{name}"))
+        if not all(size):
+            size = size_of_first_image(name, images)
+        K = required(intri, f"K_{name}", source=f"file {root / 'intri.yml'}")
+        cameras[name] = pinhole(name, K, *_pose(extri, name, root / "extri.yml"), size, opencv_pixels=True)
+        coefficients = intri.get(f"dist_{name}", intri.get(f"D_{name}", []))
+        distortion = Distortion.from_opencv(np.ravel(coefficients), subject=f"file {root / 'intri.yml'}: {name}")
+        if distortion is not None:
+            distortions[name] = distortion
+    return Recording(
+        name=root.name,
+        root=root,
+        format=NAME,
+        cameras=cameras,
+        distortions=distortions,
+        files={
+            "image": images,
+            "mask": {} if masks is None else numbered_images({name: masks / name for name in names}),
+        },
+        params=_params(root, options),
+    )
+
+
+def _pose(extri: dict[str, Any], name: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation vector counts, as in EasyMocap itself; `Rot_` is its matrix, for readers without one."""
+    T = required(extri, f"T_{name}", source=f"file {path}")
+    if f"R_{name}" not in extri:
+        return required(extri, f"Rot_{name}", source=f"file {path}"), T
+    rotation = np.ravel(extri[f"R_{name}"])
+    if len(rotation) != 3:
+        raise InputError(f"file {path}: R_{name}", expected="3 numbers", received=f"{len(rotation)}")
+    return matrix_from_rotvec(rotation), T
+
+
+def _params(root: Path, options: ReaderOptions) -> Any:
+    if options.params is not None:
+        return chosen_params(options)
+    for name in _PARAMS:
+        files = FileSeries.find(root / name, r"(?P<frame>\d+)\.json")
+        if len(files):
+            return ParamFiles(files, "easymocap", options.body)
+    return None

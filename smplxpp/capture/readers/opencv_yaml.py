@@ -1,0 +1,61 @@
+"""The part of OpenCV's YAML that calibrations are written in: matrices, lists and numbers at the top level."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+
+_KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
+
+
+def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | str]:
+    """Entries of a file that `cv2.FileStorage` writes: `!!opencv-matrix` as float64 arrays, lists of texts, numbers.
+
+    Raises:
+        InputError: missing, not text, or a matrix whose numbers do not fit its size.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"file {path}", expected="a readable YAML file", received=str(error)) from None
+    blocks: dict[str, list[str]] = {}
+    current: list[str] | None = None
+    for line in lines:
+        if match := _KEY.match(line):
+            current = blocks.setdefault(match["key"].strip().strip('"'), [])
+            current.append(match["value"].strip())
+        elif current is not None and line.strip() and not line.startswith(("%", "---")):
+            current.append(line.strip())
+    return {key: _value(key, block, path) for key, block in blocks.items()}
+
+
+def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | float | str:
+    if block[0].startswith("!!opencv-matrix"):
+        return _matrix(key, " ".join(block[1:]), path)
+    if len(block) == 1 and block[0] and not block[0].startswith("["):
+        try:
+            return float(block[0])
+        except ValueError:
+            return block[0].strip('"')
+    if block[0].startswith("["):
+        items = " ".join(block).strip("[] ").split(",")
+    else:
+        items = [line.removeprefix("-") for line in block if line.startswith("-")]
+    return [item.strip().strip('"') for item in items if item.strip()]
+
+
+def _matrix(key: str, text: str, path: Path) -> np.ndarray:
+    size = {name: re.search(rf"{name}:\s*(\d+)", text) for name in ("rows", "cols")}
+    data = re.search(r"data:\s*\[([^\]]*)\]", text)
+    try:
+        # OpenCV writes `.Nan` and `.Inf`.
+        values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in data[1].split(",")]
+        return np.array(values).reshape(int(size["rows"][1]), int(size["cols"][1]))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"file {path}: {key}", expected="rows, cols and as many numbers in data", received=str(error)
+        ) from None
