@@ -1,0 +1,199 @@
+"""Perceptual distances between images: ST-LPIPS, and LPIPS where the user has it.
+
+They are different metrics with different numbers: each carries its own name, which goes wherever its value is shown.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from smplxpp.core.errors import InputError, MissingExtraError
+
+MIN_SIZE = 32
+"""Pixels: the coarsest features of a smaller image vanish."""
+CHANNELS = (64, 192, 384, 256, 256)
+KERNELS = (11, 5, 3, 3, 3)
+STORED_CONVS = ("net.slice1.0", "net.slice2.5", "net.slice3.9", "net.slice4.11", "net.slice5.13")
+WEIGHT_FILE = Path("weights", "vST0.0", "alex_shift_tolerant.pth")
+
+
+class MissingPackageError(MissingExtraError):
+    """A package is not installed that no extra of ours can name."""
+
+    def __init__(self, package: str, *, command: str, purpose: str) -> None:
+        ImportError.__init__(self, f"{purpose} needs {package}, which is not installed: {command}")
+
+
+class PerceptualDistance(nn.Module):
+    """Distance between features of two images; differentiable in the images, its own weights are fixed.
+
+    Attributes:
+        name: of the metric, to be printed with its values.
+    """
+
+    name: str
+
+    def forward(self, image: Tensor, reference: Tensor) -> Tensor:
+        """Distance of each pair.
+
+        Args:
+            image, reference: (B, H, W, 3) in [0, 1], at least 32 pixels a side.
+
+        Returns:
+            (B,), 0 for equal images.
+
+        Raises:
+            InputError: images of another or of different shapes, or too small.
+        """
+        if image.shape != reference.shape or image.ndim != 4 or image.shape[3] != 3 or min(image.shape[1:3]) < MIN_SIZE:
+            raise InputError(
+                f"images for {self.name}",
+                expected=f"two of shape (B, H, W, 3), H and W at least {MIN_SIZE}",
+                received=f"shapes {tuple(image.shape)} and {tuple(reference.shape)}",
+            )
+        x, y = (2.0 * pixels.permute(0, 3, 1, 2) - 1.0 for pixels in (image, reference))
+        return self.distance(x, y)
+
+    def distance(self, x: Tensor, y: Tensor) -> Tensor:
+        """(B, 3, H, W) images in [-1, 1] -> (B,)."""
+        raise NotImplementedError
+
+
+class ShiftTolerantLPIPS(PerceptualDistance):
+    """ST-LPIPS (Ghildyal and Liu 2022): LPIPS on an AlexNet whose every reduction is low-pass filtered.
+
+    `sum over 5 layers of mean over pixels of w . (f/|f| - g/|g|)^2`, f and g the layer's features of the two images and
+    w its learnt weights. A shift of the image by a pixel barely changes the distance.
+    """
+
+    name = "ST-LPIPS"
+
+    def __init__(self) -> None:
+        super().__init__()
+        inputs = (3, *CHANNELS[:-1])
+        # The stem keeps AlexNet's padding of 2 at a stride of 1; the reduction is left to the filter.
+        paddings = (2, 2, 1, 1, 1)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(i, o, kernel, padding=padding)
+            for i, o, kernel, padding in zip(inputs, CHANNELS, KERNELS, paddings, strict=True)
+        )
+        self.layer_weights = nn.ParameterList(torch.rand(channels) for channels in CHANNELS)
+        # Mean and standard deviation of ImageNet for images in [-1, 1], rounded as LPIPS has them.
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])
+        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
+        taps = torch.tensor([0.25, 0.5, 0.25])
+        self.register_buffer("binomial", torch.outer(taps, taps)[None, None], persistent=False)
+        self.requires_grad_(False)
+
+    @staticmethod
+    def from_weights(stored: Mapping[str, Tensor]) -> ShiftTolerantLPIPS:
+        """With the weights of the authors' file.
+
+        Raises:
+            InputError: weights of another network.
+        """
+        metric = ShiftTolerantLPIPS()
+        state = {"shift": stored.get("scaling_layer.shift"), "scale": stored.get("scaling_layer.scale")}
+        for k, conv in enumerate(STORED_CONVS):
+            state[f"convs.{k}.weight"], state[f"convs.{k}.bias"] = (
+                stored.get(f"{conv}.weight"),
+                stored.get(f"{conv}.bias"),
+            )
+            state[f"layer_weights.{k}"] = stored.get(f"lin{k}.model.1.weight")
+        for name, value in metric.state_dict().items():
+            if state[name] is None or state[name].numel() != value.numel():
+                raise InputError(
+                    "ST-LPIPS weights",
+                    expected=f"{name} of shape {tuple(value.shape)}",
+                    received="none" if state[name] is None else f"shape {tuple(state[name].shape)}",
+                    remedy="use the weight file of stlpips-pytorch 0.0.2",
+                )
+            value.copy_(state[name].reshape(value.shape))
+        return metric
+
+    def distance(self, x: Tensor, y: Tensor) -> Tensor:
+        total = x.new_zeros(len(x))
+        for weight, f, g in zip(self.layer_weights, self.features(x), self.features(y), strict=True):
+            difference = (_unit(f) - _unit(g)).square()
+            total = total + torch.einsum("c,bchw->b", weight, difference) / (f.shape[2] * f.shape[3])
+        return total
+
+    def features(self, x: Tensor) -> list[Tensor]:
+        """(B, 3, H, W) in [-1, 1] -> activations of the five layers."""
+        conv1, conv2, conv3, conv4, conv5 = self.convs
+        first = F.relu(self._reduced(conv1((x - self.shift) / self.scale)))
+        second = F.relu(conv2(self._reduced(F.max_pool2d(first, 3, stride=1))))
+        third = F.relu(conv3(self._reduced(F.max_pool2d(second, 3, stride=1))))
+        fourth = F.relu(conv4(third))
+        return [first, second, third, fourth, F.relu(conv5(fourth))]
+
+    def _reduced(self, x: Tensor) -> Tensor:
+        channels = x.shape[1]
+        padded = F.pad(x, (2, 2, 2, 2), mode="reflect")
+        return F.conv2d(padded, self.binomial.expand(channels, -1, -1, -1), stride=2, groups=channels)
+
+
+class PackagedLPIPS(PerceptualDistance):
+    """LPIPS (Zhang et al. 2018) as the user's `lpips` package computes it."""
+
+    def __init__(self, network: nn.Module, backbone: str) -> None:
+        super().__init__()
+        self.name = f"LPIPS ({backbone})"
+        self.network = network.requires_grad_(False).eval()
+
+    def distance(self, x: Tensor, y: Tensor) -> Tensor:
+        return self.network(x, y).flatten()
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(1, keepdim=True).clamp_min(1e-20).sqrt() + 1e-10)
+
+
+def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
+    """ST-LPIPS with the authors' AlexNet weights.
+
+    Args:
+        weights: their file; None: that of the installed package `stlpips-pytorch`, whose code is not run.
+
+    Raises:
+        MissingPackageError: no file given and the package is not installed.
+        InputError: a file that holds something else.
+    """
+    if weights is None:
+        found = importlib.util.find_spec("stlpips_pytorch")
+        if found is None or not found.submodule_search_locations:
+            raise MissingPackageError(
+                "stlpips-pytorch", command="pip install --no-deps stlpips-pytorch", purpose="ST-LPIPS"
+            )
+        weights = Path(found.submodule_search_locations[0]) / WEIGHT_FILE
+    try:
+        stored = torch.load(weights, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise InputError(
+            f"file {weights.name}", expected="weights saved by torch", received=f"{type(error).__name__}"
+        ) from error
+    if not isinstance(stored, Mapping):
+        raise InputError(f"file {weights.name}", expected="tensors by name", received=type(stored).__name__)
+    return ShiftTolerantLPIPS.from_weights(stored)
+
+
+def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
+    """LPIPS by the `lpips` package, with the backbone that it finds or downloads: "alex" or "vgg".
+
+    Raises:
+        MissingPackageError: `lpips`, or torchvision which it needs, is not installed.
+        InputError: another backbone.
+    """
+    if backbone not in ("alex", "vgg"):
+        raise InputError("backbone of LPIPS", expected="'alex' or 'vgg'", received=repr(backbone))
+    try:
+        import lpips
+    except ImportError as error:
+        raise MissingPackageError("lpips", command="pip install lpips torchvision", purpose="LPIPS") from error
+    return PackagedLPIPS(lpips.LPIPS(net=backbone, verbose=False), backbone)

@@ -1,0 +1,98 @@
+"""Control points of a mesh: a few vertices whose displacements are interpolated to all the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """K control vertices of V, and how every vertex is interpolated from them.
+
+    Attributes:
+        vertices: (K,) index of each control vertex.
+        neighbours: (V, k) index of control points, from 0 to K - 1.
+        weights: (V, k) non-negative, rows sum to 1.
+    """
+
+    vertices: np.ndarray
+    neighbours: np.ndarray
+    weights: np.ndarray
+
+
+def choose_control_points(
+    vertices: np.ndarray, groups: np.ndarray, *, count: int, neighbour_count: int = 4
+) -> ControlPoints:
+    """Spread control points evenly over every group of vertices and tie each vertex to the nearest of its own group.
+
+    Farthest-point sampling, started at the vertex farthest from the group's centroid. Weights are those of embedded
+    deformation (Sumner et al. 2007, equation 5): `w_j ~ (1 - d_j / d_max)^2`, d_max the distance to the next nearest
+    control point. Groups (cloth over body, for example) do not mix, however close they lie.
+
+    Args:
+        vertices: (V, 3) metres.
+        groups: (V,) integers.
+        count: of control points, shared among the groups by their numbers of vertices (at least one each).
+        neighbour_count: control points a vertex depends on.
+
+    Raises:
+        InputError: fewer control points than groups or more than vertices, or no neighbour.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    names, group = np.unique(np.asarray(groups), return_inverse=True)
+    if not len(names) <= count <= len(vertices):
+        raise InputError(
+            "number of control points",
+            expected=f"{len(names)} (one for every group) to {len(vertices)} (one for every vertex)",
+            received=str(count),
+        )
+    if neighbour_count < 1:
+        raise InputError("neighbours of a vertex", expected="at least 1", received=str(neighbour_count))
+
+    chosen: list[np.ndarray] = []
+    neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
+    weights = np.zeros((len(vertices), neighbour_count))
+    before = 0
+    for k in range(len(names)):
+        members = np.flatnonzero(group == k)
+        share = min(len(members), max(1, round(count * len(members) / len(vertices))))
+        controls = members[_farthest_points(vertices[members], share)]
+        used = min(neighbour_count, share)
+        nearest, w = _embedded_weights(vertices[members], vertices[controls], used)
+        neighbours[members, :used] = before + nearest
+        neighbours[members, used:] = before + nearest[:, :1]
+        weights[members, :used] = w
+        chosen.append(controls)
+        before += share
+    return ControlPoints(np.concatenate(chosen), neighbours, weights)
+
+
+def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` points, each the farthest from those before it."""
+    picked = np.empty(count, dtype=np.int64)
+    picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
+    distance = np.full(len(points), np.inf)
+    # Each choice depends on the one before: a loop over control points, not over vertices.
+    for i in range(1, count):
+        distance = np.minimum(distance, np.sum((points - points[picked[i - 1]]) ** 2, axis=1))
+        picked[i] = np.argmax(distance)
+    return picked
+
+
+def _embedded_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` nearest controls of each point, and their weights."""
+    asked = min(count + 1, len(controls))
+    distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
+    # Where there is no next nearest control point, a distance twice the largest keeps every weight above zero.
+    limit = distance[:, -1] if asked > count else 2.0 * distance[:, -1]
+    closeness = 1.0 - distance[:, :count] / np.maximum(limit, 1e-12)[:, None]
+    weights = closeness**2
+    # Equal distances all round (a point among symmetric controls) leave nothing to tell them apart.
+    flat = weights.sum(1) < 1e-12
+    weights[flat] = 1.0
+    return nearest[:, :count], weights / weights.sum(1, keepdims=True)

@@ -1,0 +1,201 @@
+"""The student's non-rigid field: displacements of the template's vertices from pose and frame code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.models.config import require_at_least
+from avatar.models.control_points import ControlPoints
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Sizes of the field. The defaults are the paper's.
+
+    Attributes:
+        frequencies: bands L of the positional encoding.
+        pose_size: length of theta (21 body joints, axis-angle).
+        code_size: length of a frame's code z_t.
+        width, hidden_layers: of both MLPs; one more layer gives the displacement.
+    """
+
+    frequencies: int = 6
+    pose_size: int = 63
+    code_size: int = 32
+    width: int = 64
+    hidden_layers: int = 5
+
+    def __post_init__(self) -> None:
+        require_at_least("field frequencies", self.frequencies, 0)
+        for name in ("pose_size", "code_size", "width", "hidden_layers"):
+            require_at_least(f"field {name}", getattr(self, name), 1)
+
+    @property
+    def encoding_size(self) -> int:
+        """Length of a point's positional encoding."""
+        return 3 + 6 * self.frequencies
+
+
+def positional_encoding(points: Tensor, frequencies: int) -> Tensor:
+    """`phi(v) = (v, sin(2^l pi v), cos(2^l pi v) for l < L)` (Mildenhall et al. 2020, equation 4), with the identity.
+
+    Args:
+        points: (..., 3) metres.
+        frequencies: L.
+
+    Returns:
+        (..., 3 + 6 L).
+    """
+    bands = math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype, device=points.device)
+    angles = (points[..., None, :] * bands[:, None]).flatten(-2)
+    return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
+
+
+class _FieldNetwork(nn.Module):
+    """MLP on `phi(v) + theta + z`; the last layer starts at zero.
+
+    The first layer is linear in its parts: that of pose and code is computed once a frame, not once a vertex.
+    """
+
+    def __init__(self, config: FieldConfig) -> None:
+        super().__init__()
+        self.of_point = nn.Linear(config.encoding_size, config.width, bias=False)
+        self.of_frame = nn.Linear(config.pose_size + config.code_size, config.width)
+        self.hidden = nn.ModuleList(nn.Linear(config.width, config.width) for _ in range(config.hidden_layers - 1))
+        self.last = nn.Linear(config.width, 3)
+        fan_in = config.encoding_size + config.pose_size + config.code_size
+        for layer in (self.of_point, self.of_frame):
+            # As one layer of all inputs would start.
+            nn.init.uniform_(layer.weight, -1.0 / math.sqrt(fan_in), 1.0 / math.sqrt(fan_in))
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, encodings: Tensor, frames: Tensor) -> Tensor:
+        """(V, E) encodings and (B, pose + code) -> (B, V, 3)."""
+        x = F.relu(self.of_point(encodings) + self.of_frame(frames)[:, None])
+        for layer in self.hidden:
+            x = F.relu(layer(x))
+        return self.last(x)
+
+
+class DeformationField(nn.Module):
+    """`dv_i = m_i S_c(g_i) + S_b(g_i)`, `g_i = phi(v_i) + theta + z_t` (+ joins vectors), metres in the canonical pose.
+
+    S_b moves the whole template; S_c adds the motion of the clothes and is evaluated on them alone (m_i = 1). With
+    control points both are evaluated there and interpolated.
+
+    Args:
+        config: sizes.
+        vertices: (V, 3) canonical vertices, metres.
+        cloth_mask: (V,) bool, m.
+        control: control points of the same vertices, or None to evaluate the field on every vertex.
+
+    Raises:
+        InputError: a mask or control points of another number of vertices.
+    """
+
+    def __init__(
+        self, config: FieldConfig, vertices: Tensor, cloth_mask: Tensor, *, control: ControlPoints | None = None
+    ) -> None:
+        super().__init__()
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
+            raise InputError(
+                "template of the field",
+                expected="vertices of shape (V, 3) and a cloth mask of shape (V,)",
+                received=f"shapes {tuple(vertices.shape)} and {tuple(cloth_mask.shape)}",
+            )
+        if control is not None and len(control.neighbours) != len(vertices):
+            raise InputError(
+                "control points",
+                expected=f"those of {len(vertices)} vertices",
+                received=f"those of {len(control.neighbours)}",
+            )
+        self.config = config
+        self.body = _FieldNetwork(config)
+        self.cloth = _FieldNetwork(config)
+        if control is not None:
+            where = torch.as_tensor(control.vertices, device=vertices.device)
+            vertices, cloth_mask = vertices[where], cloth_mask[where]
+            neighbours = torch.as_tensor(control.neighbours, device=vertices.device)
+            weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
+        else:
+            neighbours = weights = None
+        self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
+        self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
+        self.register_buffer("neighbours", neighbours, persistent=False)
+        self.register_buffer("weights", weights, persistent=False)
+
+    def forward(self, pose: Tensor, code: Tensor) -> Tensor:
+        """Displacements of all vertices.
+
+        Args:
+            pose: (B, pose_size) theta, axis-angle, radians.
+            code: (B, code_size) frame codes.
+
+        Returns:
+            (B, V, 3) metres, along the canonical axes.
+
+        Raises:
+            InputError: poses or codes of another length or number.
+        """
+        expected = (self.config.pose_size, self.config.code_size)
+        if pose.ndim != 2 or code.ndim != 2 or (pose.shape[1], code.shape[1]) != expected or len(pose) != len(code):
+            raise InputError(
+                "pose and code",
+                expected=f"shapes (B, {expected[0]}) and (B, {expected[1]})",
+                received=f"shapes {tuple(pose.shape)} and {tuple(code.shape)}",
+            )
+        frames = torch.cat([pose, code], dim=1)
+        moved = self.body(self.encodings, frames)
+        moved = moved.index_add(1, self.cloth_index, self.cloth(self.encodings[self.cloth_index], frames))
+        if self.neighbours is None:
+            return moved
+        return (moved[:, self.neighbours] * self.weights[..., None]).sum(dim=2)
+
+
+class FrameCodes(nn.Module):
+    """Learnable codes z_t, one for every frame of a sequence, zero at first.
+
+    The zero vector is the *null code*: what a pose without a frame is driven by. It means something only if training
+    shows it to the field, in the place of some of the codes.
+
+    Args:
+        frames: numbers of the frames, each once.
+        code_size: length of a code.
+
+    Raises:
+        InputError: no frames, or one twice.
+    """
+
+    def __init__(self, frames: Sequence[int], code_size: int) -> None:
+        super().__init__()
+        if not len(frames) or len(set(frames)) != len(frames):
+            raise InputError("frames of the codes", expected="at least one, each once", received=str(list(frames)))
+        self.frames = tuple(int(frame) for frame in frames)
+        self.row = {frame: row for row, frame in enumerate(self.frames)}
+        self.codes = nn.Parameter(torch.zeros(len(self.frames), code_size))
+
+    def forward(self, frames: Sequence[int | None]) -> Tensor:
+        """(B, code_size): the code of each frame, the null code for None.
+
+        Raises:
+            InputError: a frame that has no code.
+        """
+        unknown = [frame for frame in frames if frame is not None and frame not in self.row]
+        if unknown:
+            raise InputError(
+                "frame of a code",
+                expected="one of the frames that were trained on, or None",
+                received=", ".join(map(str, unknown)),
+                remedy="drive new frames with the null code, or fit codes to them",
+            )
+        rows = torch.tensor([0 if frame is None else self.row[frame] for frame in frames], device=self.codes.device)
+        known = torch.tensor([frame is not None for frame in frames], device=self.codes.device)
+        return self.codes[rows] * known[:, None]

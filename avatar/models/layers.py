@@ -1,0 +1,208 @@
+"""Layers of StyleGAN2 (Karras et al. 2020) in plain torch: equalised, modulated and filtered convolutions.
+
+Weights are drawn from N(0, 1) and scaled by `1 / sqrt(fan in)` when used (equalised learning rate, Karras et al. 2018).
+Activations are `leaky_relu(x, 0.2)` with a gain of `sqrt(2)`, which is folded into the weights: they are small, the
+images are not.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+SLOPE = 0.2
+GAIN = math.sqrt(2.0)
+DEMODULATION_EPS = 1e-8
+FIR_TAPS = (1.0, 3.0, 3.0, 1.0)
+"""The low-pass filter of StyleGAN2 along one axis, before it is normalised to sum 1."""
+
+
+class _SymmetricFilter(torch.autograd.Function):
+    """Depthwise filter whose adjoint is the same filter with the complementary padding.
+
+    Torch's own gradient of a depthwise convolution runs a kernel that is several times slower on a CPU.
+    """
+
+    @staticmethod
+    def forward(ctx, image: Tensor, kernel: Tensor, padding: int) -> Tensor:
+        ctx.save_for_backward(kernel)
+        ctx.padding = padding
+        weight = kernel.to(image.dtype).expand(image.shape[1], -1, -1, -1)
+        return F.conv2d(image, weight, padding=padding, groups=image.shape[1])
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (kernel,) = ctx.saved_tensors
+        complementary = kernel.shape[-1] - 1 - ctx.padding
+        return _SymmetricFilter.apply(gradient, kernel, complementary), None, None
+
+
+class FirFilter(nn.Module):
+    """The separable low-pass filter [1, 3, 3, 1] / 8 on images (B, C, H, W) that are zero outside.
+
+    Args:
+        gain: multiplies the filter; 4 keeps the brightness of an image that is doubled with zeros in between.
+    """
+
+    def __init__(self, *, gain: float = 1.0) -> None:
+        super().__init__()
+        taps = torch.tensor(FIR_TAPS)
+        kernel = torch.outer(taps, taps) * (gain / sum(FIR_TAPS) ** 2)
+        self.register_buffer("kernel", kernel[None, None], persistent=False)
+
+    def forward(self, image: Tensor, *, padding: int) -> Tensor:
+        """(B, C, H + 2 padding - 3, W + 2 padding - 3): filtered."""
+        return _SymmetricFilter.apply(image, self.kernel, padding)
+
+    def halve(self, image: Tensor) -> Tensor:
+        """(B, C, H/2, W/2): filtered, then every second pixel."""
+        return F.conv2d(image, self._weight(image), stride=2, padding=1, groups=image.shape[1])
+
+    def double(self, image: Tensor) -> Tensor:
+        """(B, C, 2H, 2W): zeros in between, then filtered. With gain 4 this is bilinear interpolation inside."""
+        return F.conv_transpose2d(image, self._weight(image), stride=2, padding=1, groups=image.shape[1])
+
+    def _weight(self, image: Tensor) -> Tensor:
+        return self.kernel.to(image.dtype).expand(image.shape[1], -1, -1, -1)
+
+
+class EqualizedLinear(nn.Module):
+    """`y = r (W x / sqrt(fan in) + b)` with W ~ N(0, 1 / r^2): r is the layer's learning-rate multiplier."""
+
+    def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, rate: float = 1.0) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs) / rate)
+        self.bias = nn.Parameter(torch.full((outputs,), bias))
+        self.rate = rate
+        self.scale = 1.0 / math.sqrt(inputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.linear(x * self.scale, self.weight, self.bias)
+        return y if self.rate == 1.0 else self.rate * y
+
+
+class ConvLayer(nn.Module):
+    """Equalised convolution and activation; with `down` the image is filtered and halved on the way.
+
+    `forward` takes (B, inputs, H, W) to (B, outputs, H, W), or (B, outputs, H/2, W/2) with `down`.
+    """
+
+    def __init__(self, inputs: int, outputs: int, *, kernel: int = 3, down: bool = False) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.scale = GAIN / math.sqrt(inputs * kernel**2)
+        self.filter = FirFilter() if down else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight = self.weight * self.scale
+        reach = weight.shape[-1] // 2
+        if self.filter is None:
+            x = F.conv2d(x, weight, self.bias, padding=reach)
+        else:
+            x = F.conv2d(self.filter(x, padding=reach + 1), weight, self.bias, stride=2)
+        return F.leaky_relu(x, SLOPE, inplace=True)
+
+
+class JoiningConv(ConvLayer):
+    """`forward(x, skip(y)) = ConvLayer(cat(x, y))`: the half that sees y is computed once and used for many x."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(2 * channels, channels)
+
+    def skip(self, y: Tensor) -> Tensor:
+        """(B, channels, H, W) -> its half of the convolution, with the bias."""
+        return F.conv2d(y, self.weight.chunk(2, dim=1)[1] * self.scale, self.bias, padding=1)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        """(B, channels, H, W), with B = 1 allowed in one of the two."""
+        x = F.conv2d(x, self.weight.chunk(2, dim=1)[0] * self.scale, padding=1)
+        return F.leaky_relu(x + skip, SLOPE, inplace=True)
+
+
+class ModulatedWeight(nn.Module):
+    """Weights of a convolution scaled by a style, `w'_oikl = s_i w_oikl` with `s = A style`.
+
+    The style is one vector for the whole batch, as the avatar's networks use it, so that the result is an ordinary
+    filter bank: (outputs, inputs, kernel, kernel).
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, style_size: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.affine = EqualizedLinear(style_size, inputs, bias=1.0)
+
+    def forward(self, style: Tensor) -> Tensor:
+        return self.weight * self.affine(style)[:, None, None]
+
+
+def demodulate(weight: Tensor) -> Tensor:
+    """Filters of unit norm, `w''_oikl = w'_oikl / sqrt(sum_ikl w'_oikl^2 + 1e-8)` (Karras et al. 2020, equation 3)."""
+    return weight * torch.rsqrt(weight.square().sum((1, 2, 3), keepdim=True) + DEMODULATION_EPS)
+
+
+class StyledConv(nn.Module):
+    """Modulated 3 x 3 convolution, fixed noise, bias and activation; with `up` the image is doubled on the way.
+
+    Doubling is a transposed convolution with stride 2 followed by the low-pass filter. The noise is one stored image of
+    N(0, 1) whose strength is learnt from zero: detail that stays where it is, hence no flicker.
+
+    Args:
+        inputs, outputs: channels.
+        style_size: length of the style.
+        up: double the image.
+        noise_size: side of the output in pixels, if noise is to be added.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, style_size: int, *, up: bool = False, noise_size: int | None = None
+    ) -> None:
+        super().__init__()
+        self.modulated = ModulatedWeight(inputs, outputs, 3, style_size)
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        # The gain of the activation, and that of the zeros in between, ride on the filter where there is one.
+        self.filter = FirFilter(gain=4.0 * GAIN) if up else None
+        if noise_size is not None:
+            self.register_buffer("noise", torch.randn(1, 1, noise_size, noise_size))
+            self.noise_strength = nn.Parameter(torch.zeros(()))
+        else:
+            self.noise = None
+
+    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+        weight = demodulate(self.modulated(style))
+        if self.filter is None:
+            x = F.conv2d(x, weight * GAIN, self.bias, padding=1)
+        else:
+            x = F.conv_transpose2d(x, weight.transpose(0, 1), stride=2)
+            x = self.filter(x, padding=1) + self.bias[:, None, None].to(x.dtype)
+        if self.noise is not None:
+            x = x + (self.noise_strength * self.noise).to(x.dtype)
+        return F.leaky_relu(x, SLOPE, inplace=True)
+
+
+class ToMaps(nn.Module):
+    """Feature maps to output maps of twice the side: (B, inputs, H, W) -> (B, outputs, 2H, 2W).
+
+    Each feature pixel gives a block of 2 x 2 output pixels by a modulated linear map: four Haar coefficients and the
+    inverse transform, as Animatable Gaussians has it, up to an orthonormal change of the weights.
+
+    Args:
+        inputs, outputs: channels.
+        style_size: length of the style.
+        zero: start from weights of zero: the maps are zero until something is learnt.
+    """
+
+    def __init__(self, inputs: int, outputs: int, style_size: int, *, zero: bool) -> None:
+        super().__init__()
+        self.modulated = ModulatedWeight(inputs, outputs, 2, style_size)
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.scale = 1.0 / math.sqrt(inputs)
+        if zero:
+            nn.init.zeros_(self.modulated.weight)
+
+    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+        weight = self.modulated(style) * self.scale
+        return F.conv_transpose2d(x, weight.transpose(0, 1), self.bias, stride=2)

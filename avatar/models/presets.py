@@ -1,0 +1,45 @@
+"""Sizes of all networks under one name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from avatar.models.blend_shapes import BlendShapeConfig
+from avatar.models.config import require_choice
+from avatar.models.deformation_field import FieldConfig
+from avatar.models.teacher import TeacherConfig
+
+
+@dataclass(frozen=True)
+class NetworkPreset:
+    """Teacher and student of a preset. The student is the paper's in all of them: it is small already."""
+
+    teacher: TeacherConfig
+    field: FieldConfig = FieldConfig()
+    blend_shapes: BlendShapeConfig = BlendShapeConfig()
+
+
+_LEAN = {"networks": "shared", "style_layers": 1, "noise": False, "zero_output": True}
+
+NETWORK_PRESETS: dict[str, NetworkPreset] = {
+    "paper": NetworkPreset(TeacherConfig()),
+    "gpu": NetworkPreset(
+        TeacherConfig(in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True)
+    ),
+    "cpu": NetworkPreset(
+        TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN)
+    ),
+    "demo": NetworkPreset(
+        TeacherConfig(in_size=64, out_size=128, channel_base=512, channel_max=32, style_size=16, **_LEAN)
+    ),
+}
+
+
+def network_preset(name: str) -> NetworkPreset:
+    """The preset "paper", "gpu", "cpu" or "demo".
+
+    Raises:
+        InputError: another name.
+    """
+    require_choice("preset", name, tuple(NETWORK_PRESETS))
+    return NETWORK_PRESETS[name]
