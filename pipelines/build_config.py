@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
+from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.labels import LABELS
 
 STAGES: tuple[str, ...] = (
@@ -73,3 +76,36 @@ class BuildConfig:
     method: str = "ours"
     samples: int = 100_000
     seed: int = 0
+
+
+BUILD_FILE = "build.json"
+"""What a run was built from, so that later stages can write its report anew."""
+_PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
+
+
+def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
+    """Write `build.json` into a run."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Path):
+            return str(value.resolve())
+        return {k: plain(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+    content = {"inputs": plain(asdict(inputs)), "config": asdict(config)}
+    atomic_write_text(run / BUILD_FILE, json.dumps(content, indent=1) + "\n")
+
+
+def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
+    """What `save_build` wrote; None where there is none of this version. Optional inputs that are gone are left out."""
+    try:
+        content = json.loads((run / BUILD_FILE).read_text())
+        values, config = content["inputs"], BuildConfig(**content["config"])
+        paths = {name: None if values[name] is None else Path(values[name]) for name in _PATHS}
+        for name in ("labels", "cameras", "motion"):
+            if paths[name] is not None and not paths[name].exists():
+                paths[name] = None
+        maps = {name: Path(path) for name, path in values["label_maps"].items()}
+        rest = {f.name: values[f.name] for f in fields(BuildInputs) if f.name not in (*_PATHS, "label_maps")}
+        return BuildInputs(**paths, label_maps=maps, **rest), config
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

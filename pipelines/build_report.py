@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.arrays import load_arrays
-from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.build_config import STAGES, BuildConfig, BuildInputs, load_build
+from pipelines.fit_pictures import FIT_STAGE
+from pipelines.fit_report import fit_key_numbers, fit_section, standing_fit
 from pipelines.pictures import (
     blend_joint_colors,
     body_cameras,
@@ -22,7 +24,7 @@ from pipelines.scan_stages import MM, load_params_of_run, load_scan
 from pipelines.template_stages import load_parts, load_weights
 from smplxpp.body import load_body, load_params
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
-from smplxpp.core.artifact import StageRecord, jsonable, versions
+from smplxpp.core.artifact import StageRecord, jsonable, require_stage, versions
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
@@ -36,7 +38,10 @@ ERROR_LIMIT_MM = 6.0
 
 
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
-    """Write `run/report.html` from the files of a finished run."""
+    """Write `run/report.html` from the files of a finished run, with the fit of its template where there is one."""
+    fit = standing_fit(run, records["60_assemble"].manifest["files"]["smplxpp.npz"])
+    if fit is not None:
+        records = {**records, FIT_STAGE: fit}
     template = Template.load(run / "60_assemble" / "smplxpp.npz")
     reference = load_params_of_run(run)
     checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
@@ -52,6 +57,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
         _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
         _poses_section(template, reference, inputs),
+        *(() if fit is None else (fit_section(fit),)),
     )  # fmt: skip
     clothes = records["65_validate"].manifest["numbers"]["template_vs_scan"]["labels"]
     key_numbers = [
@@ -64,7 +70,10 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     seconds = {name: r.manifest["seconds"] for name, r in records.items()}
     key_numbers += [
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
-        KeyNumber("scan to template", f"{sum(seconds.values()):.1f} s", "all stages, validation included"),
+        KeyNumber(
+            "scan to template", f"{sum(seconds[name] for name in STAGES):.1f} s", "all stages, validation included"
+        ),
+        *(() if fit is None else fit_key_numbers(fit)),
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
     front = body_cameras(posed, views=("front",), height=HEIGHT)[0]
@@ -85,6 +94,21 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         },
     )  # fmt: skip
     return write_report(run / "report.html", report)
+
+
+def rewrite_report(run: Path) -> Path | None:
+    """Write the report of a finished run anew, from the run alone.
+
+    Returns:
+        The report, or None where the run does not say what it was built from.
+
+    Raises:
+        InputError: a stage of the template is missing or changed.
+    """
+    build = load_build(run)
+    if build is None:
+        return None
+    return write_build_report(run, *build, {name: require_stage(run, name) for name in STAGES})
 
 
 def _sheet(mesh: TriangleMesh, cameras: list, **colors) -> bytes:

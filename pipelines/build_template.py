@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines import scan_stages, template_stages, validate_stage
-from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.build_config import STAGES, BuildConfig, BuildInputs, save_build
 from pipelines.run_folder import own_run_folder
 from smplxpp.body import load_body, load_params
 from smplxpp.core.artifact import StageOutput, StageRecord, code_digest, jsonable, require_stage, run_stage, sha256_file
@@ -62,7 +62,8 @@ def build(
     if STAGES.index(first) > STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
     _check_inputs(inputs)
-    with own_run_folder(run, (*STAGES, "metrics", "report")):
+    with own_run_folder(run, (*STAGES, "build", "metrics", "report")):
+        save_build(run, inputs, config)
         records = _run_stages(run, inputs, config, STAGES.index(first), STAGES.index(last), progress)
         write_metrics(run, inputs, records)
     return records

@@ -93,9 +93,14 @@ class Build:
         return {**metrics, "failed": failed, "exit_status": 0}
 
     def _report_stands(self, records: dict[str, StageRecord]) -> bool:
-        """Whether the report was written after every stage."""
+        """Whether the report was written after every stage, a fit's among them."""
+        from pipelines.fit_pictures import FIT_STAGE
+
         report = self.out / "report.html"
-        made = [(record.folder / "manifest.json").stat().st_mtime_ns for record in records.values()]
+        manifests = [record.folder / "manifest.json" for record in records.values()]
+        made = [
+            path.stat().st_mtime_ns for path in (*manifests, self.out / FIT_STAGE / "manifest.json") if path.exists()
+        ]
         return report.is_file() and report.stat().st_mtime_ns > max(made)
 
     def inputs(self) -> BuildInputs:

@@ -4,6 +4,7 @@ from pipelines.report.builder import write_report
 from pipelines.report.model import (
     CheckRow,
     Comparison,
+    Curve,
     Histogram,
     KeyNumber,
     Picture,
@@ -18,6 +19,7 @@ from pipelines.report.model import (
 __all__ = [
     "CheckRow",
     "Comparison",
+    "Curve",
     "Histogram",
     "KeyNumber",
     "Picture",

@@ -11,7 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
+from pipelines.report.charts import curve_svg, histogram_statistics, histogram_svg, timings_svg
 from pipelines.report.model import STATUSES, CheckRow, Report, count_statuses, format_value, worst_status
 from smplxpp.core.atomic import atomic_write_text
 
@@ -38,6 +38,7 @@ def write_report(path: str | Path, report: Report) -> Path:
     )
     environment.globals |= {
         "histogram_svg": lambda histogram: Markup(histogram_svg(histogram)),
+        "curve_svg": lambda curve: Markup(curve_svg(curve)),
         "timings_svg": lambda seconds: Markup(timings_svg(seconds)),
         "statistics": histogram_statistics,
     }

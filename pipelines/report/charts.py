@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from pipelines.report.model import Histogram, format_value
+from pipelines.report.model import Curve, Histogram, format_value
 from smplxpp.core.errors import InputError
 
 _BINS = 64
@@ -89,6 +89,63 @@ def histogram_svg(histogram: Histogram) -> str:
         y = 14 + 16 * line_of_text
         out.append(f'<line class="{kind}" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP - 8}" y2="{base}"/>')
         out.append(f'<text class="{kind}-text" x="{center:.1f}" y="{y}" text-anchor="middle">{escape(label)}</text>')
+    return "".join([*out, "</svg>"])
+
+
+def curve_svg(curve: Curve) -> str:
+    """Lines with a dot at every point and the last value beside its end, as an SVG element."""
+    lines = {}
+    for name, (x, y) in curve.lines.items():
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        known = np.isfinite(x) & np.isfinite(y)
+        if known.any():
+            lines[name] = x[known], y[known]
+    if not lines:
+        raise InputError(f"curve {curve.title!r}", expected="at least one finite point", received="none")
+    xs, ys = (np.concatenate([line[k] for line in lines.values()]) for k in (0, 1))
+    low, high = float(xs.min()), float(xs.max())
+    bottom, top = float(ys.min()), float(ys.max())
+    high, pad = (high if high > low else low + 1.0), 0.08 * (top - bottom) or 0.5
+    bottom, top = bottom - pad, top + pad
+    right, base = _RIGHT + 44, _HEIGHT - _BOTTOM  # room for the values at the ends
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return (
+            _LEFT + (_WIDTH - _LEFT - right) * (x - low) / (high - low),
+            base - (base - _TOP) * (y - bottom) / (top - bottom),
+        )
+
+    ends = ", ".join(f"{name} {format_value(float(y[-1]))}" for name, (_, y) in lines.items())
+    unit = f" {curve.unit}" if curve.unit else ""
+    out = [
+        f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
+        f'aria-label="{escape(curve.title)}, at the end: {escape(ends + unit)}">'
+    ]
+    for tick in _ticks(bottom, top, 4):
+        y = place(low, tick)[1]
+        out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        out.append(f'<text class="tick" x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:g}</text>')
+    out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - right}" y1="{base}" y2="{base}"/>')
+    for tick in _ticks(low, high, 6):
+        at = place(tick, bottom)[0]
+        out.append(f'<text class="tick" x="{at:.1f}" y="{base + 17}" text-anchor="middle">{tick:g}</text>')
+    label = f"{curve.unit} over {curve.x_label}" if curve.unit else curve.x_label
+    out.append(f'<text class="tick" x="{_WIDTH - right}" y="{_HEIGHT - 6}" text-anchor="end">{escape(label)}</text>')
+    for k, (name, (x, y)) in enumerate(lines.items()):
+        points = [place(float(a), float(b)) for a, b in zip(x, y, strict=True)]
+        color = f"line{k % 3}"
+        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+        out.append(f'<polyline class="line {color}" points="{path}"/>')
+        for (a, b), value, where in zip(points, y, x, strict=True):
+            title = f"{name}: {format_value(float(value))}{unit} at {format_value(float(where))} {curve.x_label}"
+            out.append(
+                f'<circle class="{color}" cx="{a:.1f}" cy="{b:.1f}" r="2.4"><title>{escape(title)}</title></circle>'
+            )
+        a, b = points[-1]
+        out.append(f'<text class="value {color}" x="{a + 6:.1f}" y="{b + 4:.1f}">{format_value(float(y[-1]))}</text>')
+        at = _LEFT + 150 * k
+        out.append(f'<rect class="{color}" x="{at}" y="10" width="14" height="4" rx="2"/>')
+        out.append(f'<text class="name" x="{at + 20}" y="17">{escape(name)}</text>')
     return "".join([*out, "</svg>"])
 
 

@@ -122,6 +122,21 @@ class Histogram:
     upper: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Quantities over one axis, a line each.
+
+    Attributes:
+        lines: name -> (x, y), each (N,), x ascending; points that are not finite are left out.
+        x_label, unit: of the axes.
+    """
+
+    title: str
+    lines: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    x_label: str
+    unit: str = ""
+
+
 @dataclass(frozen=True)
 class KeyNumber:
     """A number for the head of the report, already formatted."""
@@ -147,6 +162,7 @@ class Section:
     comparisons: tuple[Comparison, ...] = ()
     tables: tuple[Table, ...] = ()
     histograms: tuple[Histogram, ...] = ()
+    curves: tuple[Curve, ...] = ()
     legend: tuple[tuple[str, tuple[int, int, int]], ...] = ()
     checks: tuple[CheckRow, ...] = ()
 

@@ -1,0 +1,84 @@
+"""What decides a reference fit, and presets that differ in time and detail."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+from avatar.gaussians.sampling import SamplingConfig
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningRates:
+    """Adam's step of every attribute at the start; all fall exponentially to `final` times that.
+
+    Attributes:
+        offset: metres. log_scales, quats, opacity_logits: of the parameters as they are stored.
+        dc: of colours in [0, 1]. sh: of the coefficients that depend on the view.
+        final: share left at the last step.
+    """
+
+    offset: float = 3e-4
+    log_scales: float = 5e-3
+    quats: float = 2e-3
+    opacity_logits: float = 3e-2
+    dc: float = 1e-2
+    sh: float = 1e-3
+    final: float = 0.1
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"learning rate {f.name}", expected="a positive number", received=repr(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """Choices of a reference fit.
+
+    Attributes:
+        sampling: number of Gaussians and where they start.
+        iterations: steps; each renders one view.
+        rates: learning rates.
+        dssim: share of `1 - SSIM` in the loss, the rest is L1.
+        alpha: weight of the L1 between rendered opacity and mask. Without it dark hair on a black background could be
+            holes.
+        scale_penalty, offset_penalty: weights of GaussianAvatars' penalties.
+        eps2d: pixels squared that the rasteriser blurs every Gaussian by; viewers use 0.3.
+        margin: pixels kept around the silhouette of a training view.
+        evaluations: how often quality is measured, spread evenly.
+        seed: of the views' order. The Gaussians' places have their own in `sampling`.
+    """
+
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    iterations: int = 3000
+    rates: LearningRates = field(default_factory=LearningRates)
+    dssim: float = 0.2
+    alpha: float = 0.1
+    scale_penalty: float = 1.0
+    offset_penalty: float = 1.0
+    eps2d: float = 0.3
+    margin: int = 12
+    evaluations: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least, most in (
+            ("iterations", 1, math.inf), ("dssim", 0.0, 1.0), ("alpha", 0.0, math.inf),
+            ("scale_penalty", 0.0, math.inf), ("offset_penalty", 0.0, math.inf), ("eps2d", 0.0, math.inf),
+            ("margin", 0, math.inf), ("evaluations", 1, math.inf), ("seed", 0, math.inf),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (math.isfinite(value) and least <= value <= most):
+                limit = f" and at most {most:g}" if math.isfinite(most) else ""
+                raise InputError(f"fit: {name}", expected=f"a number, at least {least:g}{limit}", received=repr(value))
+
+
+PRESETS: dict[str, FitConfig] = {
+    "quick": FitConfig(sampling=SamplingConfig(count=60_000), iterations=400),
+    "default": FitConfig(sampling=SamplingConfig(count=150_000), iterations=3000),
+    "paper": FitConfig(sampling=SamplingConfig(count=270_000, head_share=70 / 270), iterations=10_000),
+}
+"""quick shows whether everything fits together; default is for use; paper has TaoAvatar's numbers."""

@@ -1,0 +1,271 @@
+"""Reference fit: one frame's views turn a posed template into textured Gaussians bound to its triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.export.splats import Splats, posed_splats
+from avatar.gaussians.binding import BoundGaussians, WorldGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.regularizers import offset_penalty, scale_penalty
+from avatar.gaussians.sampling import head_faces, sample_on_mesh
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.losses.ssim import ssim
+from avatar.render.api import rasterize
+from avatar.training.fit_config import FitConfig
+from avatar.training.initial_colors import colors_from_views
+from avatar.training.loop import LoopConfig, Progress, require_finite, run_training
+from avatar.training.quality import Box, ViewQuality, decibels, eight_bit, mean_quality, view_quality
+from avatar.training.views import View
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.template import Template
+
+LEARNED = ("offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
+MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+HEAD_MARGIN = 0.08
+"""Of the head's box, added on every side."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitScene:
+    """What a fit is made on.
+
+    Attributes:
+        template: the clothed body. vertices: (V, 3) of it in the frame's pose, metres.
+        train, held_out: whole views; `held_out` may be empty.
+        background: (3,) sRGB in [0, 1] behind the person.
+    """
+
+    template: Template
+    vertices: np.ndarray
+    train: Sequence[View]
+    held_out: Sequence[View]
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.train:
+            raise InputError("views of the fit", expected="at least one training view", received="none")
+        if self.vertices.shape != self.template.vertices.shape:
+            raise InputError(
+                "posed vertices", expected=f"shape {self.template.vertices.shape}", received=str(self.vertices.shape)
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What a fit gives.
+
+    Attributes:
+        gaussians: on the CPU. splats: the same in the world, in the frame's pose.
+        progress: where the loop ended; not `finished` when its time was over.
+        quality: of held-out and training views by camera.
+        images: (H, W, 3) uint8 rendered, by camera, and `heads` the box of the head in each.
+    """
+
+    gaussians: BoundGaussians
+    splats: Splats
+    progress: Progress
+    quality: dict[str, ViewQuality]
+    images: dict[str, np.ndarray]
+    heads: dict[str, Box | None]
+
+
+def fit_reference(
+    scene: FitScene,
+    config: FitConfig,
+    folder: Path,
+    *,
+    key: str = "",
+    device: str = "cpu",
+    max_seconds: float = float("inf"),
+    report: Callable[[Progress], None] = lambda progress: None,
+    preview: Callable[[Mapping[str, np.ndarray]], None] = lambda images: None,
+) -> FitResult:
+    """Fit Gaussians to a frame by gradient descent on `(1 - s) L1 + s (1 - SSIM)` of composited images.
+
+    The mesh stands still; offsets, scales, rotations, opacities and colours are learned. Colours start from the
+    photographs. The same seed gives the same bits at one number of threads, interrupted or not.
+
+    Args:
+        folder: for `metrics.jsonl` and the checkpoint; a checkpoint with this `key` in it is taken up.
+        device: "cpu" or "cuda".
+        max_seconds: stop with a checkpoint after as much work.
+        report: called after every logged step and evaluation.
+        preview: called at every evaluation with the rendered (H, W, 3) uint8 image of each camera that was measured.
+
+    Raises:
+        InputError: unusable input; `DivergedError` when the loss is not finite.
+    """
+    task = FitTask(scene, config, device, preview)
+    loop = LoopConfig(
+        iterations=config.iterations,
+        evaluate_every=max(1, config.iterations // config.evaluations),
+        max_seconds=max_seconds,
+    )
+    progress = run_training(task, loop, Path(folder), key=key, report=report)
+    quality, images = task.measure((*scene.held_out, *scene.train))
+    gaussians = task.gaussians().to(device="cpu")
+    splats = posed_splats(gaussians, torch.tensor(scene.vertices), torch.tensor(scene.template.faces))
+    return FitResult(gaussians, splats, progress, quality, images, task.heads)
+
+
+def choose_device(name: str) -> str:
+    """ "cpu" or "cuda" for "auto", "cpu" or "cuda".
+
+    Raises:
+        InputError: CUDA where there is none.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("option device", expected="a CUDA device that torch can use", received="none")
+    return name
+
+
+class FitTask:
+    """Parameters and optimiser of a reference fit, as `run_training` wants them."""
+
+    def __init__(
+        self,
+        scene: FitScene,
+        config: FitConfig,
+        device: str = "cpu",
+        preview: Callable[[Mapping[str, np.ndarray]], None] = lambda images: None,
+    ) -> None:
+        self.scene, self.config, self.preview = scene, config, preview
+        template, mesh = scene.template, scene.template.mesh.with_vertices(scene.vertices)
+        faces = torch.tensor(template.faces, device=device)
+        self.frames = triangle_frames(torch.tensor(scene.vertices, dtype=torch.float32, device=device), faces)
+        start = sample_on_mesh(template, config.sampling).to(device=device)
+        placed = world_from_frames(start, self.frames)
+        dc, seen = colors_from_views(
+            placed.means.double().cpu().numpy(), placed.normals.double().cpu().numpy(), start.dc, mesh=mesh,
+            views=scene.train,
+        )  # fmt: skip
+        self.seen_share = float(seen.mean())
+        self.start = replace(start, dc=dc)
+        self.parameters = {name: getattr(self.start, name).clone().requires_grad_() for name in LEARNED}
+        self.optimiser = torch.optim.Adam(
+            [{"params": [self.parameters[name]], "lr": getattr(config.rates, name)} for name in LEARNED],
+            betas=(0.9, 0.99), eps=1e-15, fused=True,
+        )  # fmt: skip
+        self.train = [view.cropped(config.margin).to(device) for view in scene.train]
+        self.held_out = [view.to(device) for view in scene.held_out]
+        self.background = torch.tensor(scene.background, dtype=torch.float32, device=device)
+        corners = scene.vertices[np.unique(template.faces[_head(template)])]
+        self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
+
+    def gaussians(self) -> BoundGaussians:
+        """The Gaussians as they stand, without gradients."""
+        return replace(self.start, **{name: value.detach().clone() for name, value in self.parameters.items()})
+
+    def render(self, view: View) -> tuple[Tensor, Tensor]:
+        """(H, W, 3) image and (H, W) opacity of a view, with gradients to the parameters."""
+        bound = replace(self.start, **self.parameters)
+        world = world_from_frames(bound, self.frames)
+        return self.draw(world, self.colors(bound, world, view), view)
+
+    def colors(self, bound: BoundGaussians, world: WorldGaussians, view: View) -> Tensor:
+        """(1, N, 3) as the camera of a view sees them; directions count as constants."""
+        return view_colors(bound, self.frames, world.means.detach(), view.position[None])
+
+    def draw(self, world: WorldGaussians, colors: Tensor, view: View) -> tuple[Tensor, Tensor]:
+        """Rasterise; parameters are checked for NaN once a step, not here."""
+        image, alpha, _ = rasterize(
+            world.means, world.quats, world.scales, world.opacities, colors, view.viewmat[None], view.K[None],
+            view.camera.width, view.camera.height, background=self.background, eps2d=self.config.eps2d, check=False,
+        )  # fmt: skip
+        return image[0], alpha[0, ..., 0]
+
+    def loss(self, view: View, image: Tensor, alpha: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """The loss of a rendered view, and its terms as numbers."""
+        config, real = self.config, view.composited(self.background)
+        bound = replace(self.start, **self.parameters)
+        l1 = (image - real).abs().mean()
+        similarity = ssim(image, real)
+        total = (1.0 - config.dssim) * l1 + config.dssim * (1.0 - similarity)
+        if config.alpha:
+            total = total + config.alpha * (alpha - view.opacity()).abs().mean()
+        total = total + config.scale_penalty * scale_penalty(bound)
+        total = total + config.offset_penalty * offset_penalty(bound, self.frames)
+        square = (image.detach().clamp(0.0, 1.0) - real).square().mean()
+        terms = {"loss": total.item(), "l1": l1.item(), "ssim": similarity.item(), "psnr_crop": decibels(square.item())}
+        return total, terms
+
+    def step(self, iteration: int) -> Mapping[str, Any]:
+        """One view, one step of Adam."""
+        view = self.train[self.view_index(iteration)]
+        share = self.config.rates.final ** (iteration / self.config.iterations)
+        for group, name in zip(self.optimiser.param_groups, LEARNED, strict=True):
+            group["lr"] = getattr(self.config.rates, name) * share
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, terms = self.loss(view, *self.render(view))
+        loss.backward()
+        gradients = [value.grad for value in self.parameters.values() if value.grad is not None]
+        require_finite((loss, *gradients), iteration=iteration, view=view.name)
+        self.optimiser.step()
+        return {**terms, "view": view.name}
+
+    def view_index(self, iteration: int) -> int:
+        """Every view once an epoch, in an order that the seed and the epoch alone decide."""
+        epoch, place = divmod(iteration, len(self.train))
+        return int(np.random.default_rng([self.config.seed, epoch]).permutation(len(self.train))[place])
+
+    def measure(self, views: Sequence[View]) -> tuple[dict[str, ViewQuality], dict[str, np.ndarray]]:
+        """Figures and rendered uint8 images of whole views."""
+        quality, images = {}, {}
+        with torch.no_grad():
+            for view in views:
+                view = view.to(self.background.device)
+                image, alpha = self.render(view)
+                quality[view.name] = view_quality(view, image, alpha, self.background, head=self.heads[view.name])
+                images[view.name] = eight_bit(image).numpy()
+        return quality, images
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Figures of the held-out views; of the training views where none is held out."""
+        quality, images = self.measure(self.held_out or self.scene.train)
+        self.preview(images)
+        views = {name: asdict(q) for name, q in quality.items()}
+        return {"held_out": bool(self.held_out), "mean": mean_quality(quality), "views": views}
+
+    def state(self) -> Mapping[str, Tensor]:
+        """Parameters and Adam's moments."""
+        tensors = dict(self.parameters)
+        for name, value in self.parameters.items():
+            for key, moment in self.optimiser.state.get(value, {}).items():
+                tensors[f"adam.{key}.{name}"] = moment
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `state` gave."""
+        with torch.no_grad():
+            for name, value in self.parameters.items():
+                value.copy_(tensors[name])
+                moments = {key: tensors[f"adam.{key}.{name}"] for key in MOMENTS if f"adam.{key}.{name}" in tensors}
+                self.optimiser.state[value] = {key: moment.to(value.device) for key, moment in moments.items()}
+
+
+def _head(template: Template) -> np.ndarray:
+    """(F,) bool faces of the head, or all of a body without one."""
+    return head_faces(template) if "head" in template.joint_names else np.ones(len(template.faces), dtype=bool)
+
+
+def head_box(points: np.ndarray, camera: Camera) -> Box | None:
+    """x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing of it is in the image."""
+    x, y, depth = camera.screen_from_world(points).T[:3]
+    if not (depth > 0).all():
+        return None
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    margin = HEAD_MARGIN * (high - low)
+    x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + margin), (camera.width, camera.height)).astype(int)
+    return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None

@@ -1,0 +1,106 @@
+"""One frame of a capture as views to train on: composited colour, opacity, and the camera of the part that matters."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from smplxpp.capture import Capture
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import GeometryWarning, InputError
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera's image of one frame, on the CPU or a GPU, in 8 bits until it is used.
+
+    Attributes:
+        camera: of these pixels.
+        foreground: (H, W, 3) uint8 sRGB times opacity. alpha: (H, W) uint8 opacity of the person.
+    """
+
+    camera: Camera
+    foreground: Tensor
+    alpha: Tensor
+
+    @property
+    def name(self) -> str:
+        return self.camera.name
+
+    @cached_property
+    def viewmat(self) -> Tensor:
+        """(4, 4) float32 camera from world."""
+        return torch.tensor(self.camera.cam_from_world, dtype=torch.float32, device=self.alpha.device)
+
+    @cached_property
+    def K(self) -> Tensor:
+        """(3, 3) float32 intrinsics in pixels."""
+        return torch.tensor(self.camera.K, dtype=torch.float32, device=self.alpha.device)
+
+    @cached_property
+    def position(self) -> Tensor:
+        """(3,) float32 centre of projection in the world."""
+        return torch.tensor(self.camera.position, dtype=torch.float32, device=self.alpha.device)
+
+    def opacity(self) -> Tensor:
+        """(H, W) float32 in [0, 1]."""
+        return self.alpha / 255.0
+
+    def composited(self, background: Tensor) -> Tensor:
+        """(H, W, 3) float32 sRGB in [0, 1]: `F + (1 - a) B` for a (3,) background B."""
+        return self.foreground / 255.0 + (1.0 - self.opacity())[..., None] * background
+
+    def photograph(self, background: Sequence[float]) -> np.ndarray:
+        """(H, W, 3) uint8, composited, to look at."""
+        return (self.composited(torch.tensor(background)) * 255.0).round().to(torch.uint8).numpy()
+
+    def cropped(self, margin: int) -> View:
+        """Only the silhouette's bounding box and `margin` pixels around it; the principal point moves with it.
+
+        Rasterising and comparing nothing but the person is what makes a step cheap.
+        """
+        rows, columns = (torch.nonzero(self.alpha.any(dim)).flatten() for dim in (1, 0))
+        if not len(rows):
+            return self
+        top, bottom = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + margin + 1, self.camera.height)
+        left, right = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + margin + 1, self.camera.width)
+        K = self.camera.K.copy()
+        K[:2, 2] -= (left, top)
+        camera = replace(self.camera, K=K, width=right - left, height=bottom - top)
+        part = (slice(top, bottom), slice(left, right))
+        return View(camera, self.foreground[part].contiguous(), self.alpha[part].contiguous())
+
+    def to(self, device: torch.device | str) -> View:
+        """The same view on another device."""
+        return View(self.camera, self.foreground.to(device), self.alpha.to(device))
+
+
+def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[View]:
+    """The whole images of a frame, composited as the capture says; cameras without an image or a person are left out.
+
+    Raises:
+        InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
+    """
+    views = []
+    for name in cameras:
+        if name in capture.cameras and capture.file(name, frame) is None:
+            warnings.warn(f"camera {name}: no image of frame {frame}; it is left out", GeometryWarning, stacklevel=2)
+            continue
+        if name not in capture.cameras:
+            raise InputError(
+                f"camera of capture {capture.name}", expected=f"one of {', '.join(capture.cameras)}", received=name
+            )
+        foreground, alpha = capture.foreground(name, frame)
+        if not alpha.any():
+            warnings.warn(
+                f"camera {name}: nobody in the mask of frame {frame}; it is left out", GeometryWarning, stacklevel=2
+            )
+            continue
+        views.append(View(capture.cameras[name], torch.tensor(np.array(foreground)), torch.tensor(np.array(alpha))))
+    return views

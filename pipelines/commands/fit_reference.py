@@ -1,0 +1,165 @@
+"""`smplxpp fit-reference`: a template and one frame's photographs in; Gaussians on it, figures and a report out."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from pipelines.commands.options import OptionalInt, OptionalPath
+from smplxpp.core.artifact import StageRecord
+from smplxpp.core.errors import InputError, MissingExtraError
+
+if TYPE_CHECKING:
+    from avatar.training import FitConfig
+    from avatar.training import Progress as FitProgress
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FitReference:
+    """Options of `smplxpp fit-reference`. The same command goes on with a fit that was interrupted."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `smplxpp build` wrote; the fit goes into it as 70_bind."""
+    capture: Path
+    """Folder of the capture: cameras, images, masks and body parameters of the frame."""
+    frame: int = 0
+    """Frame to fit."""
+    params: OptionalPath = None
+    """Stacked body parameters to take instead of the capture's own, the same as for the build."""
+    body: OptionalPath = None
+    """SMPL-X-layout body file that the parameters are for; the open body by default."""
+    preset: Literal["quick", "default", "paper"] = "default"
+    """quick: 60k Gaussians, 400 iterations, to see whether all fits together; default: 150k and 3,000;
+    paper: 270k and 10,000."""
+    iterations: OptionalInt = None
+    """Iterations, in the place of the preset's; each renders one view."""
+    gaussians: OptionalInt = None
+    """Number of Gaussians, in the place of the preset's."""
+    hold_out: tuple[str, ...] = ()
+    """Cameras to keep from training and to measure on; by default those that the capture holds out."""
+    scale: float = 1.0
+    """Size of the images to work on, 1 for every pixel."""
+    max_minutes: float = math.inf
+    """Stop after as many minutes of iterations and write what there is; the same command then goes on."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where it is."""
+    seed: int = 0
+    """Of the Gaussians' places and of the views' order."""
+    force: bool = False
+    """Fit anew even if the fit stands."""
+    no_report: bool = False
+    """Leave report.html as it is."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Fit, write the report, print the figures."""
+        for package in ("torch", "safetensors"):
+            if find_spec(package) is None:
+                raise MissingExtraError(package, extra="avatar", purpose="fitting Gaussians")
+        from avatar.training import choose_device
+        from pipelines.build_report import rewrite_report
+        from pipelines.fit_stage import FitInputs, fit
+
+        inputs = FitInputs(self.capture, self.frame, self.params, self.body, self.hold_out, self.scale)
+        if not self.max_minutes > 0:
+            raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
+        config = self.config()
+        with _progress(config.iterations, enabled=not self.json) as progress:
+            record = fit(
+                self.run_folder, inputs, config, device=choose_device(self.device),
+                max_seconds=60.0 * self.max_minutes, force=self.force, progress=progress,
+            )  # fmt: skip
+        report = self.run_folder / "report.html"
+        if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
+            log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
+        if not self.json:
+            _print(record, report)
+        numbers = record.manifest["numbers"]
+        return {**numbers, "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
+
+    def config(self) -> FitConfig:
+        """The preset with the options' changes.
+
+        Raises:
+            InputError: numbers out of range.
+        """
+        from dataclasses import replace
+
+        from avatar.training import PRESETS
+
+        config = PRESETS[self.preset]
+        count = config.sampling.count if self.gaussians is None else self.gaussians
+        iterations = config.iterations if self.iterations is None else self.iterations
+        for name, value, least in (("gaussians", count, 1), ("iterations", iterations, 1), ("seed", self.seed, 0)):
+            if value < least:
+                raise InputError(f"option {name}", expected=f"a number, at least {least}", received=str(value))
+        sampling = replace(config.sampling, count=count, seed=self.seed)
+        return replace(config, sampling=sampling, iterations=iterations, seed=self.seed)
+
+
+@contextmanager
+def _progress(total: int, *, enabled: bool) -> Iterator[Callable[[FitProgress], None]]:
+    """A bar with loss, the held-out views' PSNR, speed and the time that is left."""
+    columns = (
+        TextColumn("fit"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    quality: dict[str, Any] = {}
+    with Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0) as bar:
+        task = bar.add_task("fit", total=total, figures="starting")
+
+        def show(state: FitProgress) -> None:
+            if state.evaluation is not None:
+                quality.update(state.evaluation["mean"], held_out=state.evaluation["held_out"])
+            figures = [f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}"]
+            if state.metrics:
+                figures = [f"loss {state.metrics['loss']:.4f}", *figures, f"{state.rate:.1f} it/s"]
+            bar.update(task, completed=state.iteration, figures="  ".join(figures))
+
+        yield show
+
+
+def _print(record: StageRecord, report: Path) -> None:
+    console = Console()
+    numbers = record.manifest["numbers"]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("camera")
+    for name in ("PSNR person", "PSNR image", "SSIM", "PSNR head"):
+        table.add_column(name, justify="right")
+    keys = ("psnr", "psnr_image", "ssim", "psnr_head")
+
+    def add(name: str, figures: dict[str, Any], **style: Any) -> None:
+        cells = [f"{figures[key]:.4f}" if key == "ssim" else "-" if figures.get(key) is None else f"{figures[key]:.2f}"
+                 for key in keys]  # fmt: skip
+        table.add_row(name, *cells, **style)
+
+    for name, figures in numbers["held_out"].items():
+        add(name, figures)
+    for which, label in (("held_out", "mean, held out"), ("train", "mean, training")):
+        if which in numbers["mean"]:
+            add(label, numbers["mean"][which], style="bold" if which == "held_out" else "dim")
+    console.print(table)
+    done, total = numbers["iterations_done"], numbers["iterations"]
+    state = "finished" if numbers["finished"] else "stopped; the same command goes on"
+    console.print(
+        f"{numbers['gaussians']:,} Gaussians, {done:,} of {total:,} iterations in {numbers['seconds_of_steps']:.1f} s "
+        f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}"
+    )
+    for name, path in (("splats", record.folder / "splats.ply"), ("views", record.folder / "previews"),
+                       ("report", report)):  # fmt: skip
+        if path.exists():
+            console.print(f"{name}  {path}", soft_wrap=True, highlight=False)
