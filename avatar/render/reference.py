@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
 
-BLOCK = 32
+BLOCK = 16
 """Side in pixels of the square blocks that are blended at once."""
 FRUSTUM_MARGIN = 0.3
 """The Jacobian of the projection is taken no farther outside the image than this share of half its width and height."""

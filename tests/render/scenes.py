@@ -96,14 +96,15 @@ def random_scene(
     channels: int = 4,
     cameras: int = 1,
     sigma: float = 0.06,
+    spread: float = 0.4,
     features_per_camera: bool = False,
 ) -> Scene:
-    """A cloud about a metre across, 3 m before cameras that stand around it, some of it outside the images or behind.
+    """A cloud of Gaussians (`sigma` and `spread` in metres), 3 m before cameras around it; some are behind or outside.
 
     No alpha, transmittance or order of two depths is near a threshold: every rounding gives the same picture.
     """
     rng = np.random.default_rng(seed)
-    means = rng.normal(0, 0.4, (count, 3))
+    means = rng.normal(0, spread, (count, 3))
     means[: count // 20] *= 15
     angles = 0.4 + np.arange(cameras) * 1.1
     eyes = 3 * np.stack([np.sin(angles), 0.2 * np.cos(3 * angles), np.cos(angles)], -1)

@@ -119,6 +119,7 @@ def test_shared_features_and_background_are_those_of_every_camera(backend, scene
         (0, {"cameras": 2}),
         (1, {"count": 250, "sigma": 0.15, "channels": 10}),
         (2, {"cameras": 2, "features_per_camera": True, "channels": 1}),
+        (4, {"sigma": 0.4, "spread": 2.0, "count": 80}),
         (3, {"count": 400, "sigma": 0.01, "channels": 37, "width": 70}),
     ],
 )
@@ -146,6 +147,7 @@ def test_fast_backends_equal_the_reference(backend, seed, options, depth):
         (0, {"cameras": 2}),
         (1, {"count": 250, "sigma": 0.15, "channels": 10}),
         (2, {"cameras": 2, "features_per_camera": True, "channels": 1}),
+        (4, {"sigma": 0.4, "spread": 2.0, "count": 80}),
     ],
 )
 def test_fast_gradients_equal_those_of_the_reference(backend, seed, options):

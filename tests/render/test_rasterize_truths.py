@@ -63,6 +63,19 @@ def test_a_gaussian_beside_the_axis_is_sheared_by_the_perspective(backend):
     np.testing.assert_allclose(meta.means2d[0, 0].cpu(), [4.5 + FOCAL * slope, 4.5], atol=1e-5)
 
 
+def test_far_beside_the_image_the_perspective_is_that_of_its_widened_border(backend):
+    """Slope 0.6, where the image ends at 4.5 / 20 and its widened frustum at 1.3 times that: 0.2925."""
+    depth, scale, limit = 2.0, 0.5, 1.3 * 4.5 / FOCAL
+    scene = facing_scene([depth], [0.9], scale=scale)
+    scene = scene.replace(means=torch.tensor([[0.6 * depth, 0, depth]], dtype=torch.float64))
+    _, alpha, _ = draw(scene, backend)
+    variance = (FOCAL * scale / depth) ** 2
+    offset = np.arange(9) + 0.5 - (4.5 + FOCAL * 0.6)
+    across = np.exp(-(offset**2) / (2 * (variance * (1 + limit**2) + BLUR)))
+    assert_image(alpha[0, 4, :, 0], 0.9 * np.where(0.9 * across >= 1 / 255, across, 0), backend)
+    assert alpha[0, 4, 8] > 0.1
+
+
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1]])
 def test_gaussians_are_blended_nearest_first(backend, order):
     scene = facing_scene([2.0, 3.0, 4.0], [0.5, 0.6, 0.7]).kept(torch.tensor(order))

@@ -24,6 +24,7 @@ def arguments(scene: Scene) -> tuple:
         (1, {"count": 250, "sigma": 0.15, "channels": 2}),
         (2, {"cameras": 3, "count": 60, "features_per_camera": True}),
         (3, {"width": BLOCK + 1, "height": 5, "channels": 1}),
+        (4, {"sigma": 0.4, "spread": 2.0, "count": 80}),
     ],
 )
 def test_equals_the_scalar_implementation(seed, options):
