@@ -2,6 +2,7 @@
 
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.capture import Capture
+from smplxpp.capture.problems import find_problems
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.reference import ReferenceFrame, find_reference
 from smplxpp.capture.registry import FORMATS, detect_format, open_capture
@@ -14,6 +15,7 @@ __all__ = [
     "ReferenceFrame",
     "Splits",
     "detect_format",
+    "find_problems",
     "find_reference",
     "open_capture",
     "read_cameras",

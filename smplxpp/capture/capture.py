@@ -223,6 +223,11 @@ class Capture:
         splits = self.splits.restricted(list(recording.cameras), kept_frames)
         return replace(self, recording=recording, splits=splits, excluded=frozenset(excluded))
 
+    def reader(self, camera: str) -> ViewReader:
+        """Reads files of a camera into its window, past the cache."""
+        full, recording = self._full_camera(camera), self.recording
+        return ViewReader(full, self.windows[camera], recording.distortions.get(camera), recording.background)
+
     def _full_camera(self, name: str) -> Camera:
         if name not in self.recording.cameras:
             have = ", ".join(self.recording.cameras) or "no camera"
@@ -246,6 +251,4 @@ class Capture:
     def _cached(
         self, kind: str, camera: str, frame: int, make: Callable[[ViewReader], tuple[np.ndarray, ...]]
     ) -> tuple[np.ndarray, ...]:
-        recording, window = self.recording, self.windows[camera]
-        reader = ViewReader(self._full_camera(camera), window, recording.distortions.get(camera), recording.background)
-        return self.cache.get((kind, camera, frame, window), lambda: make(reader))
+        return self.cache.get((kind, camera, frame, self.windows[camera]), lambda: make(self.reader(camera)))

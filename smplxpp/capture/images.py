@@ -72,15 +72,14 @@ def _read(path: Path) -> Image:
     import PIL.Image
 
     try:
-        image = PIL.Image.open(path)
-        raw_mode = str(image.tile[0][3]) if image.tile else ""
-        image.load()
+        with PIL.Image.open(path) as image:
+            image.info["raw_mode"] = str(image.tile[0][3]) if image.tile else ""
+            image.load()
+            return image
     except FileNotFoundError:
         raise InputError(f"image file {path}", expected="an existing file", received="none") from None
     except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
         raise InputError(f"image file {path}", expected="a whole image", received=f"{error}", remedy=_REMEDY) from None
-    image.info["raw_mode"] = raw_mode
-    return image
 
 
 def _read_npy_labels(path: Path) -> np.ndarray:

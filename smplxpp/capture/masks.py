@@ -49,7 +49,7 @@ def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> di
     known = set(by_stem.values())
     found: dict[int, str] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
             continue
         own = path.stem
         if shared:

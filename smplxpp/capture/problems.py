@@ -1,0 +1,99 @@
+"""What is wrong with a capture's files, told before a training run finds out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from smplxpp.capture.capture import Capture
+from smplxpp.capture.recording import Problem
+from smplxpp.core.errors import InputError
+
+
+def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
+    """Everything that would stop a view or a frame from being used, each with its file.
+
+    Missing: cameras without images, frames that not every camera has, images without a mask where others have one,
+    frames without parameters. Unusable: parameters that cannot be read or hold NaN; with `decode` (which reads
+    every file) damaged images, masks, label and normal maps, ones of another size than the calibration's, and images
+    that are not on the declared background. `capture.without(problems)` leaves out what is named.
+
+    Args:
+        capture: as opened; its own `problems` come first.
+        decode: open every image file as well.
+    """
+    found = [*capture.problems, *_missing_images(capture), *_parameters(capture)]
+    found += _missing_masks(capture)
+    if decode:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):
+                found += problems
+    return list(dict.fromkeys(found))
+
+
+def _missing_images(capture: Capture) -> Iterator[Problem]:
+    names, table = list(capture.cameras), capture.presence()
+    for name, has in zip(names, table, strict=True):
+        if len(capture.frames) and not has.any():
+            yield Problem(f"camera {name}: calibrated, but without any image", name)
+    used = table.any(axis=1)
+    for column, frame in enumerate(capture.frames):
+        seen = [name for name, has in zip(names, table[:, column], strict=True) if has]
+        if len(seen) == 1 and used.sum() > 1:
+            yield Problem(f"frame {frame}: an image in camera {seen[0]} alone", None, frame)
+        elif seen:
+            for row in np.flatnonzero(used & ~table[:, column]):
+                yield Problem(f"camera {names[row]}: no image of frame {frame}", names[row], frame)
+
+
+def _missing_masks(capture: Capture) -> Iterator[Problem]:
+    images, masks = capture.presence(), capture.presence("mask")
+    if not masks.any():
+        if images.any():
+            yield Problem("no masks: give a folder of mattes, or make them with a matting model")
+        return
+    names = list(capture.cameras)
+    for row, column in np.argwhere(images & ~masks):
+        frame = capture.frames[column]
+        path = capture.file(names[row], frame)
+        yield Problem(f"image file {path}: no mask", names[row], frame)
+
+
+def _parameters(capture: Capture) -> Iterator[Problem]:
+    source = capture.recording.params
+    if source is None:
+        return
+    try:
+        known = set(source.frames().tolist())
+    except InputError as error:
+        yield Problem(str(error))
+        return
+    for frame in capture.frames:
+        if frame not in known:
+            yield Problem(f"frame {frame}: no body parameters", None, frame)
+            continue
+        try:
+            source.read(frame)
+        except InputError as error:
+            yield Problem(str(error), None, frame)
+
+
+def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:
+    reader = capture.reader(camera)
+    path = {kind: capture.file(camera, frame, kind) for kind in ("image", "mask", "label", "normal")}
+    try:
+        if path["mask"] is None:
+            reader.color(path["image"])
+        else:
+            reader.foreground(path["image"], path["mask"])
+    except InputError as error:
+        yield Problem(str(error), camera, frame)
+    for kind, read in (("label", reader.labels), ("normal", reader.normals)):
+        if path[kind] is not None:
+            try:
+                read(path[kind])
+            except InputError as error:
+                yield Problem(str(error), camera, frame)

@@ -1,0 +1,163 @@
+"""Masks made by other tools, and by the user's own matting model."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from smplxpp.capture import open_capture
+from smplxpp.core.errors import InputError
+from tests.capture.scene import make_scene
+from tests.capture.writers import write_simple
+
+
+@pytest.fixture
+def rig(tmp_path):
+    return write_simple(make_scene(), tmp_path / "rig")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "cut_out"),
+    [
+        ("{c}/{c}_rgb{f:06d}.png", False),
+        ("{c}/{c}_rgb{f:06d}_alpha.png", True),
+        ("{c}/{c}_rgb{f:06d}.birefnet.webp", False),
+        ("{c}/{f:06d}.png", True),
+        ("{c}/{c}_mask{f:06d}.png", False),
+        ("{c}_rgb{f:06d}.png", False),
+        ("{c}-{f:04d}-matte.png", False),
+    ],
+)
+def test_mattes_are_matched_to_images_by_name(rig, tmp_path, pattern, cut_out):
+    scene = make_scene()
+    for (camera, frame), mask in scene.masks.items():
+        path = tmp_path / "mattes" / pattern.format(c=camera, f=frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rgba = np.dstack([scene.photographs[camera, frame], mask])
+        Image.fromarray(rgba if cut_out else mask).save(path, lossless=True)
+    capture = open_capture(rig, masks=tmp_path / "mattes")
+    assert capture.presence("mask").all()
+    for (camera, frame), mask in scene.masks.items():
+        np.testing.assert_array_equal(capture.mask(camera, frame), mask)
+
+
+def test_a_camera_whose_name_begins_another_keeps_its_own_mattes(tmp_path):
+    scene = make_scene(names=("Cam1", "Cam10", "Cam2"))
+    rig = write_simple(scene, tmp_path / "rig")
+    (tmp_path / "mattes").mkdir()
+    for (camera, frame), mask in scene.masks.items():
+        Image.fromarray(mask).save(tmp_path / "mattes" / f"{camera}_{frame}.png")
+    capture = open_capture(rig, masks=tmp_path / "mattes")
+    for (camera, frame), mask in scene.masks.items():
+        np.testing.assert_array_equal(capture.mask(camera, frame), mask)
+
+
+def test_masks_given_replace_those_of_the_capture(rig, tmp_path):
+    (tmp_path / "mattes/A").mkdir(parents=True)
+    Image.new("L", (192, 256), 7).save(tmp_path / "mattes/A/000000.png")
+    capture = open_capture(rig, masks=tmp_path / "mattes")
+    assert (capture.mask("A", 0) == 7).all()
+    assert capture.mask("A", 1) is None and capture.mask("B", 0) is None
+
+
+def test_folders_without_a_matching_matte_are_refused(rig, tmp_path):
+    with pytest.raises(InputError, match="existing folder"):
+        open_capture(rig, masks=tmp_path / "nowhere")
+    (tmp_path / "mattes").mkdir()
+    Image.new("L", (192, 256)).save(tmp_path / "mattes/other.png")
+    with pytest.raises(InputError, match=r"A/A_rgb000000\.png.*other\.png"):
+        open_capture(rig, masks=tmp_path / "mattes")
+
+
+def test_sixteen_bit_masks_keep_their_range(rig):
+    path = rig / "masks/A/A_mask000000.png"
+    ramp = np.linspace(0, 65535, 192 * 256).reshape(256, 192).astype(np.uint16)
+    Image.fromarray(ramp).save(path)
+    mask = open_capture(rig).mask("A", 0)
+    np.testing.assert_allclose(mask, ramp / 257.0, atol=0.51)
+
+
+def model_file(path, *, side: int | str, logits: bool) -> None:
+    """A model that calls red things the person: the first channel, undone its normalisation, as matte or as logits."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    def constant(name, value):
+        return helper.make_node(
+            "Constant", [], [name], value=numpy_helper.from_array(np.array(value, dtype=np.float32), name)
+        )
+
+    nodes = [
+        constant("std", 0.229),
+        constant("mean", 0.485),
+        helper.make_node("Split", ["image"], ["r", "g", "b"], axis=1, num_outputs=3),
+        helper.make_node("Mul", ["r", "std"], ["scaled"]),
+        helper.make_node("Add", ["scaled", "mean"], ["red"]),
+    ]
+    if logits:
+        nodes += [
+            constant("steep", 40.0),
+            constant("half", 0.5),
+            helper.make_node("Sub", ["red", "half"], ["centred"]),
+            helper.make_node("Mul", ["centred", "steep"], ["matte"]),
+        ]
+    else:
+        nodes += [helper.make_node("Identity", ["red"], ["matte"])]
+    graph = helper.make_graph(
+        nodes,
+        "red",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, side, side])],
+        [helper.make_tensor_value_info("matte", TensorProto.FLOAT, [1, 1, side, side])],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), path)
+
+
+@pytest.mark.parametrize(("side", "logits"), [(64, False), ("side", True)])
+def test_a_users_model_writes_masks_in_our_layout(rig, tmp_path, side, logits):
+    pytest.importorskip("onnxruntime")
+    from smplxpp.capture.matting import MattingModel, write_mattes
+
+    model_file(tmp_path / "red.onnx", side=side, logits=logits)
+    picture = np.zeros((40, 30, 3), np.uint8)
+    picture[:, 15:, 0] = 255
+    matte = MattingModel(tmp_path / "red.onnx")(picture)
+    assert matte.shape == (40, 30) and matte.dtype == np.uint8
+    assert matte[:, :13].max() <= 2 and matte[:, 17:].min() >= 253
+
+    capture = open_capture(rig)
+    written = list(write_mattes(capture, MattingModel(tmp_path / "red.onnx"), tmp_path / "mattes"))
+    assert len(written) == 6 and written[0].name == "A_mask000000.png"
+    stamp = written[0].stat().st_mtime_ns
+    list(write_mattes(capture, MattingModel(tmp_path / "red.onnx"), tmp_path / "mattes"))
+    assert written[0].stat().st_mtime_ns == stamp
+    scene, matted = make_scene(), open_capture(rig, masks=tmp_path / "mattes")
+    if logits:  # the room is blue, the person is not
+        inside = matted.mask("A", 0) > 127
+        truth = scene.masks["A", 0] > 127
+        assert (inside & truth).sum() / (inside | truth).sum() > 0.95
+
+
+def test_what_is_no_matting_model_is_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    from smplxpp.capture.matting import MattingModel
+
+    with pytest.raises(InputError, match="existing ONNX file"):
+        MattingModel(tmp_path / "none.onnx")
+    (tmp_path / "broken.onnx").write_bytes(b"no")
+    with pytest.raises(InputError, match=r"broken\.onnx"):
+        MattingModel(tmp_path / "broken.onnx")
+
+
+def test_matting_without_onnxruntime_names_the_extra(tmp_path):
+    code = (
+        "import sys; sys.modules['onnxruntime'] = None\n"
+        "from smplxpp.capture.matting import MattingModel\n"
+        "try: MattingModel('x.onnx')\n"
+        "except ImportError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "smplxpp[matting]" in done.stdout
