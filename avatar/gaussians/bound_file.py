@@ -53,7 +53,9 @@ def load_bound(path: str | Path, *, faces: np.ndarray | None = None) -> BoundGau
         )
     try:
         bound = BoundGaussians(**tensors, face_count=int(metadata["face_count"]), topology=metadata["topology"])
-    except (TypeError, KeyError, AttributeError) as error:
+    except InputError as error:
+        raise InputError(f"{subject}: {error.subject}", expected=error.expected, received=error.received) from None
+    except (TypeError, KeyError, AttributeError, ValueError) as error:
         raise InputError(subject, expected="all tensors of bound Gaussians", received=str(error)) from None
     for name, value in bound.tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
