@@ -28,6 +28,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Build",
         "a scan, a body fit and labels in; an SMPLX++ template and a report out",
     ),
+    "fit-reference": (
+        "pipelines.commands.fit_reference",
+        "FitReference",
+        "a built template and one frame's photographs in; textured Gaussians on it and their figures out",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "animate": (
         "pipelines.commands.animate",
@@ -35,6 +40,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "show a template moving: MP4, GIF, PNG frames or an animated GLB",
     ),
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
+    "synth": ("pipelines.commands.synth", "Synth", "make a synthetic capture of a clothed person with moving cloth"),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }
 HELP = ("-h", "--help")

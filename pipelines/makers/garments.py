@@ -45,10 +45,14 @@ class DressForm:
 
 
 def smooth_noise(points: np.ndarray, *, scale: tuple[float, float, float], seed: int, waves: int = 24) -> np.ndarray:
-    """(N,) smooth random field of about unit size: a sum of seeded plane waves of the given scale (metres) an axis."""
+    """(N,) smooth random field of about unit size: a sum of seeded plane waves of the given scale (metres) an axis.
+
+    Computed in the points' own precision.
+    """
     rng = np.random.default_rng(seed)
-    frequency = rng.normal(size=(waves, 3)) / np.asarray(scale)
-    return np.sin(points @ frequency.T + rng.uniform(0, 2 * np.pi, waves)).sum(axis=1) / np.sqrt(waves / 2)
+    frequency = (rng.normal(size=(waves, 3)) / np.asarray(scale)).astype(points.dtype)
+    phase = rng.uniform(0, 2 * np.pi, waves).astype(points.dtype)
+    return np.sin(points @ frequency.T + phase).sum(axis=1) / points.dtype.type(np.sqrt(waves / 2))
 
 
 def ramp(x: np.ndarray, start: float, end: float) -> np.ndarray:

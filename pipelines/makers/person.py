@@ -34,7 +34,7 @@ class Person:
         vertex_label: (V,) indices into `LABEL_NAMES`; eyes, teeth and tongue are "other".
         betas: (20,) of the body.
         body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
-        brows, lips: (10, 3), (12, 3) landmarks on the T-pose, for the colours.
+        face: landmarks on the T-pose, for the colours.
     """
 
     tpose: TriangleMesh
@@ -44,8 +44,7 @@ class Person:
     vertex_label: np.ndarray
     betas: np.ndarray
     body: BodyModel
-    brows: np.ndarray
-    lips: np.ndarray
+    face: textures.FaceMarks
 
     def posed(self, params: BodyParams) -> np.ndarray:
         """(T, V, 3): linear blend skinning of every layer by the body's joints."""
@@ -64,7 +63,7 @@ class Person:
         for k, name in enumerate(PART_NAMES):
             own = part == k
             if name == "body":
-                out[own] = textures.skin_colors(points[own], self.brows, self.lips, seed=1)
+                out[own] = textures.skin_colors(points[own], self.face, seed=1)
                 own &= (label == _OTHER) & (np.linalg.norm(points - eye, axis=1) < 0.02)
                 out[own] = textures.eye_colors(points[own] - eye[own])
             elif name == "upper":
@@ -107,6 +106,10 @@ def make_person(base: BaseMesh, body: BodyModel, *, landmarks: np.ndarray, seed:
         vertex_label=vertex_label,
         betas=PERSON_BETAS,
         body=body,
-        brows=landmarks[:10],
-        lips=landmarks[31:43],
+        face=face_marks(landmarks),
     )
+
+
+def face_marks(landmarks: np.ndarray) -> textures.FaceMarks:
+    """From (51, 3) landmarks in dlib's order from 17."""
+    return textures.FaceMarks(brows=landmarks[:10], eyes=landmarks[19:31], lips=landmarks[31:43])

@@ -1,0 +1,90 @@
+"""Uniform light from all around, with the shadow that the person casts on herself: ambient occlusion a vertex.
+
+Depth images from many directions tell which vertices each part of the surroundings reaches, so the shading changes
+with the pose. No path tracing: light that bounces is estimated from the surface's own colour.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh, view_directions
+
+# The surroundings are brighter above than below, as a lit stage is.
+_SKY, _GROUND = 1.12, 0.78
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """Quality of the light.
+
+    Attributes:
+        directions: from which light comes.
+        resolution: of a direction's depth image, pixels a side.
+        lift: metres off the surface at which light is gathered, against the image's grain.
+        slack: metres by which a point may lie behind the depth image.
+    """
+
+    directions: int = 72
+    resolution: int = 384
+    lift: float = 0.006
+    slack: float = 0.004
+
+
+def vertex_light(mesh: TriangleMesh, config: LightConfig) -> np.ndarray:
+    """(2, N) irradiance over pi at each vertex, on its outer and its inner side; 1 is an open vertex's mean.
+
+    `E(n) = 1/pi integral of L(w) V(w) max(n . w, 0) dw`, with V from depth images along `w`.
+    """
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    radius = 0.51 * float(np.linalg.norm(high - low))
+    directions = view_directions(config.directions)
+    normals = mesh.vertex_normals
+    lifted = [mesh.vertices + side * config.lift * normals for side in (1.0, -1.0)]
+
+    def from_one(direction: np.ndarray) -> np.ndarray:
+        camera = Camera.orthographic_view(
+            center=0.5 * (low + high), direction=direction, half_extent=radius, size=config.resolution
+        )
+        depth = rasterize_mesh(mesh, camera, threads=1).depth
+        brightness = _GROUND + (_SKY - _GROUND) * 0.5 * (1.0 + direction[1])
+        facing = normals @ direction
+        out = np.zeros((2, mesh.vertex_count))
+        for k, cosine in enumerate((facing, -facing)):
+            lit = np.flatnonzero(cosine > 0.0)
+            out[k, lit] = brightness * cosine[lit] * _visible(camera, depth, lifted[k][lit], config.slack)
+        return out
+
+    with ThreadPoolExecutor(2) as pool:
+        total = sum(pool.map(from_one, directions), np.zeros((2, mesh.vertex_count)))
+    return total * (4.0 / config.directions)
+
+
+def bounced(light: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """Colour (P, 3) of surfaces of linear `albedo` (P, 3) in `light` (P,), with light that bounces among them.
+
+    What is not open sees surfaces of the same albedo and the same light: `E = a + (1 - a) albedo E`, so
+    `E = a / (1 - (1 - a) albedo)`, with `a` the open share.
+    """
+    albedo = np.minimum(albedo, 0.9)
+    share = np.minimum(light, 1.0)[:, None]
+    return albedo * light[:, None] / (1.0 - (1.0 - share) * albedo)
+
+
+def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray, slack: float) -> np.ndarray:
+    """(P,) share of the four pixels around each point, bilinear, whose depth does not hide it."""
+    x, y, z = camera.screen_from_world(points).T[:3]
+    x, y = x - 0.5, y - 0.5
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = x - column, y - row
+    flat, width = depth.ravel(), camera.width
+    index = row * width + column
+    front = z - slack
+    upper = (1 - fx) * (flat.take(index) > front) + fx * (flat.take(index + 1) > front)
+    lower = (1 - fx) * (flat.take(index + width) > front) + fx * (flat.take(index + width + 1) > front)
+    return (1 - fy) * upper + fy * lower
