@@ -1,0 +1,185 @@
+"""Structural similarity of images: a readable reference, and the fused kernel of the native library with gradients.
+
+SSIM (Wang et al. 2004) at a pixel, from Gaussian-weighted means over its 11x11 window (sigma 1.5):
+
+    SSIM = (2 mu_x mu_y + C1) (2 cov_xy + C2) / ((mu_x^2 + mu_y^2 + C1) (var_x + var_y + C2)),  C1 = 0.01^2, C2 = 0.03^2
+
+with biased variances, for images in [0, 1], each channel for itself. `padding="zero"` takes pixels outside of the image
+as 0, as the code of 3D Gaussian Splatting does; `"valid"` uses only windows that lie within the image.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from avatar.losses.checks import check_images, mean, total_weight
+from smplxpp.core.errors import InputError
+from smplxpp.native import native_library
+
+WINDOW = 11
+"""Pixels on a side of the window."""
+SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2
+_BORDER = {"zero": 0, "valid": WINDOW // 2}
+
+
+def ssim(x: Tensor, y: Tensor, *, mask: Tensor | None = None, padding: str = "zero") -> Tensor:
+    """Mean structural similarity of two images; 1 where they are equal.
+
+    float32 tensors on the CPU go through the fused kernel, everything else through `ssim_reference`. The kernel gives
+    the same bits at any number of threads.
+
+    Args:
+        x, y: (H, W, C) or (B, H, W, C), of one shape, in [0, 1]. Gradients flow to both where they ask for it.
+        mask: (H, W) or (B, H, W) weights >= 0: `sum(mask * SSIM) / (C sum(mask))`. Windows are not masked, so
+            composite both images on one background first. No gradient flows to the mask.
+        padding: "zero" or "valid".
+
+    Returns:
+        Scalar mean over pixels, channels and batch.
+
+    Raises:
+        InputError: shapes, types or devices that do not fit; a mask without weight; "valid" on images under 11 pixels.
+    """
+    if not _native(x):
+        return ssim_reference(x, y, mask=mask, padding=padding)
+    x, y, mask = _checked(x, y, mask, padding)
+    return _SsimMean.apply(x, y, mask, _BORDER[padding], torch.is_grad_enabled())
+
+
+def ssim_map(x: Tensor, y: Tensor, *, padding: str = "zero") -> Tensor:
+    """Structural similarity at every pixel and channel: the images' shape, or 10 pixels less each way for "valid".
+
+    Arguments and errors are those of `ssim`.
+    """
+    if not _native(x):
+        return ssim_map_reference(x, y, padding=padding)
+    batched = x.dim() == 4
+    x, y, _ = _checked(x, y, None, padding)
+    value = _SsimMap.apply(x, y, _BORDER[padding])
+    return value if batched else value[0]
+
+
+def ssim_reference(x: Tensor, y: Tensor, *, mask: Tensor | None = None, padding: str = "zero") -> Tensor:
+    """`ssim` in plain torch, in the images' own precision and on their device."""
+    value = ssim_map_reference(x, y, padding=padding)
+    check_images(x, y, mask)
+    return mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
+
+
+def ssim_map_reference(x: Tensor, y: Tensor, *, padding: str = "zero") -> Tensor:
+    """`ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
+    batched = x.dim() == 4
+    x, y, _ = _checked(x, y, None, padding)
+    C = x.shape[-1]
+    k = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    g = torch.exp(-(k**2) / (2 * SIGMA**2))
+    g = (g / g.sum()).to(x)
+    kernel = torch.outer(g, g).expand(C, 1, WINDOW, WINDOW)
+
+    def blur(v: Tensor) -> Tensor:
+        return F.conv2d(v, kernel, groups=C, padding=WINDOW // 2 if padding == "zero" else 0)
+
+    x, y = x.permute(0, 3, 1, 2), y.permute(0, 3, 1, 2)
+    mu_x, mu_y = blur(x), blur(y)
+    var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
+    value = (2 * mu_x * mu_y + C1) * (2 * cov + C2) / ((mu_x**2 + mu_y**2 + C1) * (var_x + var_y + C2))
+    value = value.permute(0, 2, 3, 1)
+    return value if batched else value[0]
+
+
+class _SsimMean(torch.autograd.Function):
+    """The kernel gives value and gradient in one sweep, so the backward pass only scales."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, y: Tensor, mask: Tensor | None, border: int, differentiate: bool) -> Tensor:
+        B, H, W, C = x.shape
+        if mask is None:
+            weight = B * (H - 2 * border) * (W - 2 * border)
+        else:
+            weight = total_weight(_inner(mask, border), x.shape).item()
+        want_x, want_y = (differentiate and wanted for wanted in ctx.needs_input_grad[:2])
+        value, _, grad_x, grad_y = _call(x, y, mask, border, scale=1.0 / (weight * C), grad_x=want_x, grad_y=want_y)
+        ctx.save_for_backward(grad_x, grad_y)
+        return torch.tensor(value, dtype=x.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        grad_x, grad_y = ctx.saved_tensors
+        return None if grad_x is None else grad_x * grad, None if grad_y is None else grad_y * grad, None, None, None
+
+
+class _SsimMap(torch.autograd.Function):
+    """The gradient of a map needs the gradient by it: the kernel runs again with that as its weights."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, y: Tensor, border: int) -> Tensor:
+        ctx.save_for_backward(x, y)
+        ctx.border = border
+        return _inner(_call(x, y, None, border, map_=True)[1], border)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, y = ctx.saved_tensors
+        b = ctx.border
+        weight = F.pad(grad, (0, 0, b, b, b, b)).contiguous()
+        want_x, want_y = ctx.needs_input_grad[:2]
+        _, _, grad_x, grad_y = _call(x, y, weight, b, grad_x=want_x, grad_y=want_y)
+        return grad_x, grad_y, None
+
+
+def _call(
+    x: Tensor, y: Tensor, weight: Tensor | None, border: int, *,
+    scale: float = 1.0, map_: bool = False, grad_x: bool = False, grad_y: bool = False,
+) -> tuple[float, Tensor | None, Tensor | None, Tensor | None]:  # fmt: skip
+    """The kernel: sum of scale * weight * SSIM, the map (B, H, W, C), the gradient of the sum by each image.
+
+    `weight` is (H, W), (B, H, W) or (B, H, W, C).
+    """
+    if grad_y and not grad_x:
+        value, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
+        return value, values, None, by_y
+    B, H, W, C = x.shape
+    values, by_x, by_y = (torch.empty_like(x) if wanted else None for wanted in (map_, grad_x, grad_y))
+    value = ctypes.c_double()
+
+    def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+        return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+    native_library().smplxpp_ssim(
+        pointer(x), pointer(y), pointer(weight),
+        C if weight is not None and weight.dim() == 4 else 1, int(weight is not None and weight.dim() > 2),
+        ctypes.c_float(scale), B, H, W, C, border,
+        ctypes.byref(value), pointer(values), pointer(by_x), pointer(by_y), torch.get_num_threads(),
+    )  # fmt: skip
+    return value.value, values, by_x, by_y
+
+
+def _native(x: Tensor) -> bool:
+    return x.device.type == "cpu" and x.dtype == torch.float32
+
+
+def _inner(value: Tensor, border: int) -> Tensor:
+    """Without the border of the image axes: those before the channels of a map (B, H, W, C), the last two of a mask."""
+    if not border:
+        return value
+    inside = slice(border, -border)
+    return value[..., inside, inside, :] if value.dim() == 4 else value[..., inside, inside]
+
+
+def _checked(x: Tensor, y: Tensor, mask: Tensor | None, padding: str) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Contiguous images with a batch axis, and the mask in their type."""
+    if padding not in _BORDER:
+        raise InputError("padding of SSIM", expected="'zero' or 'valid'", received=repr(padding))
+    check_images(x, y, mask, least=1 if padding == "zero" else WINDOW)
+    if mask is not None:
+        mask = mask.detach().to(x.dtype).contiguous()
+    x, y = (v.contiguous() if v.dim() == 4 else v.contiguous()[None] for v in (x, y))
+    return x, y, mask
