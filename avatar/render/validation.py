@@ -64,11 +64,14 @@ def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
     _check_shape(tensors, "opacities", (count,))
     cameras = _check_shape(tensors, "viewmats", ("C", 4, 4))["C"]
     _check_shape(tensors, "Ks", (cameras, 3, 3))
-    features = tensors["features"]
-    wanted = (count, "D") if features.ndim == 2 else (cameras, count, "D")
-    channels = _check_shape(tensors, "features", wanted)["D"]
-    if channels == 0:
-        raise InputError("features", expected="one channel or more", received="none", remedy="pass a column of ones")
+    received = tuple(tensors["features"].shape)
+    if received[:-1] not in ((count,), (cameras, count)) or received[-1] == 0:
+        raise InputError(
+            "features",
+            expected=f"shape ({count}, D) or ({cameras}, {count}, D), with D of 1 or more",
+            received=f"shape {received}",
+        )
+    channels = received[-1]
     if background is not None and background.shape not in ((channels,), (cameras, channels)):
         raise InputError(
             "background",
@@ -100,8 +103,7 @@ def _check_shape(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | st
         not isinstance(want, str) and want != got for want, got in zip(shape, received, strict=True)
     ):
         expected = ", ".join(str(size) for size in shape) + ("," if len(shape) == 1 else "")
-        alternative = " or (C, N, D)" if name == "features" and len(shape) == 2 else ""
-        raise InputError(name, expected=f"shape ({expected}){alternative}", received=f"shape {received}")
+        raise InputError(name, expected=f"shape ({expected})", received=f"shape {received}")
     return {want: got for want, got in zip(shape, received, strict=True) if isinstance(want, str)}
 
 
