@@ -1,0 +1,234 @@
+// Derivatives of the picture, back to front over each tile's list. With d_i = g . f_i at a pixel (g the gradient of the
+// picture there) and S_i = sum_{k > i} T_k alpha_k d_k + T_end (g . background - g_alpha),
+//   dL/df_i = T_i alpha_i g,    dL/dalpha_i = T_i d_i - S_i / (1 - alpha_i),
+// and T_i = T_{i+1} / (1 - alpha_i) walks back from the final transmittance. With v = alpha dL/dalpha (0 where alpha is
+// clamped) the sums over the pixels of v, v p, v q, v p^2, v p q, v q^2 hold all that the ellipse needs.
+//
+// Every thread owns a run of tiles, cut by the work that the forward pass measured, and adds into rows of its own: the
+// sums are the same, bit for bit, whenever the number of threads is.
+#include <cmath>
+#include <memory>
+
+#include "gaussian_tile.hpp"
+#include "parallel.hpp"
+
+namespace smplxpp::gaussian {
+
+namespace {
+
+struct Thread {
+    Chunk chunk;
+    float* row[CHUNK];
+    alignas(64) float transmittance[BLOCKS][LANES], rest[BLOCKS][LANES];  // T_{i+1} and S_i
+    alignas(64) int32_t stop[BLOCKS][LANES];
+    alignas(64) float weight[BLOCKS][LANES];
+    int32_t last[BLOCKS];   // entries of the list that reach a block
+    Buffer<float> gradient;  // (D or more, BLOCKS, LANES)
+};
+
+// First tile of each thread, so that all have about the same work; the last entry is the number of tiles.
+std::vector<int64_t> cut_tiles(const Workspace& w, int threads) {
+    constexpr int64_t COST_OF_TILE = 4;  // in visits
+    int64_t total = 0, sum = 0;
+    for (int64_t t = 0; t < w.tiles(); ++t) total += w.tile_work[t] + COST_OF_TILE;
+    std::vector<int64_t> cut(threads + 1, w.tiles());
+    cut[0] = 0;
+    int next = 1;
+    for (int64_t t = 0; t < w.tiles() && next < threads; ++t) {
+        sum += w.tile_work[t] + COST_OF_TILE;
+        while (next < threads && sum >= total / threads * next) cut[next++] = t + 1;
+    }
+    return cut;
+}
+
+// Which threads touch each visible Gaussian, from the tile rows of its box; returns the number of rows.
+int64_t assign_rows(int64_t count, Workspace& w, const std::vector<int64_t>& cut, int threads) {
+    w.owners.reserve(count);
+    std::vector<int> first_owner(w.tiles_y), last_owner(w.tiles_y);  // of a tile row
+    for (int y = 0; y < w.tiles_y; ++y) {
+        const int64_t first = (int64_t)y * w.tiles_x, last = first + w.tiles_x - 1;
+        first_owner[y] = (int)(std::upper_bound(cut.begin(), cut.end() - 1, first) - cut.begin()) - 1;
+        last_owner[y] = (int)(std::upper_bound(cut.begin(), cut.end() - 1, last) - cut.begin()) - 1;
+    }
+    std::vector<int64_t> extra(threads + 1, 0);
+    const auto each = [&](int t, auto&& work) {
+        for (int64_t k = w.visible * t / threads, end = w.visible * (t + 1) / threads; k < end; ++k) work((uint32_t)w.order[k]);
+    };
+    run_threads(threads, [&](int t) {
+        int64_t sum = 0;
+        each(t, [&](uint32_t g) {
+            const Ellipse& e = w.ellipses[g];
+            // A little more than the box that binning took.
+            const float y = e.pixel_y + e.rest_y, height = 1.0001f * std::sqrt(e.log_opacity - LOG2_ALPHA_MIN) / e.c + 1.0f;
+            const float limit = w.tiles_y - 1.0f;
+            const int top = (int)std::clamp((y - height) / TILE, 0.0f, limit), bottom = (int)std::clamp((y + height) / TILE, 0.0f, limit);
+            w.owners[g] = {0, (uint16_t)first_owner[top], (uint16_t)last_owner[bottom]};
+            sum += last_owner[bottom] - first_owner[top];
+        });
+        extra[t + 1] = sum;
+    });
+    extra[0] = count;
+    for (int t = 0; t < threads; ++t) extra[t + 1] += extra[t];
+    run_threads(threads, [&](int t) {
+        int64_t next = extra[t];
+        each(t, [&](uint32_t g) {
+            Workspace::Owners& o = w.owners[g];
+            o.extra = (uint32_t)next;
+            next += o.last - o.first;
+        });
+    });
+    return extra[threads];
+}
+
+// Gradients and state of a tile's pixels, by block and lane.
+void load_tile(const Scene& scene, const Camera& camera, const Workspace& w, Thread& t, int64_t tile, int64_t count,
+               const float* grad_image, const float* grad_alpha) {
+    const int D = scene.channels;
+    float* gradient = t.gradient.data();
+    for (int block = 0; block < BLOCKS; ++block) {
+        const BlockPlace place(w, tile, block);
+        t.last[block] = 0;
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int at = block * LANES + lane;
+            const int64_t kept = tile * BLOCKS * LANES + at;
+            const bool inside = place.inside(lane);
+            const int32_t stop = inside ? (int32_t)std::min<int64_t>(w.stop[kept], count) : 0;
+            float behind = 0.0f;
+            if (inside) {
+                const int64_t pixel = (int64_t)(place.y + lane / 4) * w.width + place.x + lane % 4;
+                if (grad_alpha) behind -= grad_alpha[pixel];
+                for (int j = 0; j < D; ++j) {
+                    const float g = grad_image ? grad_image[pixel * D + j] : 0.0f;
+                    gradient[j * BLOCKS * LANES + at] = g;
+                    if (camera.background) behind += g * camera.background[j];
+                }
+            } else {
+                for (int j = 0; j < D; ++j) gradient[j * BLOCKS * LANES + at] = 0.0f;
+            }
+            t.transmittance[block][lane] = w.transmittance[kept];
+            t.rest[block][lane] = w.transmittance[kept] * behind;
+            t.stop[block][lane] = stop;
+            t.last[block] = std::max(t.last[block], stop);
+        }
+    }
+}
+
+// Adds one Gaussian's sums over the blocks of `blocks` to its row. D channels ride in the first group of 16.
+template <int D, bool MORE>
+SMPLXPP_INLINE void unblend_row(const Scene& scene, Thread& t, int i, int32_t position, uint32_t gaussian, uint32_t blocks) {
+    constexpr int PLANE = BLOCKS * LANES;
+    const TileRow& row = t.chunk.rows[i];
+    const float* features = scene.features + (int64_t)gaussian * scene.channels;
+    const Floats threshold = broadcast(LOG2_ALPHA_MIN), alpha_max = broadcast(ALPHA_MAX), one = broadcast(1.0f);
+    const Ints index = broadcast(position);
+    Floats sum[LANES] = {};
+    for (uint32_t m = blocks; m; m &= m - 1) {
+        const int block = __builtin_ctz(m);
+        const float* gradient = t.gradient.data() + block * LANES;
+        const Exponent x(row, BlockPixels(block));
+        const Mask active = (x.e >= threshold) & (load(t.stop[block]) > index);
+        const Floats raw = exp2(x.e), alpha = where(active, min(raw, alpha_max));
+        const Floats inverse = reciprocal(one - alpha), T = load(t.transmittance[block]) * inverse, w = alpha * T;
+        store(t.transmittance[block], T);
+        Floats d = zeros();
+        for (int j = 0; j < D; ++j) {
+            const Floats g = load(gradient + j * PLANE);
+            d = fma(g, broadcast(row.channels[j]), d);
+            sum[MOMENTS + j] = fma(w, g, sum[MOMENTS + j]);
+        }
+        if (MORE) {
+            for (int j = D; j < scene.channels; ++j) d = fma(load(gradient + j * PLANE), broadcast(features[j]), d);
+            store(t.weight[block], w);
+        }
+        const Floats S = load(t.rest[block]);
+        store(t.rest[block], fma(w, d, S));
+        const Floats v = where(alpha_max > raw, alpha * fnma(S, inverse, T * d)), vp = v * x.p, vq = v * x.q;
+        sum[0] = sum[0] + v;
+        sum[1] = sum[1] + vp;
+        sum[2] = sum[2] + vq;
+        sum[3] = fma(vp, x.p, sum[3]);
+        sum[4] = fma(vp, x.q, sum[4]);
+        sum[5] = fma(vq, x.q, sum[5]);
+    }
+    add_lane_sums(sum, t.row[i]);
+    if (MORE) {
+        for (int first = D, group = 1; first < scene.channels; first += LANES, ++group) {
+            const int n = std::min(LANES, scene.channels - first);
+            Floats more[LANES] = {};
+            for (uint32_t m = blocks; m; m &= m - 1) {
+                const int block = __builtin_ctz(m);
+                const float* gradient = t.gradient.data() + block * LANES + first * PLANE;
+                const Floats w = load(t.weight[block]);
+                for (int j = 0; j < n; ++j) more[j] = fma(w, load(gradient + j * PLANE), more[j]);
+            }
+            add_lane_sums(more, t.row[i] + group * LANES);
+        }
+    }
+}
+
+template <int D, bool MORE>
+void unblend_tile(const Scene& scene, const Camera& camera, const Workspace& w, Thread& t, int thread, int64_t tile,
+                  const float* grad_image, const float* grad_alpha) {
+    const int64_t begin = w.tile_start[tile], count = w.tile_start[tile + 1] - begin;
+    if (count == 0) return;
+    load_tile(scene, camera, w, t, tile, count, grad_image, grad_alpha);
+    const int32_t needed = *std::max_element(t.last, t.last + BLOCKS);
+    const float x = (float)((tile % w.tiles_x) * TILE + TILE / 2), y = (float)((tile / w.tiles_x) * TILE + TILE / 2);
+    const int64_t stride = (int64_t)LANES * row_groups(scene.channels);
+    for (int32_t base = (needed - 1) / CHUNK * CHUNK; base >= 0 && needed; base -= CHUNK) {
+        const Hit* hits = w.hits.data() + begin + base;
+        const int n = std::min(CHUNK, needed - base);
+        t.chunk.gather(scene, w, hits, n, n, x, y);
+        for (int i = 0; i < n; ++i) {
+            t.row[i] = w.rows.data() + w.row_of(hits[i].gaussian, thread) * stride;
+            __builtin_prefetch(t.row[i], 1);
+        }
+        uint32_t live = 0;
+        for (int i = n - 1; i >= 0; --i) {
+            // Blocks whose pixels had all stopped earlier drop out; looking every 16 entries is enough, since the lanes
+            // know their own end.
+            if (i == n - 1 || i % 16 == 15) {
+                live = 0;
+                for (int block = 0; block < BLOCKS; ++block) live |= (uint32_t)(t.last[block] > base + i / 16 * 16) << block;
+            }
+            const uint32_t blocks = hits[i].blocks & live;
+            if (blocks) unblend_row<D, MORE>(scene, t, i, base + i, hits[i].gaussian, blocks);
+        }
+    }
+}
+
+template <int D, bool MORE>
+void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const float* grad_image, const float* grad_alpha,
+                   int threads) {
+    const std::vector<int64_t> cut = cut_tiles(w, threads);
+    const int64_t rows = assign_rows(scene.count, w, cut, threads), stride = (int64_t)LANES * row_groups(scene.channels);
+    w.rows.reserve(rows * stride);
+    Failure failure;
+    run_threads(threads, [&](int t) {
+        const int64_t begin = rows * t / threads, end = rows * (t + 1) / threads;
+        std::fill(w.rows.data() + begin * stride, w.rows.data() + end * stride, 0.0f);
+    });
+    run_threads(threads, [&](int t) { failure.guard([&] {
+        auto thread = std::make_unique<Thread>();
+        thread->gradient.reserve((int64_t)BLOCKS * LANES * std::max<int64_t>(scene.channels, D));
+        std::fill(thread->gradient.data(), thread->gradient.data() + thread->gradient.capacity(), 0.0f);
+        for (int64_t tile = cut[t]; tile < cut[t + 1]; ++tile) {
+            unblend_tile<D, MORE>(scene, camera, w, *thread, t, tile, grad_image, grad_alpha);
+        }
+    }); });
+    failure.rethrow();
+}
+
+}  // namespace
+
+void unblend(const Scene& scene, const Camera& camera, Workspace& w, const float* grad_image, const float* grad_alpha,
+             int threads) {
+    const int D = scene.channels;
+    if (D <= 3) return unblend_tiles<3, false>(scene, camera, w, grad_image, grad_alpha, threads);
+    if (D <= 4) return unblend_tiles<4, false>(scene, camera, w, grad_image, grad_alpha, threads);
+    if (D <= 7) return unblend_tiles<7, false>(scene, camera, w, grad_image, grad_alpha, threads);
+    if (D <= ROW_CHANNELS) return unblend_tiles<ROW_CHANNELS, false>(scene, camera, w, grad_image, grad_alpha, threads);
+    return unblend_tiles<ROW_CHANNELS, true>(scene, camera, w, grad_image, grad_alpha, threads);
+}
+
+}  // namespace smplxpp::gaussian
