@@ -69,7 +69,11 @@ class ViewReader:
         image = self._sized(read_color(image_path), image_path)
         opacity = self._sized(read_alpha(mask_path), mask_path)
         if self.background is None:
-            image = PIL.Image.composite(image, PIL.Image.new("RGB", image.size), opacity)
+            product = PIL.Image.new("RGB", image.size)
+            box = opacity.getbbox()
+            if box is not None:
+                product.paste(image.crop(box), box, mask=opacity.crop(box))
+            image = product
         else:
             self._check_background(image, opacity, image_path)
             if any(self.background):
@@ -86,7 +90,7 @@ class ViewReader:
 
     def _shown(self, image: Image, *, labels: bool = False) -> np.ndarray:
         if self.distortion is None:
-            return np.array(self.window.apply(image, labels=labels))
+            return np.asarray(self.window.apply(image, labels=labels))
         # Where the window shrinks, the distorted image is shrunk first, as a whole: the lens works on the plane z = 1
         # and does not mind, and the bilinear look-up then skips no pixel.
         whole = Window.full(self.camera)

@@ -78,6 +78,8 @@ class Window:
         whole_box = all(edge == int(edge) for edge in self.box)
         if whole_box and self.scale == (1.0, 1.0):
             return image.crop(tuple(int(edge) for edge in self.box))
-        area = whole_box and all((1.0 / scale).is_integer() for scale in self.scale)
-        resample = Resampling.NEAREST if labels else Resampling.BOX if area else Resampling.LANCZOS
+        factors = [1.0 / scale for scale in self.scale]
+        if whole_box and not labels and all(factor.is_integer() for factor in factors):
+            return image.reduce((int(factors[0]), int(factors[1])), box=tuple(int(edge) for edge in self.box))
+        resample = Resampling.NEAREST if labels else Resampling.LANCZOS
         return image.resize((self.width, self.height), resample, box=self.box)

@@ -101,3 +101,18 @@ def test_true_meshes_are_given_where_the_set_has_them(written):
         np.testing.assert_allclose(capture.truth_mesh(12).vertices, scene.meshes[1].vertices, atol=1e-6)
     else:
         assert capture.truth_mesh(0) is None
+
+
+def test_both_calibrations_of_the_ground_truth_capture_cast_the_same_rays(captures):
+    """Read as our layout (cameras.json) and as ActorsHQ (calibration.csv): corners and middle of every image."""
+    ours, theirs = (open_capture(captures / "woman_casual", format=name) for name in ("simple", "actorshq"))
+    assert ours.frames == theirs.frames and list(ours.cameras) == list(theirs.cameras)
+    for a, b in zip(ours.cameras.values(), theirs.cameras.values(), strict=True):
+        pixels = np.array([[x * a.width, y * a.height, 1.0] for x in (0, 0.5, 1) for y in (0, 0.5, 1)]).T
+        rays = []
+        for camera in (a, b):
+            directions = camera.cam_from_world[:3, :3].T @ np.linalg.solve(camera.K, pixels)
+            rays.append(
+                np.vstack([directions / np.linalg.norm(directions, axis=0), camera.position[:, None].repeat(9, 1)])
+            )
+        np.testing.assert_allclose(*rays, atol=1e-6)
