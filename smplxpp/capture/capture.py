@@ -161,11 +161,15 @@ class Capture:
             InputError: as `image` and `mask`; no mask; or images that are not on the colour the capture declares.
         """
         foreground, alpha = self.foreground(camera, frame)
-        out = foreground.astype(np.float32) / np.float32(255)
+        out = np.multiply(foreground, np.float32(1 / 255), dtype=np.float32)
         colour = np.asarray(background, dtype=np.float32).reshape(3)
         if colour.any():
-            out += (1.0 - alpha.astype(np.float32) / np.float32(255))[..., None] * colour
-        return np.clip(out, 0.0, 1.0, out=out)
+            transparent = 1.0 - alpha * np.float32(1 / 255)
+            for channel in range(3):
+                out[..., channel] += transparent * colour[channel]
+            # JPEG's own errors may have left the product brighter than its opacity.
+            np.minimum(out, 1.0, out=out)
+        return out
 
     def foreground(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """The person alone: (H, W, 3) uint8 colour times opacity, and (H, W) uint8 opacity; both read-only.
