@@ -26,13 +26,14 @@ class ControlPoints:
 
 
 def choose_control_points(
-    vertices: np.ndarray, groups: np.ndarray, *, count: int, neighbour_count: int = 4
+    vertices: np.ndarray, groups: np.ndarray, *, count: int, neighbour_count: int = 6
 ) -> ControlPoints:
     """Spread control points evenly over every group of vertices and tie each vertex to the nearest of its own group.
 
-    Farthest-point sampling, started at the vertex farthest from the group's centroid. Weights are those of embedded
-    deformation (Sumner et al. 2007, equation 5): `w_j ~ (1 - d_j / d_max)^2`, d_max the distance to the next nearest
-    control point. Groups (cloth over body, for example) do not mix, however close they lie.
+    Farthest-point sampling, started at the vertex farthest from the group's centroid. Weights are inverse distances
+    that fade to zero at the next nearest control point, `w_j ~ (d_max - d_j) / (d_max d_j)` (Shepard's method in Franke
+    and Little's local form): a control point keeps its own value. Groups (cloth over body, for example) do not mix,
+    however close they lie.
 
     Args:
         vertices: (V, 3) metres.
@@ -63,7 +64,7 @@ def choose_control_points(
         share = min(len(members), max(1, round(count * len(members) / len(vertices))))
         controls = members[_farthest_points(vertices[members], share)]
         used = min(neighbour_count, share)
-        nearest, w = _embedded_weights(vertices[members], vertices[controls], used)
+        nearest, w = _local_weights(vertices[members], vertices[controls], used)
         neighbours[members, :used] = before + nearest
         neighbours[members, used:] = before + nearest[:, :1]
         weights[members, :used] = w
@@ -84,15 +85,14 @@ def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     return picked
 
 
-def _embedded_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _local_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The `count` nearest controls of each point, and their weights."""
     asked = min(count + 1, len(controls))
     distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
+    distance = np.maximum(distance, 1e-9)
     # Where there is no next nearest control point, a distance twice the largest keeps every weight above zero.
-    limit = distance[:, -1] if asked > count else 2.0 * distance[:, -1]
-    closeness = 1.0 - distance[:, :count] / np.maximum(limit, 1e-12)[:, None]
-    weights = closeness**2
+    limit = (distance[:, -1] if asked > count else 2.0 * distance[:, -1])[:, None]
+    weights = (limit - distance[:, :count]) / (limit * distance[:, :count])
     # Equal distances all round (a point among symmetric controls) leave nothing to tell them apart.
-    flat = weights.sum(1) < 1e-12
-    weights[flat] = 1.0
+    weights[weights.sum(1) <= 0.0] = 1.0
     return nearest[:, :count], weights / weights.sum(1, keepdims=True)

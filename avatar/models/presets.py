@@ -12,26 +12,30 @@ from avatar.models.teacher import TeacherConfig
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """Teacher and student of a preset. The student is the paper's in all of them: it is small already."""
+    """Teacher and student of a preset."""
 
     teacher: TeacherConfig
-    field: FieldConfig = FieldConfig()
-    blend_shapes: BlendShapeConfig = BlendShapeConfig()
+    field: FieldConfig
+    blend_shapes: BlendShapeConfig
 
 
 _LEAN = {"networks": "shared", "style_layers": 1, "noise": False, "zero_output": True}
 
-NETWORK_PRESETS: dict[str, NetworkPreset] = {
-    "paper": NetworkPreset(TeacherConfig()),
-    "gpu": NetworkPreset(
-        TeacherConfig(in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True)
+_TEACHERS = {
+    "paper": TeacherConfig(),
+    "gpu": TeacherConfig(
+        in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
     ),
-    "cpu": NetworkPreset(
-        TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN)
+    "cpu": TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN),
+    "demo": TeacherConfig(
+        in_size=64, out_size=128, bottleneck=16, channel_base=512, channel_max=32, style_size=16, **_LEAN
     ),
-    "demo": NetworkPreset(
-        TeacherConfig(in_size=64, out_size=128, channel_base=512, channel_max=32, style_size=16, **_LEAN)
-    ),
+}
+
+NETWORK_PRESETS = {
+    # The student is the paper's in all of them: it is small already.
+    name: NetworkPreset(teacher, FieldConfig(), BlendShapeConfig())
+    for name, teacher in _TEACHERS.items()
 }
 
 
