@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import pytest
 import torch
 
@@ -16,9 +14,5 @@ GSPLAT = pytest.param(
     "gsplat",
     marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device"),
 )
-CPU = pytest.param(
-    "cpu",
-    marks=pytest.mark.skipif(find_spec("avatar.render.cpu") is None, reason="the CPU backend is not there"),
-)
-FAST_BACKENDS = [CPU, GSPLAT]
-ALL_BACKENDS = [pytest.param("reference"), *FAST_BACKENDS]
+FAST_BACKENDS = ["cpu", GSPLAT]
+ALL_BACKENDS = ["reference", *FAST_BACKENDS]

@@ -5,11 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from tests.render.backends import CPU
-
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "rendering.md"
-
-pytestmark = list(CPU.marks)
 
 
 def test_example_of_the_docs():

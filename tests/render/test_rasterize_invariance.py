@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.render import rasterize
 from tests.render.backends import ALL_BACKENDS, FAST_BACKENDS, GRADIENT_TOLERANCE, IMAGE_TOLERANCE
-from tests.render.scenes import Scene, draw, gradients, random_scene
+from tests.render.scenes import LEAVES, Scene, draw, gradients, random_scene
 
 REARRANGED = 10
 """Two ways of computing the same image may each be this many times off the tolerance of one: inputs are rounded too."""
@@ -156,6 +156,24 @@ def test_fast_gradients_equal_those_of_the_reference(backend, seed, options):
     for name, expected in truth.items():
         error = (found[name] - expected).abs().max() / expected.abs().max()
         assert error < GRADIENT_TOLERANCE[backend], f"{name}: {error:.2g}"
+
+
+@pytest.mark.parametrize("backend", FAST_BACKENDS)
+@pytest.mark.parametrize("output", [0, 1])
+def test_a_loss_of_one_output_alone(backend, output):
+    """Image without alpha, alpha without image: the other's gradient does not come as zeros, but not at all."""
+    scene, found = random_scene(25, cameras=2), {}
+    for name in (backend, "reference"):
+        leaves = scene.of(name).mapped(lambda tensor: tensor.clone().requires_grad_())
+        leaves = leaves.replace(Ks=leaves.Ks.detach())
+        rasterize(**vars(leaves), backend=name, camera_gradients=True)[output].square().sum().backward()
+        found[name] = {leaf: getattr(leaves, leaf).grad for leaf in LEAVES}
+    for leaf, expected in found["reference"].items():
+        if expected is None or not expected.any():
+            assert found[backend][leaf] is None or not found[backend][leaf].any(), leaf
+        else:
+            error = (found[backend][leaf].cpu() - expected).abs().max() / expected.abs().max()
+            assert error < GRADIENT_TOLERANCE[backend], f"{leaf}: {error:.2g}"
 
 
 def test_gradients_of_expected_depth_are_those_of_finite_differences():
