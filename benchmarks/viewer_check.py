@@ -178,7 +178,9 @@ def posed_template(run: Path, count: int) -> tuple[BoundGaussians, torch.Tensor,
     sh[:, 0] = torch.tensor([0.0, 0.3, -0.2])
     poses = hard_poses(BodyParams.rest(betas=0, expressions=0))
     vertices = template.pose(poses.frame(list(HARD_POSES).index("high_step")))[0]
-    return replace(bound, sh=sh), torch.tensor(vertices, dtype=torch.float32), torch.tensor(template.faces)
+    # The viewer cuts every Gaussian's colour at 1 and we do not: keep below.
+    bound = replace(bound, dc=0.7 * bound.dc, sh=sh)
+    return bound, torch.tensor(vertices, dtype=torch.float32), torch.tensor(template.faces)
 
 
 def look(splats: Splats, azimuth: float, size: int) -> Camera:
