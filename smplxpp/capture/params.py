@@ -11,8 +11,11 @@ import numpy as np
 from smplxpp.body import BodyModel, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.core.safe_pickle import safe_npz
+
+# What has a row a frame, in the layouts that stack frames.
+_STACKED = (*ARRAY_NAMES, "poses", "trans")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +33,12 @@ class StackedParams:
     body: BodyModel | None = None
 
     @cached_property
-    def _rows(self) -> tuple[BodyParams | None, np.ndarray]:
+    def _rows(self) -> tuple[BodyParams, np.ndarray]:
         """The good rows, and for every row its index among them (-1: bad)."""
         arrays = safe_npz(self.path)
-        rows = max((len(a) for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 2), default=0)
-        stacked = {
-            name: array
-            for name, array in arrays.items()
-            if isinstance(array, np.ndarray) and array.ndim == 2 and len(array) == rows and array.dtype.kind == "f"
-        }
+        matrices = {name: arrays[name] for name in _STACKED if np.ndim(arrays.get(name)) == 2}
+        rows = max(map(len, matrices.values()), default=1)
+        stacked = {name: array for name, array in matrices.items() if len(array) == rows and array.dtype.kind == "f"}
         good = np.ones(rows, dtype=bool)
         if rows > 1:
             for array in stacked.values():

@@ -226,3 +226,12 @@ def test_ground_truth_capture_projects_onto_its_masks(captures):
     assert set(np.unique(lengths.round(4))) == {0.0, 1.0}
     noisy = open_capture(captures / "woman_casual", params="params_noisy.npz")
     assert 0 < np.abs(noisy.params(0).transl - capture.params(0).transl).max() < 0.05
+
+
+def test_one_frame_alone_is_a_stack_of_one(tmp_path):
+    """Arrays without the frames' axis; and columns that no layout knows do not count as rows."""
+    root = write_capture(tmp_path / "disc")
+    arrays = {name: value[0] for name, value in BodyParams.rest(betas=10).as_dict().items()}
+    np.savez(tmp_path / "fit.npz", **arrays, joints=np.full((77, 3), np.nan))
+    capture = open_capture(root, params=tmp_path / "fit.npz")
+    assert len(capture.params(0)) == 1 and capture.params(1) is None
