@@ -113,14 +113,15 @@ def make_capture(
     with atomic_folder(out) as root:
         if config.layout == "actorshq":
             sequence = root / "Actor01" / "Sequence1"
-            images, params = sequence / "1x", sequence / "params"
+            # The name under which fitted parameters lie beside ActorsHQ's scales.
+            images, params = sequence / "1x", sequence / "smpl_params.npz"
             boxes = np.stack([take.vertices.min(axis=1), take.vertices.max(axis=1)], axis=1)
             files.write_actorshq_scene(sequence, boxes, config.fps)
         else:
-            images, params = root, root / "params"
+            images, params = root, root / "params" / "params.npz"
         files.write_calibration_csv(images / "calibration.csv", rig)
-        take.params.save(params / "params.npz")
-        noisy.save(params / "params_noisy.npz")
+        take.params.save(params)
+        noisy.save(params.with_stem(f"{params.stem}_noisy"))
         hidden = hidden_faces(person, take.vertices[0])
         if config.layout == "simple":
             files.write_cameras_json(root / "cameras.json", rig)

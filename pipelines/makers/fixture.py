@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 _QUANTUM = 2.0**-16
 _SEED = 3
 # What fits into a repository: see the README's table.
-CAPTURE = SynthConfig(cameras=8, frames=16, size=320, truth_step=2, normals_step=8)
+CAPTURE = SynthConfig(cameras=8, frames=16, size=320, truth_step=2, normals_step=16)
 
 
 def make_fixture(out: Path, topology_file: Path | None = None) -> dict[str, float]:

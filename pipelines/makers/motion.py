@@ -154,7 +154,7 @@ class Performance:
         sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
         for name, degrees in sizes.items():
             out[:, JOINT_NAMES.index(name)] = np.radians(degrees) * _wander(t, rng, hertz=1.1)
-        gaze = np.radians(5.0) * _wander(t, rng, hertz=1.6)
+        gaze = np.radians(2.5) * _wander(t, rng, hertz=1.6)
         gaze[:, 2] = 0.0
         for name in ("left_eye_smplhf", "right_eye_smplhf"):
             out[:, JOINT_NAMES.index(name)] = gaze

@@ -55,8 +55,8 @@ def test_an_open_plane_is_lit_from_above_and_less_from_below():
     light = vertex_light(slab(0.0), LightConfig(directions=400, resolution=128))
     centre = np.abs(slab(0.0).vertices).max(axis=1) < 0.3
     # The integral of L max(cos, 0) / pi over the upper half with L = mean + half (sky - ground) y: mean + slope / 3.
-    assert light[0, centre].mean() == pytest.approx(0.95 + 0.17 * 2 / 3, abs=0.02)
-    assert light[1, centre].mean() == pytest.approx(0.95 - 0.17 * 2 / 3, abs=0.02)
+    assert light[0, centre].mean() == pytest.approx(0.92 + 0.24 * 2 / 3, abs=0.02)
+    assert light[1, centre].mean() == pytest.approx(0.92 - 0.24 * 2 / 3, abs=0.02)
 
 
 def test_a_roof_takes_light_away_from_what_is_below():
@@ -67,7 +67,7 @@ def test_a_roof_takes_light_away_from_what_is_below():
     light = vertex_light(both, LightConfig(directions=200, resolution=128))
     centre = np.flatnonzero(np.abs(floor.vertices).max(axis=1) < 0.2)
     assert light[0, centre].max() < 0.2
-    assert light[0, centre + floor.vertex_count].min() > 0.95
+    assert light[0, centre + floor.vertex_count].min() > 0.9
 
 
 def test_bounces_lighten_bright_surfaces_more_and_open_ones_not_at_all():
@@ -275,3 +275,4 @@ def test_the_other_layout_is_actorshqs(tmp_path):
     assert [camera.name for camera in read_cameras(sequence / "1x" / "calibration.csv")] == ["Cam001", "Cam002"]
     capture = open_capture(sequence / "1x")
     assert capture.format == "actorshq" and capture.mask("Cam001", 1).any()
+    assert capture.params(1).expression.shape == (1, 52)

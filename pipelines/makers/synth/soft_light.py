@@ -16,7 +16,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh, view_directions
 
 # The surroundings are brighter above than below, as a lit stage is.
-_SKY, _GROUND = 1.12, 0.78
+_SKY, _GROUND = 1.16, 0.68
 
 
 @dataclass(frozen=True)
