@@ -146,10 +146,11 @@ class _Stage:
         self.person, self.performance, self.config = person, performance, config
         self.hair = np.flatnonzero(person.vertex_part == HAIR)
         self._skin_faces = _contact_faces(person)
+        self._head = person.body.joint_names.index("head")
         _, layers, transforms = self.standing(np.zeros(1))
-        self._layers, head = layers[0], transforms[0, person.body.joint_names.index("head"), :3, :3]
+        self._layers = layers[0]
         self._pivot = self._head_joint(transforms[0])
-        self.lag = HairLag(head)
+        self.lag = HairLag(transforms[0, self._head, :3, :3])
         self._looseness = self._hair_looseness()
         hold = attachment(person)
         self.skirt, self.shirt = (
@@ -189,7 +190,7 @@ class _Stage:
             if damped:
                 garment.solver.velocity *= 0.7
             garment.solver.advance(Tick(seconds, (before[garment.vertices], after[garment.vertices]), contacts))
-        self.lag.advance(transforms[0, self.person.body.joint_names.index("head"), :3, :3], seconds)
+        self.lag.advance(transforms[0, self._head, :3, :3], seconds)
         self._pivot = self._head_joint(transforms[0])
         self._layers = after
 
@@ -202,10 +203,10 @@ class _Stage:
         return out
 
     def _head_joint(self, transforms: np.ndarray) -> np.ndarray:
+        """(3,) where the head's joint is: the hair's pivot."""
         body = self.person.body
-        head = body.joint_names.index("head")
-        rest = body.joint_regressor[head] @ self.person.tpose.vertices[: body.vertex_count]
-        return transforms[head, :3, :3] @ rest + transforms[head, :3, 3]
+        rest = body.joint_regressor[self._head] @ self.person.tpose.vertices[: body.vertex_count]
+        return transforms[self._head, :3, :3] @ rest + transforms[self._head, :3, 3]
 
     def _hair_looseness(self) -> np.ndarray:
         """(H,) 0 on the crown, 1 at the tips."""
