@@ -43,9 +43,9 @@ def checked_settings(settings: RasterSettings) -> RasterSettings:
         raise InputError("near, far", expected="0 < near < far, in metres", received=f"{settings.near}, {settings.far}")
     if settings.eps2d < 0:
         raise InputError("eps2d", expected="0 or more, in pixels squared", received=repr(settings.eps2d))
-    numbers_ = {name: int(getattr(settings, name)) for name in ("width", "height")}
-    numbers_ |= {name: float(getattr(settings, name)) for name in ("near", "far", "eps2d")}
-    return dataclasses.replace(settings, **numbers_)
+    plain = {name: int(getattr(settings, name)) for name in ("width", "height")}
+    plain |= {name: float(getattr(settings, name)) for name in ("near", "far", "eps2d")}
+    return dataclasses.replace(settings, **plain)
 
 
 def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> None:
@@ -132,21 +132,21 @@ def _suspects(values: Mapping[str, Tensor]) -> list[str]:
         looks["scales"] = torch.aminmax(filled["scales"])
         looks["opacities"] = torch.aminmax(filled["opacities"])
         looks["quats"] += (filled["quats"][:, 0].abs().min(),)
-    flat = [number for numbers_ in looks.values() for number in numbers_]
+    flat = [stat for stats in looks.values() for stat in stats]
     answers = iter(torch.stack(flat).tolist() if flat else [])
-    found = {name: [next(answers) for _ in numbers_] for name, numbers_ in looks.items()}
-    return [name for name, numbers_ in found.items() if not _is_clear(name, numbers_)]
+    found = {name: [next(answers) for _ in stats] for name, stats in looks.items()}
+    return [name for name, stats in found.items() if not _is_clear(name, stats)]
 
 
-def _is_clear(name: str, numbers_: list[float]) -> bool:
-    if not all(math.isfinite(number) for number in numbers_):
+def _is_clear(name: str, stats: list[float]) -> bool:
+    if not all(math.isfinite(stat) for stat in stats):
         return False
     if name == "scales":
-        return numbers_[0] > 0
+        return stats[0] > 0
     if name == "opacities":
-        return numbers_[0] >= 0 and numbers_[1] <= 1
+        return stats[0] >= 0 and stats[1] <= 1
     # A quaternion with a first component is not 0; the others deserve the exact look.
-    return name != "quats" or numbers_[1] >= QUAT_NORM_MIN
+    return name != "quats" or stats[1] >= QUAT_NORM_MIN
 
 
 def _check_exactly(name: str, value: Tensor) -> None:
