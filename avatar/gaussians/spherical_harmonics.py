@@ -100,7 +100,7 @@ def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, ca
         (C, N, 3), with gradients to the colours, the means, the frames and the positions.
 
     Raises:
-        InputError: shapes that do not fit, as those of batches of poses.
+        InputError: shapes (those of batches of poses too), types or devices that do not fit.
     """
     expected = {"rotations": (bound.face_count, 3, 3), "means": (len(bound), 3), "camera positions": (None, 3)}
     received = {"rotations": frames.rotations, "means": means, "camera positions": camera_positions}
@@ -108,6 +108,12 @@ def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, ca
         value = tuple(received[name].shape)
         if len(value) != len(shape) or any(b not in (None, a) for a, b in zip(value, shape, strict=True)):
             raise InputError(f"colours: {name}", expected=f"shape {shape}", received=f"shape {value}")
+        if received[name].dtype != bound.dc.dtype or received[name].device != bound.dc.device:
+            raise InputError(
+                f"colours: {name}",
+                expected=f"{bound.dc.dtype} on {bound.dc.device}, as the Gaussians",
+                received=f"{received[name].dtype} on {received[name].device}",
+            )
     inputs = (frames.rotations, bound.dc, bound.sh, means, camera_positions)
     if is_native(*inputs):
         return ColorsFunction.apply(bound.face_index, *inputs)

@@ -118,3 +118,23 @@ def test_gradients():
 def test_degrees_out_of_range_are_refused(degree):
     with pytest.raises(InputError, match="degree"):
         sh_basis(directions(1), degree)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("means", lambda means, cameras: (means[1:], cameras)),
+        ("means", lambda means, cameras: (means.float(), cameras)),
+        ("camera positions", lambda means, cameras: (means, cameras[0])),
+        ("camera positions", lambda means, cameras: (means, cameras.float())),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(name, change):
+    vertices, faces = sphere()
+    bound = random_bound(faces)
+    frames = triangle_frames(vertices, faces)
+    means, cameras = change(world_from_frames(bound, frames).means, torch.zeros(2, 3, dtype=torch.float64))
+    with pytest.raises(InputError, match=name):
+        view_colors(bound, frames, means, cameras)
+    with pytest.raises(InputError, match="rotations"):
+        view_colors(bound, triangle_frames(vertices[None], faces), means, cameras)
