@@ -9,11 +9,11 @@ from avatar.gaussians.binding import BoundGaussians, topology_digest
 from smplxpp.core.rotations import matrix_from_rotvec
 
 
-def sphere(*, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
-    """An octahedron split twice, a little squashed and off the origin: 66 vertices, 128 faces."""
+def sphere(*, splits: int = 2, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
+    """An octahedron split so often, a little squashed and off the origin: twice gives 66 vertices, 128 faces."""
     vertices = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
     faces = [(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)]
-    for _ in range(2):
+    for _ in range(splits):
         middles: dict[tuple[int, int], int] = {}
 
         def middle(a: int, b: int, middles: dict = middles) -> int:

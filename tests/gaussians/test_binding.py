@@ -93,7 +93,7 @@ def test_batches_of_poses():
 
 
 def test_gradients_to_attributes_and_vertices():
-    vertices, faces = sphere()
+    vertices, faces = sphere(splits=1)
     bound = random_bound(faces, count=6)
     names = ("barycentric", "normal_offset", "offset", "log_scales", "quats", "opacity_logits")
 

@@ -52,10 +52,10 @@ def test_batches_are_single_frames_side_by_side():
 
 
 def test_gradients():
-    vertices, faces = sphere()
+    vertices, faces = sphere(splits=1)
 
     def values(vertices):
-        frames = triangle_frames(vertices, faces[::9])
+        frames = triangle_frames(vertices, faces[::5])
         return frames.rotations, frames.quats, frames.lengths
 
     assert torch.autograd.gradcheck(values, vertices.requires_grad_(True))
