@@ -32,6 +32,7 @@ class Capture:
         splits: cameras and frames to train on and to hold out.
         windows: the part of each camera's image that is shown, and its size.
         cache: decoded images.
+        excluded: (camera, frame) that are left out, None meaning all.
     """
 
     recording: Recording

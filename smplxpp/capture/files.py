@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,10 +68,10 @@ class FileSeries:
         return FileSeries(self.folder, self.numbers[keep], self.names[keep])
 
 
-def image_name(before: str = "") -> str:
-    """Pattern of an image file's name: `before`, the frame's digits, a suffix."""
-    suffixes = "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
-    return rf"{re.escape(before)}(?P<frame>\d+)\.(?i:{suffixes})"
+def image_name(before: str = "", *, after: str = "", suffixes: Sequence[str] = IMAGE_SUFFIXES) -> str:
+    """Pattern of a file's name: `before`, the frame's digits, the pattern `after`, a suffix in either case."""
+    endings = "|".join(re.escape(suffix[1:]) for suffix in suffixes)
+    return rf"{re.escape(before)}(?P<frame>\d+){after}\.(?i:{endings})"
 
 
 def subfolders(folder: Path) -> list[str]:

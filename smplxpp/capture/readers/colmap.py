@@ -54,9 +54,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             distortions[name] = distortion
         if rig:
             files["image"][name] = FileSeries.find(root / "images" / path.parent, image_name())
-            files["mask"][name] = FileSeries.find(
-                root / "masks" / path.parent, image_name().replace(r"\.(", r"(?:\.\w+)?\.(", 1)
-            )
+            masks = image_name(after=r"(?:\.\w+)?")
+            files["mask"][name] = FileSeries.find(root / "masks" / path.parent, masks)
         else:
             files["image"][name] = _single(root / "images", [image.name])
             files["mask"][name] = _single(

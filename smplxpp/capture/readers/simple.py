@@ -11,7 +11,7 @@ import numpy as np
 
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.files import FileSeries, image_name, subfolders
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfolders
 from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.params import ParamFiles, find_params
 from smplxpp.capture.readers.common import read_json
@@ -111,10 +111,11 @@ def _files(
     files: dict[str, dict[str, FileSeries]] = {}
     problems = []
     for kind, (folder, tag) in _FOLDERS.items():
-        pattern = {name: image_name(f"{name}_{tag}") for name in cameras}
-        if kind == "label":
-            pattern = {name: text.replace("jpg", "npy|jpg") for name, text in pattern.items()}
-        found = {name: FileSeries.find(root / folder / name, pattern[name]) for name in cameras}
+        suffixes = (*IMAGE_SUFFIXES, ".npy") if kind == "label" else IMAGE_SUFFIXES
+        found = {
+            name: FileSeries.find(root / folder / name, image_name(f"{name}_{tag}", suffixes=suffixes))
+            for name in cameras
+        }
         files[kind] = {name: series for name, series in found.items() if len(series)}
         for name in sorted(set(subfolders(root / folder)) - set(cameras)):
             problems.append(

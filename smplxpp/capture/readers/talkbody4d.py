@@ -65,7 +65,10 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 
 def _calibration(root: Path) -> Path | None:
     for path in sorted(root.glob("*.json")):
-        content = read_json(path)
+        try:
+            content = read_json(path)
+        except InputError:  # a file of another layout, whose reader will say so
+            continue
         if isinstance(content, Mapping) and {"cameras", "camera_poses"} <= content.keys():
             return path
     return None
