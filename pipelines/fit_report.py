@@ -63,8 +63,8 @@ def fit_section(record: StageRecord) -> Section:
             f"The cameras shown were {kind}. Error: the largest difference of a colour channel at a pixel, "
             f"from 0 (pale) to {ERROR_LIMIT} of 255 and more (dark).",
             f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations in "
-            f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.1f} a second. {FIT_STAGE}/splats.ply "
-            "holds the splats of this pose in the layout of 3D Gaussian Splatting, "
+            f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.1f} a second. "
+            f"{FIT_STAGE}/splats.ply holds the splats of this pose in the layout of 3D Gaussian Splatting, "
             f"{FIT_STAGE}/gaussians.safetensors holds them bound to the triangles.",
             numbers["convention"],
         ),

@@ -14,17 +14,21 @@ class LearningRates:
     """Adam's step of every attribute at the start; all fall exponentially to `final` times that.
 
     Attributes:
-        offset: metres. log_scales, quats, opacity_logits: of the parameters as they are stored.
+        normal_offset: pixels along the normal, which has the silhouettes to meet. A pixel is the median over the
+            training views of what one covers at the person, so that the rate fits any distance and image size.
+        offset: pixels in every direction; slow, so that texture stays where several views agree on it.
+        log_scales, quats, opacity_logits: of the parameters as they are stored.
         dc: of colours in [0, 1]. sh: of the coefficients that depend on the view.
         final: share left at the last step.
     """
 
-    offset: float = 3e-4
+    normal_offset: float = 0.1
+    offset: float = 0.015
     log_scales: float = 5e-3
     quats: float = 2e-3
     opacity_logits: float = 3e-2
-    dc: float = 1e-2
-    sh: float = 1e-3
+    dc: float = 2e-3
+    sh: float = 5e-4
     final: float = 0.1
 
     def __post_init__(self) -> None:

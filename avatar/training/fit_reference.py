@@ -28,7 +28,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.template import Template
 
-LEARNED = ("offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
+LEARNED = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 HEAD_MARGIN = 0.08
 """Of the head's box, added on every side."""
@@ -153,8 +153,11 @@ class FitTask:
         self.seen_share = float(seen.mean())
         self.start = replace(start, dc=dc)
         self.parameters = {name: getattr(self.start, name).clone().requires_grad_() for name in LEARNED}
+        pixel = pixel_size(scene)
+        unit = {"normal_offset": pixel, "offset": pixel}
+        self.rates = {name: getattr(config.rates, name) * unit.get(name, 1.0) for name in LEARNED}
         self.optimiser = torch.optim.Adam(
-            [{"params": [self.parameters[name]], "lr": getattr(config.rates, name)} for name in LEARNED],
+            [{"params": [self.parameters[name]], "lr": rate} for name, rate in self.rates.items()],
             betas=(0.9, 0.99), eps=1e-15, fused=True,
         )  # fmt: skip
         self.train = [view.cropped(config.margin).to(device) for view in scene.train]
@@ -204,8 +207,8 @@ class FitTask:
         """One view, one step of Adam."""
         view = self.train[self.view_index(iteration)]
         share = self.config.rates.final ** (iteration / self.config.iterations)
-        for group, name in zip(self.optimiser.param_groups, LEARNED, strict=True):
-            group["lr"] = getattr(self.config.rates, name) * share
+        for group, rate in zip(self.optimiser.param_groups, self.rates.values(), strict=True):
+            group["lr"] = rate * share
         self.optimiser.zero_grad(set_to_none=True)
         loss, terms = self.loss(view, *self.render(view))
         loss.backward()
@@ -257,6 +260,13 @@ class FitTask:
 def _head(template: Template) -> np.ndarray:
     """(F,) bool faces of the head, or all of a body without one."""
     return head_faces(template) if "head" in template.joint_names else np.ones(len(template.faces), dtype=bool)
+
+
+def pixel_size(scene: FitScene) -> float:
+    """Metres that a pixel covers at the person: median over the training views of `distance / f`."""
+    center = scene.vertices.mean(0)
+    sizes = [np.linalg.norm(view.camera.position - center) / view.camera.K[0, 0] for view in scene.train]
+    return float(np.median(sizes))
 
 
 def head_box(points: np.ndarray, camera: Camera) -> Box | None:
