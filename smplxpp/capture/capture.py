@@ -102,7 +102,7 @@ class Capture:
                 table[row] = series.has(numbers)
         rows, columns = {c: i for i, c in enumerate(self.recording.cameras)}, {f: i for i, f in enumerate(self.frames)}
         for camera, frame in self.excluded:
-            if camera is not None and frame in columns:
+            if camera in rows and frame in columns:
                 table[rows[camera], columns[frame]] = False
         return table
 

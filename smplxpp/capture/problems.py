@@ -25,8 +25,10 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
         capture: as opened; its own `problems` come first.
         decode: open every image file as well.
     """
-    found = [*capture.problems, *_missing_images(capture), *_parameters(capture)]
-    found += _missing_masks(capture)
+    found = list(capture.problems)
+    told = {(problem.camera, problem.frame) for problem in found}
+    found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in told]
+    found += [*_missing_masks(capture), *_parameters(capture)]
     if decode:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):

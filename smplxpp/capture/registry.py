@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from smplxpp.body import BodyModel
@@ -54,9 +53,10 @@ def open_capture(
     Raises:
         InputError: no such folder, no layout that fits or several, or what the reader refuses.
     """
-    root = Path(path)
+    # Absolute: a loader's worker may have another working directory.
+    root = Path(path).absolute()
     if not root.is_dir():
-        raise InputError("capture", expected="an existing folder", received=str(root))
+        raise InputError("capture", expected="an existing folder", received=str(path))
     if format is not None and format not in READERS:
         raise InputError("format of the capture", expected=f"one of {', '.join(FORMATS)}", received=str(format))
     reader = READERS[format or detect_format(root)]
@@ -67,7 +67,6 @@ def open_capture(
     splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
     if hold_out_every is not None:
         splits = splits.hold_out_cameras(hold_out_every)
-    recording = replace(recording, name=recording.name or root.resolve().name)
     windows = {name: Window.full(camera) for name, camera in recording.cameras.items()}
     return Capture(recording, splits, windows, ArrayCache(cache_bytes))
 

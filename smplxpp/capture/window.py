@@ -78,8 +78,9 @@ class Window:
         whole_box = all(edge == int(edge) for edge in self.box)
         if whole_box and self.scale == (1.0, 1.0):
             return image.crop(tuple(int(edge) for edge in self.box))
-        factors = [1.0 / scale for scale in self.scale]
-        if whole_box and not labels and all(factor.is_integer() for factor in factors):
-            return image.reduce((int(factors[0]), int(factors[1])), box=tuple(int(edge) for edge in self.box))
+        x0, y0, x1, y1 = self.box
+        if whole_box and not labels and (x1 - x0) % self.width == 0 and (y1 - y0) % self.height == 0:
+            factors = int(x1 - x0) // self.width, int(y1 - y0) // self.height
+            return image.reduce(factors, box=tuple(int(edge) for edge in self.box))
         resample = Resampling.NEAREST if labels else Resampling.LANCZOS
         return image.resize((self.width, self.height), resample, box=self.box)

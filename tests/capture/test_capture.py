@@ -160,6 +160,8 @@ def test_views_named_by_problems_are_left_out(tmp_path):
     assert less.views() == [("B", 0), ("A", 1), ("B", 1), ("A", 2)]
     assert less.splits.train_cameras == ("A", "B") and less.params(3) is None
     assert len(capture.views()) == 11
+    twice = less.without([Problem("", "C", 1), Problem("", "B", 0)])
+    assert twice.views() == [("A", 1), ("B", 1), ("A", 2)]
 
 
 def test_a_capture_pickles_small_and_reads_the_same_elsewhere(tmp_path):
@@ -188,6 +190,10 @@ def test_folders_without_a_camera_and_listed_but_missing_images_are_told(tmp_pat
         ("capture.json", '{"background": [0, 0, 255]}', "from 0 to 1"),
         ("capture.json", '{"novel_views": ["Z"]}', "novel_views.*Z"),
         ("capture.json", '{"train_frames": [1, 2, 3]}', "train_frames"),
+        ("capture.json", '{"train_views": "A"}', "list of cameras"),
+        ("capture.json", '{"fps": "fast"}', r"capture\.json.*fast"),
+        ("capture.json", '{"background": "black"}', r"capture\.json.*black"),
+        ("capture.json", '{"images": {"A": "all"}}', r"capture\.json"),
     ],
 )
 def test_broken_descriptions_are_refused(tmp_path, name, text, words):

@@ -56,7 +56,7 @@ def colmap_files(tmp_path_factory):
 @settings(max_examples=60, deadline=None)
 @given(data=st.data(), kind=st.sampled_from(["bin", "txt"]), name=st.sampled_from(["cameras", "images"]))
 def test_broken_colmap_files_are_refused_or_read(colmap_files, tmp_path_factory, data, kind, name):
-    """Cut anywhere, or with a byte changed: an InputError that names the file, or still a model, never another error."""
+    """Cut anywhere, or with a byte changed: an InputError that names the file, or a model, never another error."""
     folder = tmp_path_factory.mktemp("broken")
     for path in colmap_files[kind].glob(f"*.{kind}"):
         (folder / path.name).write_bytes(path.read_bytes())

@@ -45,12 +45,28 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     Raises:
         InputError: images without a camera file, a broken camera file or description.
     """
-    description = _describe(root)
     lenses = _lenses(root)
+    path = next((root / name for name in _DESCRIPTIONS if (root / name).is_file()), root / _DESCRIPTIONS[0])
+    description = read_json(path) if path.is_file() else {}
+    try:
+        return _described(root, lenses, description, options)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"file {path}", expected="an object with the keys of docs/captures.md",
+            received=f"{type(error).__name__}: {error}",
+        ) from None  # fmt: skip
+
+
+def _described(
+    root: Path, lenses: list[tuple[Camera, Distortion | None]], description: Mapping[str, Any], options: ReaderOptions
+) -> Recording:
     cameras = {camera.name: camera for camera, _ in lenses}
     files, problems = _files(root, cameras, description)
+    topology, frames = root / "geometry" / "topology.npz", r"frame_(?P<frame>\d{6})\.npz"
     recording = Recording(
-        name=str(description.get("name", root.name)),
+        name=str(description.get("name", root.resolve().name)),
         root=root,
         format=NAME,
         cameras=cameras,
@@ -59,14 +75,11 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         background=_background(description),
         label_set=str(description.get("label_set", "capture")),
         params=_params(root, options),
-        meshes=PosedTopology(
-            root / "geometry" / "topology.npz",
-            FileSeries.find(root / "geometry", r"frame_(?P<frame>\d{6})\.npz"),
-        ),
-        fps=description.get("fps"),
+        meshes=PosedTopology(topology, FileSeries.find(topology.parent, frames)) if topology.is_file() else None,
+        fps=None if description.get("fps") is None else float(description["fps"]),
         problems=tuple(problems),
     )
-    return recording if not description else _with_splits(recording, description)
+    return replace(recording, splits=_splits(recording, description)) if description else recording
 
 
 def stacked_params(root: Path, name: str | Path | None = None) -> Path:
@@ -86,14 +99,6 @@ def _params(root: Path, options: ReaderOptions) -> ParamSource | None:
         return ParamFiles(single, body=options.body)
     stacked = stacked_params(root)
     return find_params(stacked, body=options.body) if stacked.is_file() else None
-
-
-def _describe(root: Path) -> dict[str, Any]:
-    path = next((root / name for name in _DESCRIPTIONS if (root / name).is_file()), None)
-    content = {} if path is None else read_json(path)
-    if not isinstance(content, dict):
-        raise InputError(f"file {path}", expected="a JSON object", received=type(content).__name__)
-    return content
 
 
 def _lenses(root: Path) -> list[tuple[Camera, Distortion | None]]:
@@ -124,7 +129,7 @@ def _files(
         listed = description.get(f"{kind}s", {})
         for name, frames in listed.items() if isinstance(listed, Mapping) else ():
             if name in found:
-                missing = np.setdiff1d(frames, found[name].numbers).tolist()
+                missing = np.setdiff1d(np.asarray(frames, dtype=np.int64), found[name].numbers).tolist()
                 problems += [Problem(f"{root / folder / name}: no {kind} of frame {f}", name, f) for f in missing]
     return files, problems
 
@@ -141,24 +146,25 @@ def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | 
     return tuple(colour.tolist())
 
 
-def _with_splits(recording: Recording, description: Mapping[str, Any]) -> Recording:
+def _splits(recording: Recording, description: Mapping[str, Any]) -> Splits:
     cameras, frames = list(recording.cameras), recording.frames()
     novel_views = _names(description, "novel_views", cameras) or []
     train_views = _names(description, "train_views", cameras)
     novel_frames = _ranges(description, "novel_pose_frames", frames) or []
     train_frames = _ranges(description, "train_frames", frames)
-    splits = Splits(
+    return Splits(
         tuple(train_views if train_views is not None else [c for c in cameras if c not in novel_views]),
         tuple(novel_views),
         tuple(train_frames if train_frames is not None else [f for f in frames if f not in set(novel_frames)]),
         tuple(novel_frames),
     )
-    return replace(recording, splits=splits)
 
 
 def _names(description: Mapping[str, Any], key: str, cameras: list[str]) -> list[str] | None:
     if key not in description:
         return None
+    if not isinstance(description[key], list):
+        raise InputError(f"{key} of the capture", expected="a list of cameras", received=f"{description[key]}")
     unknown = sorted(set(description[key]) - set(cameras))
     if unknown:
         raise InputError(f"{key} of the capture", expected=f"cameras among {cameras}", received=f"{unknown}")
