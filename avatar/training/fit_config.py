@@ -50,7 +50,8 @@ class FitConfig:
         alpha: weight of the L1 between rendered opacity and mask. Without it dark hair on a black background could be
             holes.
         scale_penalty, offset_penalty: weights of GaussianAvatars' penalties.
-        eps2d: pixels squared that the rasteriser blurs every Gaussian by; viewers use 0.3.
+        eps2d: pixels squared that the rasteriser blurs every Gaussian by. 1/12 is the variance of a pixel's own square;
+            viewers use 0.3, which widens silhouettes by a pixel, and the surface would have to shrink to meet them.
         margin: pixels kept around the silhouette of a training view.
         evaluations: how often quality is measured, spread evenly.
         seed: of the views' order. The Gaussians' places have their own in `sampling`.
@@ -63,7 +64,7 @@ class FitConfig:
     alpha: float = 0.1
     scale_penalty: float = 1.0
     offset_penalty: float = 1.0
-    eps2d: float = 0.3
+    eps2d: float = 0.1
     margin: int = 12
     evaluations: int = 12
     seed: int = 0

@@ -157,7 +157,8 @@ def _print(record: StageRecord, report: Path) -> None:
     state = "finished" if numbers["finished"] else "stopped; the same command goes on"
     console.print(
         f"{numbers['gaussians']:,} Gaussians, {done:,} of {total:,} iterations in {numbers['seconds_of_steps']:.1f} s "
-        f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}"
+        f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}",
+        soft_wrap=True,
     )
     for name, path in (("splats", record.folder / "splats.ply"), ("views", record.folder / "previews"),
                        ("report", report)):  # fmt: skip

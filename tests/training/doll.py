@@ -94,7 +94,7 @@ def _template(vertices: np.ndarray, faces: np.ndarray) -> Template:
     weights[count // 2 :, body.joint_names.index("head")] = 1.0
     return Template(
         vertices=vertices, faces=faces, vertex_labels=np.zeros(count), vertex_part=np.zeros(count),
-        part_names=("body",),         vertex_colors=np.full((count, 3), 128), weights=SkinWeights.from_dense(weights),
+        part_names=("body",), vertex_colors=np.full((count, 3), 128), weights=SkinWeights.from_dense(weights),
         joint_regressor=np.full((joints, count), 1.0 / count), parents=body.parents, joint_names=body.joint_names,
         betas=np.zeros(2), shape_basis=np.zeros((count, 3, 2)), expression_basis=np.zeros((count, 3, 0)),
         pose_basis=None, left_hand_components=None, right_hand_components=None, left_hand_mean=None,

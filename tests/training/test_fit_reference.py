@@ -46,8 +46,8 @@ def test_held_out_views_get_better_and_good(fitted):
     evaluations = [e for e in entries if e["kind"] == "evaluation"]
     before, after = evaluations[0]["mean"], evaluations[-1]["mean"]
     assert [e["iteration"] for e in evaluations] == [0, 20, 40, 60]
-    assert after["psnr"] > before["psnr"] + 3.0
-    assert after["psnr"] > 26.0 and after["ssim"] > 0.95
+    assert after["psnr"] > before["psnr"] + 4.0
+    assert after["psnr"] > 23.0 and after["ssim"] > 0.95
     assert set(evaluations[0]["views"]) == set(HELD_OUT) and evaluations[0]["held_out"]
     assert result.progress.finished and set(result.quality) == {*TRAIN, *HELD_OUT}
     assert result.quality["Held0"].psnr == pytest.approx(evaluations[-1]["views"]["Held0"]["psnr"])
@@ -73,7 +73,8 @@ def test_what_comes_out_is_bound_posed_and_free_of_gradients(fitted):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_same_seed_gives_the_same_bits(tmp_path, threads):
-    config, before = replace(CONFIG, iterations=8), torch.get_num_threads()
+    config = replace(CONFIG, iterations=3, sampling=SamplingConfig(count=600))
+    before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         one, two = (fit_reference(scene(), config, tmp_path / name).gaussians for name in ("one", "two"))
@@ -85,7 +86,7 @@ def test_the_same_seed_gives_the_same_bits(tmp_path, threads):
 
 
 def test_an_interrupted_fit_is_the_uninterrupted_one(tmp_path):
-    config = replace(CONFIG, iterations=9, evaluations=1)
+    config = replace(CONFIG, iterations=6, evaluations=1)
     whole = fit_reference(scene(), config, tmp_path / "whole", key="k").gaussians
     sessions, done = 0, False
     while not done:
