@@ -79,43 +79,39 @@ class _Rasterize(torch.autograd.Function):
         ctx.settings = settings
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(means2d, radii, depths)
-        ctx.save_for_backward(*inputs, alpha, radii)
+        ctx.save_for_backward(*inputs, radii)
         return image, alpha, means2d, radii, depths
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_image, grad_alpha, *_):
-        *inputs, alpha, radii = ctx.saved_tensors
-        means, quats, scales, opacities, features, viewmats, _, background = inputs
-        grads = [None] * 9
+        *inputs, radii = ctx.saved_tensors
+        *gaussians, features, viewmats, _, background = inputs
         if grad_image is None and grad_alpha is None:
-            return tuple(grads)
+            return (None,) * 9
         grad_image = None if grad_image is None else grad_image.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        if any(ctx.needs_input_grad[:6]):
-            grads[:5] = [torch.empty_like(tensor) for tensor in (means, quats, scales, opacities, features)]
-            poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
-            for camera, (view, workspace) in enumerate(zip(_views(inputs, ctx.settings), ctx.workspaces, strict=True)):
-                own_features = features.ndim == 3
-                workspace.backward(
-                    view,
-                    radii[camera],
-                    None if grad_image is None else grad_image[camera],
-                    None if grad_alpha is None else grad_alpha[camera],
-                    (
-                        *grads[:4],
-                        grads[4][camera] if own_features else grads[4],
-                        None if poses is None else poses[camera],
-                    ),
-                    (camera > 0, camera > 0 and not own_features),
-                )
-            if poses is not None:
-                grads[5] = torch.zeros_like(viewmats)
-                grads[5][:, :3] = poses
-        if ctx.needs_input_grad[7] and grad_image is not None:
-            left = (1 - alpha).flatten(1, 2)  # (C, HW, 1)
-            grads[7] = (left.mT @ grad_image.flatten(1, 2))[:, 0]
-        return tuple(grads)
+        grads = [torch.empty_like(tensor) for tensor in (*gaussians, features)]
+        poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
+        grad_background = torch.empty_like(background) if ctx.needs_input_grad[7] else None
+        own_features = features.ndim == 3
+        for camera, (view, workspace) in enumerate(zip(_views(inputs, ctx.settings), ctx.workspaces, strict=True)):
+            workspace.backward(
+                view,
+                radii[camera],
+                *(None if grad is None else grad[camera] for grad in (grad_image, grad_alpha)),
+                (
+                    *grads[:4],
+                    grads[4][camera] if own_features else grads[4],
+                    *(None if grad is None else grad[camera] for grad in (poses, grad_background)),
+                ),
+                (camera > 0, camera > 0 and not own_features),
+            )
+        grad_viewmats = None
+        if poses is not None:
+            grad_viewmats = torch.zeros_like(viewmats)
+            grad_viewmats[:, :3] = poses
+        return (*grads, grad_viewmats, None, grad_background, None)
 
 
 def _views(inputs: tuple[Tensor | None, ...], settings: RasterSettings) -> list[View]:

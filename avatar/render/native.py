@@ -32,7 +32,9 @@ class _Camera(ctypes.Structure):
 
 
 class _Gradients(ctypes.Structure):
-    _fields_ = [(name, _POINTER) for name in ("means", "quats", "scales", "opacities", "features", "viewmat")]
+    _fields_ = [
+        (name, _POINTER) for name in ("means", "quats", "scales", "opacities", "features", "viewmat", "background")
+    ]
     _fields_ += [("accumulate", ctypes.c_int32), ("accumulate_features", ctypes.c_int32)]
 
 
@@ -91,10 +93,10 @@ class Workspace:
         accumulate: tuple[bool, bool],
         seconds: ctypes.Array | None = None,
     ) -> None:
-        """Gradients of the last forward pass, to means .. features and the pose (3, 4) float64, where it is given.
+        """Gradients of the last forward pass, to means .. features, the pose (3, 4) float64 and the background (D).
 
-        `accumulate` says whether to add to the first four, and to the features', what is otherwise written; the pose's
-        is always added to.
+        The last two may be None. `accumulate` says whether to add to the first four, and to the features', what is
+        otherwise written; the pose's is always added to.
         """
         target = _Gradients(*map(address, gradients), *accumulate)
         with self._lock:

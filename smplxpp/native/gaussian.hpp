@@ -5,6 +5,7 @@
 //   bin       depth sort; the list of Gaussians of each tile, front to back   gaussian_sort.cpp, gaussian_bin.cpp
 //   blend     front to back over the list, 16 pixels at once                  gaussian_blend.cpp
 //   unblend   back to front: sums over pixels of the gradients                gaussian_unblend.cpp
+//   background  its share of the picture's gradient                           gaussian_background.cpp
 //   chain     from those sums to means, quaternions, scales, opacities, pose  gaussian_chain.cpp
 //
 // An ellipse is kept as the Cholesky factor of its inverse covariance, scaled so that the exponent is a power of two:
@@ -45,6 +46,7 @@ struct Camera {
 struct Gradients {
     float *means, *quats, *scales, *opacities, *features;
     double* viewmat;           // (3, 4), added to; null where not asked for
+    float* background;         // (D); null where not asked for
     int32_t accumulate;        // add to means .. opacities instead of writing them
     int32_t accumulate_features;
 };
@@ -108,6 +110,7 @@ void sort_by_depth(int64_t count, const float* depths, const float* radii, Works
 void bin(Workspace&, int threads);
 void blend(const Scene&, const Camera&, Workspace&, float* image, float* alpha, int threads);
 void unblend(const Scene&, const Camera&, Workspace&, const float* grad_image, const float* grad_alpha, int threads);
+void sum_background(const Scene&, const Workspace&, const float* grad_image, float* grad_background, int threads);
 void chain(const Scene&, const Camera&, const Workspace&, const float* radii, const Gradients&, int threads);
 
 }  // namespace smplxpp::gaussian

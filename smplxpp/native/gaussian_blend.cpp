@@ -25,7 +25,7 @@ struct TileState {
 struct Thread {
     TileState state;
     Chunk chunk;
-    uint16_t list[BLOCKS][CHUNK];
+    uint16_t list[BLOCKS][CHUNK + 1];
     int length[BLOCKS];
     alignas(64) float weight[CHUNK][LANES];
     Buffer<float> more;  // (BLOCKS, channels beyond ROW_CHANNELS, LANES)
@@ -44,41 +44,45 @@ void split_by_block(const Hit* hits, int n, uint32_t live, Thread& t) {
 
 // Blends a chunk into one block; false once all of its pixels have stopped. D channels are kept in registers, the weights
 // of each visit noted for the further ones. `visits` counts rows looked at.
+//
+// The opacity of the next row is begun before the present one is blended: it is a long chain of dependent operations,
+// and a processor that met it last would run out of room to look ahead for other work.
 template <int D, bool NOTE_WEIGHTS>
 bool blend_block(Thread& t, int block, int32_t base, int& visits) {
     TileState& s = t.state;
-    const BlockPixels at(block);
-    const Floats zero = zeros(), threshold = broadcast(LOG2_ALPHA_MIN), alpha_max = broadcast(ALPHA_MAX);
+    const Floats x = load(TILE_PIXELS.x[block]), y = load(TILE_PIXELS.y[block]);
     const Floats stop_at = broadcast(TRANSMITTANCE_MIN), one = broadcast(1.0f);
     Floats T = load(s.transmittance[block]), color[D];
     for (int j = 0; j < D; ++j) color[j] = load(s.color[block][j]);
-    Mask live = T > zero;
-    const uint16_t* list = t.list[block];
+    Mask live = T > zeros();
+    uint16_t* list = t.list[block];
     const int n = t.length[block];
+    list[n] = list[n - 1];
     int k = 0;
     bool alive = true;
+    Opacity next(t.chunk.rows[list[0]], x, y);
     while (k < n) {
         const int i = list[k];
-        const TileRow& row = t.chunk.rows[i];
-        const Exponent x(row, at);
-        const Floats alpha = where(x.e >= threshold, min(exp2(x.e), alpha_max));
-        Floats w = alpha * T, next = T * (one - alpha);
-        const Mask kill = without(live, next > stop_at);
+        const Floats alpha = next.alpha;
+        next = Opacity(t.chunk.rows[list[k + 1]], x, y);
+        Floats w = alpha * T, after = T * (one - alpha);
+        const Mask kill = without(live, after > stop_at);
         if (__builtin_expect(any(kill), 0)) {
             store(s.final[block], where(kill, T, load(s.final[block])));
             store(s.stop[block], where(kill, broadcast(base + i), load(s.stop[block])));
             live = without(live, kill);
             w = where(live, w);
-            next = where(live, next);
+            after = where(live, after);
             if (!any(live)) {
                 t.length[block] = k;  // the further channels of those before
                 ++k;
                 alive = false;
-                T = next;
+                T = after;
                 break;
             }
         }
-        T = next;
+        T = after;
+        const TileRow& row = t.chunk.rows[i];
         for (int j = 0; j < D; ++j) color[j] = fma(w, broadcast(row.channels[j]), color[j]);
         if (NOTE_WEIGHTS) store(t.weight[k], w);
         ++k;
@@ -170,7 +174,7 @@ void blend_tile(const Scene& scene, const Camera& camera, Workspace& w, Thread& 
     for (int64_t base = 0; base < count && live; base += CHUNK) {
         const Hit* hits = w.hits.data() + begin + base;
         const int n = (int)std::min<int64_t>(CHUNK, count - base);
-        t.chunk.gather(scene, w, hits, n, count - base, x, y);
+        t.chunk.gather<D>(scene, w, hits, n, count - base, x, y);
         split_by_block(hits, n, live, t);
         for (uint32_t m = live; m; m &= m - 1) {
             const int block = __builtin_ctz(m);

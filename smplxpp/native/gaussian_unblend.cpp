@@ -16,14 +16,21 @@ namespace smplxpp::gaussian {
 
 namespace {
 
+// What a block carries from one Gaussian to the one before it: T_{i+1}, S_i, and where its pixels stopped.
+struct alignas(64) BlockState {
+    float transmittance[LANES], rest[LANES];
+    int32_t stop[LANES];
+    float weight[LANES];
+};
+
 struct Thread {
     Chunk chunk;
     float* row[CHUNK];
-    alignas(64) float transmittance[BLOCKS][LANES], rest[BLOCKS][LANES];  // T_{i+1} and S_i
-    alignas(64) int32_t stop[BLOCKS][LANES];
-    alignas(64) float weight[BLOCKS][LANES];
-    int32_t last[BLOCKS];   // entries of the list that reach a block
-    Buffer<float> gradient;  // (D or more, BLOCKS, LANES)
+    uint16_t visits[CHUNK * BLOCKS + 1];  // 16 * place in the chunk + block, back to front
+    BlockState state[BLOCKS];
+    int32_t last[BLOCKS];    // entries of the list that reach a block
+    Buffer<float> gradient;  // (BLOCKS, D or more, LANES)
+    int64_t plane;           // floats of `gradient` a block
 };
 
 // First tile of each thread, so that all have about the same work; the last entry is the number of tiles.
@@ -84,84 +91,118 @@ int64_t assign_rows(int64_t count, Workspace& w, const std::vector<int64_t>& cut
 void load_tile(const Scene& scene, const Camera& camera, const Workspace& w, Thread& t, int64_t tile, int64_t count,
                const float* grad_image, const float* grad_alpha) {
     const int D = scene.channels;
-    float* gradient = t.gradient.data();
     for (int block = 0; block < BLOCKS; ++block) {
         const BlockPlace place(w, tile, block);
         t.last[block] = 0;
         for (int lane = 0; lane < LANES; ++lane) {
-            const int at = block * LANES + lane;
-            const int64_t kept = tile * BLOCKS * LANES + at;
+            const int64_t kept = (tile * BLOCKS + block) * LANES + lane;
             const bool inside = place.inside(lane);
             const int32_t stop = inside ? (int32_t)std::min<int64_t>(w.stop[kept], count) : 0;
+            float* gradient = t.gradient.data() + block * t.plane + lane;
             float behind = 0.0f;
             if (inside) {
                 const int64_t pixel = (int64_t)(place.y + lane / 4) * w.width + place.x + lane % 4;
                 if (grad_alpha) behind -= grad_alpha[pixel];
                 for (int j = 0; j < D; ++j) {
                     const float g = grad_image ? grad_image[pixel * D + j] : 0.0f;
-                    gradient[j * BLOCKS * LANES + at] = g;
+                    gradient[j * LANES] = g;
                     if (camera.background) behind += g * camera.background[j];
                 }
             } else {
-                for (int j = 0; j < D; ++j) gradient[j * BLOCKS * LANES + at] = 0.0f;
+                for (int j = 0; j < D; ++j) gradient[j * LANES] = 0.0f;
             }
-            t.transmittance[block][lane] = w.transmittance[kept];
-            t.rest[block][lane] = w.transmittance[kept] * behind;
-            t.stop[block][lane] = stop;
+            t.state[block].transmittance[lane] = w.transmittance[kept];
+            t.state[block].rest[lane] = w.transmittance[kept] * behind;
+            t.state[block].stop[lane] = stop;
             t.last[block] = std::max(t.last[block], stop);
         }
     }
 }
 
-// Adds one Gaussian's sums over the blocks of `blocks` to its row. D channels ride in the first group of 16.
+// The visits of a chunk, last Gaussian first; returns their number. Blocks whose pixels had all stopped before are left
+// out; looking every 16 entries is enough, since the lanes know their own end.
+int list_visits(Thread& t, const Hit* hits, int n, int32_t base) {
+    uint32_t live = 0;
+    int visits = 0;
+    for (int i = n - 1; i >= 0; --i) {
+        if (i == n - 1 || i % 16 == 15) {
+            live = 0;
+            for (int block = 0; block < BLOCKS; ++block) live |= (uint32_t)(t.last[block] > base + i / 16 * 16) << block;
+        }
+        for (uint32_t m = hits[i].blocks & live; m; m &= m - 1) t.visits[visits++] = (uint16_t)(i * BLOCKS + __builtin_ctz(m));
+    }
+    return visits;
+}
+
+struct VisitedOpacity : Opacity {
+    Floats inverse;  // of 1 - alpha
+    SMPLXPP_INLINE VisitedOpacity(const Thread& t, int visit, int32_t base)
+        : Opacity(t.chunk.rows[visit / BLOCKS], load(TILE_PIXELS.x[visit % BLOCKS]), load(TILE_PIXELS.y[visit % BLOCKS]),
+                  load(t.state[visit % BLOCKS].stop) > broadcast(base + visit / BLOCKS)),
+          inverse(reciprocal(broadcast(1.0f) - alpha)) {}
+};
+
+// The channels from D on of one Gaussian, whose visits are [begin, end).
+template <int D>
+void unblend_more(const Scene& scene, Thread& t, int i, int begin, int end) {
+    for (int first = D, group = 1; first < scene.channels; first += LANES, ++group) {
+        const int n = std::min(LANES, scene.channels - first);
+        Floats more[LANES] = {};
+        for (int v = begin; v < end; ++v) {
+            const int block = t.visits[v] % BLOCKS;
+            const float* gradient = t.gradient.data() + block * t.plane + first * LANES;
+            const Floats w = load(t.state[block].weight);
+            for (int j = 0; j < n; ++j) more[j] = fma(w, load(gradient + j * LANES), more[j]);
+        }
+        add_lane_sums(more, t.row[i] + group * LANES);
+    }
+}
+
+// Adds the sums of a chunk's Gaussians over their visits to their rows. D channels ride in the first group of 16. As in
+// blend_block, the opacity of the next visit is begun before the present one is used.
 template <int D, bool MORE>
-SMPLXPP_INLINE void unblend_row(const Scene& scene, Thread& t, int i, int32_t position, uint32_t gaussian, uint32_t blocks) {
-    constexpr int PLANE = BLOCKS * LANES;
-    const TileRow& row = t.chunk.rows[i];
-    const float* features = scene.features + (int64_t)gaussian * scene.channels;
-    const Floats threshold = broadcast(LOG2_ALPHA_MIN), alpha_max = broadcast(ALPHA_MAX), one = broadcast(1.0f);
-    const Ints index = broadcast(position);
+void unblend_visits(const Scene& scene, Thread& t, const Hit* hits, int visits, int32_t base) {
+    if (visits == 0) return;
+    const Floats alpha_max = broadcast(ALPHA_MAX);
+    t.visits[visits] = (uint16_t)(t.visits[visits - 1] ^ BLOCKS);  // another Gaussian: the last one's end is seen
+    VisitedOpacity next(t, t.visits[0], base);
     Floats sum[LANES] = {};
-    for (uint32_t m = blocks; m; m &= m - 1) {
-        const int block = __builtin_ctz(m);
-        const float* gradient = t.gradient.data() + block * LANES;
-        const Exponent x(row, BlockPixels(block));
-        const Mask active = (x.e >= threshold) & (load(t.stop[block]) > index);
-        const Floats raw = exp2(x.e), alpha = where(active, min(raw, alpha_max));
-        const Floats inverse = reciprocal(one - alpha), T = load(t.transmittance[block]) * inverse, w = alpha * T;
-        store(t.transmittance[block], T);
+    int begin = 0;
+    for (int v = 0; v < visits; ++v) {
+        const int i = t.visits[v] / BLOCKS, block = t.visits[v] % BLOCKS;
+        const VisitedOpacity now = next;
+        next = VisitedOpacity(t, t.visits[v + 1], base);
+        BlockState& state = t.state[block];
+        const float* gradient = t.gradient.data() + block * t.plane;
+        const TileRow& row = t.chunk.rows[i];
+        const Floats T = load(state.transmittance) * now.inverse, w = now.alpha * T;
+        store(state.transmittance, T);
         Floats d = zeros();
         for (int j = 0; j < D; ++j) {
-            const Floats g = load(gradient + j * PLANE);
+            const Floats g = load(gradient + j * LANES);
             d = fma(g, broadcast(row.channels[j]), d);
             sum[MOMENTS + j] = fma(w, g, sum[MOMENTS + j]);
         }
         if (MORE) {
-            for (int j = D; j < scene.channels; ++j) d = fma(load(gradient + j * PLANE), broadcast(features[j]), d);
-            store(t.weight[block], w);
+            const float* features = scene.features + (int64_t)hits[i].gaussian * scene.channels;
+            for (int j = D; j < scene.channels; ++j) d = fma(load(gradient + j * LANES), broadcast(features[j]), d);
+            store(state.weight, w);
         }
-        const Floats S = load(t.rest[block]);
-        store(t.rest[block], fma(w, d, S));
-        const Floats v = where(alpha_max > raw, alpha * fnma(S, inverse, T * d)), vp = v * x.p, vq = v * x.q;
-        sum[0] = sum[0] + v;
+        const Floats S = load(state.rest);
+        store(state.rest, fma(w, d, S));
+        const Floats v_alpha = where(alpha_max > now.alpha, now.alpha * fnma(S, now.inverse, T * d));
+        const Floats vp = v_alpha * now.p, vq = v_alpha * now.q;
+        sum[0] = sum[0] + v_alpha;
         sum[1] = sum[1] + vp;
         sum[2] = sum[2] + vq;
-        sum[3] = fma(vp, x.p, sum[3]);
-        sum[4] = fma(vp, x.q, sum[4]);
-        sum[5] = fma(vq, x.q, sum[5]);
-    }
-    add_lane_sums(sum, t.row[i]);
-    if (MORE) {
-        for (int first = D, group = 1; first < scene.channels; first += LANES, ++group) {
-            const int n = std::min(LANES, scene.channels - first);
-            Floats more[LANES] = {};
-            for (uint32_t m = blocks; m; m &= m - 1) {
-                const int block = __builtin_ctz(m);
-                const float* gradient = t.gradient.data() + block * LANES + first * PLANE;
-                const Floats w = load(t.weight[block]);
-                for (int j = 0; j < n; ++j) more[j] = fma(w, load(gradient + j * PLANE), more[j]);
-            }
-            add_lane_sums(more, t.row[i] + group * LANES);
+        sum[3] = fma(vp, now.p, sum[3]);
+        sum[4] = fma(vp, now.q, sum[4]);
+        sum[5] = fma(vq, now.q, sum[5]);
+        if (t.visits[v + 1] / BLOCKS != i) {
+            add_lane_sums(sum, t.row[i]);
+            for (Floats& s : sum) s = zeros();
+            if (MORE) unblend_more<D>(scene, t, i, begin, v + 1);
+            begin = v + 1;
         }
     }
 }
@@ -178,22 +219,12 @@ void unblend_tile(const Scene& scene, const Camera& camera, const Workspace& w, 
     for (int32_t base = (needed - 1) / CHUNK * CHUNK; base >= 0 && needed; base -= CHUNK) {
         const Hit* hits = w.hits.data() + begin + base;
         const int n = std::min(CHUNK, needed - base);
-        t.chunk.gather(scene, w, hits, n, n, x, y);
+        t.chunk.gather<D>(scene, w, hits, n, n, x, y);
         for (int i = 0; i < n; ++i) {
             t.row[i] = w.rows.data() + w.row_of(hits[i].gaussian, thread) * stride;
             __builtin_prefetch(t.row[i], 1);
         }
-        uint32_t live = 0;
-        for (int i = n - 1; i >= 0; --i) {
-            // Blocks whose pixels had all stopped earlier drop out; looking every 16 entries is enough, since the lanes
-            // know their own end.
-            if (i == n - 1 || i % 16 == 15) {
-                live = 0;
-                for (int block = 0; block < BLOCKS; ++block) live |= (uint32_t)(t.last[block] > base + i / 16 * 16) << block;
-            }
-            const uint32_t blocks = hits[i].blocks & live;
-            if (blocks) unblend_row<D, MORE>(scene, t, i, base + i, hits[i].gaussian, blocks);
-        }
+        unblend_visits<D, MORE>(scene, t, hits, list_visits(t, hits, n, base), base);
     }
 }
 
@@ -210,7 +241,8 @@ void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const
     });
     run_threads(threads, [&](int t) { failure.guard([&] {
         auto thread = std::make_unique<Thread>();
-        thread->gradient.reserve((int64_t)BLOCKS * LANES * std::max<int64_t>(scene.channels, D));
+        thread->plane = (int64_t)LANES * std::max<int64_t>(scene.channels, D);
+        thread->gradient.reserve(BLOCKS * thread->plane);
         std::fill(thread->gradient.data(), thread->gradient.data() + thread->gradient.capacity(), 0.0f);
         for (int64_t tile = cut[t]; tile < cut[t + 1]; ++tile) {
             unblend_tile<D, MORE>(scene, camera, w, *thread, t, tile, grad_image, grad_alpha);

@@ -188,16 +188,14 @@ SMPLXPP_INLINE Floats square_root(Floats a) {
 
 // 2^x for -126 < x < 126 with a relative error of 9e-8; anything at all elsewhere, which callers mask away.
 // x is split into its nearest integer n (adding 1.5 * 2^23 leaves n in the low bits) and the rest, for which a minimax
-// polynomial of degree 5 stands; n is added to the exponent.
+// polynomial of degree 5 stands, in Estrin's order: what waits for it waits less. n is added to the exponent.
 SMPLXPP_INLINE Floats exp2(Floats a) {
     return map<PARTS>([](auto x) {
         const float shift = 12582912.0f;
-        NativeFloat shifted = x + shift, f = x - (shifted - shift);
-        NativeFloat r = 0.0013264814f * f + 0.0096716740f;
-        r = r * f + 0.055507287f;
-        r = r * f + 0.24022213f;
-        r = r * f + 0.69314694f;
-        r = r * f + 1.0f;
+        NativeFloat shifted = x + shift, f = x - (shifted - shift), f2 = f * f;
+        NativeFloat low = 0.69314694f * f + 1.0f, middle = 0.055507287f * f + 0.24022213f;
+        NativeFloat high = 0.0013264814f * f + 0.0096716740f;
+        NativeFloat r = (high * f2 + middle) * f2 + low;
         return (NativeFloat)((NativeInt)r + ((NativeInt)shifted << 23));
     }, a);
 }
