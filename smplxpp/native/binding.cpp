@@ -10,36 +10,14 @@
 #include <cstdint>
 #include <vector>
 
+#include "binding_math.hpp"
+#include "harmonics.hpp"
 #include "parallel.hpp"
 
 namespace {
 
+using namespace smplxpp::binding;
 using smplxpp::run_threads;
-
-struct Vec {
-    float x, y, z;
-};
-Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-float dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-Vec cross(Vec a, Vec b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-float length(Vec a) { return std::sqrt(dot(a, a)); }
-Vec load(const float* p) { return {p[0], p[1], p[2]}; }
-Vec load_or_zero(const float* p, int64_t i) { return p ? load(p + 3 * i) : Vec{0, 0, 0}; }
-void store(float* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
-void add(float* p, Vec a) { p[0] += a.x, p[1] += a.y, p[2] += a.z; }
-Vec column(const float* m, int k) { return {m[k], m[3 + k], m[6 + k]}; }
-Vec turn(const float* m, Vec v) { return v.x * column(m, 0) + v.y * column(m, 1) + v.z * column(m, 2); }
-Vec turn_back(const float* m, Vec v) { return v.x * load(m) + v.y * load(m + 3) + v.z * load(m + 6); }
-// m += a b^T
-void add_outer(float* m, Vec a, Vec b) { add(m, a.x * b), add(m + 3, a.y * b), add(m + 6, a.z * b); }
-// Gradient to v of a function of v / |v|, from its gradient g to the unit vector u.
-Vec unit_gradient(Vec g, Vec u, float norm) { return (1.0f / norm) * (g - dot(g, u) * u); }
-
-int64_t share(int64_t count, int thread, int threads) { return count * thread / threads; }
-
-// ---- Frames
 
 constexpr float kMinEdge = 1e-6f;
 constexpr float kTolerance = 100.0f * FLT_EPSILON;
@@ -107,91 +85,8 @@ void quat_gradient(const float* m, const float* g, float* gm) {
     gm[3] += d[6] + d[7], gm[1] += d[7] - d[6];
 }
 
-// ---- Spherical harmonics of degrees 1 to 3, as sh_basis orders them
-
-constexpr float kC1 = 0.4886025119029199f;
-constexpr float kC2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
-constexpr float kC3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
-                          1.445305721320277f};
-
-template <int K>
-void basis([[maybe_unused]] Vec d, [[maybe_unused]] float* y) {
-    [[maybe_unused]] const float X = d.x, Y = d.y, Z = d.z, xx = X * X, yy = Y * Y, zz = Z * Z;
-    if constexpr (K >= 3) y[0] = -kC1 * Y, y[1] = kC1 * Z, y[2] = -kC1 * X;
-    if constexpr (K >= 8) {
-        y[3] = kC2[0] * X * Y, y[4] = -kC2[0] * Y * Z, y[5] = kC2[1] * (2 * zz - xx - yy);
-        y[6] = -kC2[0] * X * Z, y[7] = kC2[2] * (xx - yy);
-    }
-    if constexpr (K >= 15) {
-        y[8] = -kC3[0] * Y * (3 * xx - yy), y[9] = kC3[1] * X * Y * Z, y[10] = -kC3[2] * Y * (4 * zz - xx - yy);
-        y[11] = kC3[3] * Z * (2 * zz - 3 * xx - 3 * yy), y[12] = -kC3[2] * X * (4 * zz - xx - yy);
-        y[13] = kC3[4] * Z * (xx - yy), y[14] = -kC3[0] * X * (xx - 3 * yy);
-    }
-}
-
-// Gradient to d of sum_k c_k Y_k(d).
-template <int K>
-Vec basis_gradient(Vec d, const float* c) {
-    const float X = d.x, Y = d.y, Z = d.z, xx = X * X, yy = Y * Y, zz = Z * Z;
-    Vec g{0, 0, 0};
-    if constexpr (K >= 3) g = {-kC1 * c[2], -kC1 * c[0], kC1 * c[1]};
-    if constexpr (K >= 8) {
-        const float a = kC2[0], b = kC2[1], e = kC2[2];
-        g.x += a * c[3] * Y - 2 * b * c[5] * X - a * c[6] * Z + 2 * e * c[7] * X;
-        g.y += a * c[3] * X - a * c[4] * Z - 2 * b * c[5] * Y - 2 * e * c[7] * Y;
-        g.z += -a * c[4] * Y + 4 * b * c[5] * Z - a * c[6] * X;
-    }
-    if constexpr (K >= 15) {
-        const float p = kC3[0] * c[8], q = kC3[1] * c[9], r = kC3[2] * c[10], s = kC3[3] * c[11], t = kC3[2] * c[12],
-                    u = kC3[4] * c[13], v = kC3[0] * c[14];
-        g.x += -6 * p * X * Y + q * Y * Z + 2 * r * X * Y - 6 * s * X * Z - t * (4 * zz - 3 * xx - yy) + 2 * u * X * Z -
-               3 * v * (xx - yy);
-        g.y += -3 * p * (xx - yy) + q * X * Z - r * (4 * zz - xx - 3 * yy) - 6 * s * Y * Z + 2 * t * X * Y -
-               2 * u * Y * Z + 6 * v * X * Y;
-        g.z += q * X * Y - 8 * r * Y * Z + s * (6 * zz - 3 * xx - 3 * yy) - 8 * t * X * Z + u * (xx - yy);
-    }
-    return g;
-}
-
-template <int K>
-Vec color_before_clamp(Vec direction, Vec dc, const float* sh, float* y) {
-    basis<K>(direction, y);
-    for (int k = 0; k < K; ++k) dc = dc + y[k] * load(sh + 3 * k);
-    return dc;
-}
-
 // From a camera to a Gaussian, which may sit in it.
 float view_distance(Vec v) { return std::max(length(v), 1e-12f); }
-
-// ---- Which Gaussians a thread takes
-
-// Ranges of faces with about equally many Gaussians each: threads + 1 bounds.
-std::vector<int64_t> face_bounds(const int64_t* face, int64_t N, int64_t F, int threads) {
-    std::vector<int64_t> count(F, 0), bounds(threads + 1, F);
-    for (int64_t i = 0; i < N; ++i) ++count[face[i]];
-    bounds[0] = 0;
-    int64_t sum = 0;
-    int next = 1;
-    for (int64_t f = 0; f < F && next < threads; ++f) {
-        sum += count[f];
-        while (next < threads && sum >= share(N, next, threads)) bounds[next++] = f + 1;
-    }
-    return bounds;
-}
-
-// Calls work(i, thread) for every Gaussian. With `by_face`, those of one face are taken by one thread, in index order.
-template <class Work>
-void for_gaussians(const int64_t* face, int64_t N, int64_t F, bool by_face, int threads, Work&& work) {
-    const std::vector<int64_t> bounds = by_face && threads > 1 ? face_bounds(face, N, F, threads) : std::vector<int64_t>();
-    run_threads(threads, [&](int t) {
-        if (bounds.empty()) {
-            for (int64_t i = share(N, t, threads), end = share(N, t + 1, threads); i < end; ++i) work(i, t);
-            return;
-        }
-        for (int64_t i = 0; i < N; ++i)
-            if (face[i] >= bounds[t] && face[i] < bounds[t + 1]) work(i, t);
-    });
-}
 
 template <int K>
 void colors_forward(const int64_t* face, const float* rotations, const float* dc, const float* sh, const float* means,
