@@ -31,7 +31,7 @@ BOUND = 256 << 20
 def main() -> int:
     """Measure and store."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--images", type=int, default=24, help="distinct images of 1500 x 2000")
+    parser.add_argument("--images", type=int, default=16, help="distinct images of 1500 x 2000")
     parser.add_argument("--frames", type=int, default=6000, help="frames of the long capture")
     parser.add_argument("--captures", type=Path, default=Path("../shared/captures"), help="for the two calibrations")
     parser.add_argument("--memory-of", type=Path, help=argparse.SUPPRESS)
@@ -81,7 +81,7 @@ def write_images(root: Path, *, size: tuple[int, int], count: int, photographs: 
 def throughput(root: Path, count: int) -> dict[str, object]:
     """Each way of reading the same files beside the plain decode of them, in alternation; medians of three rounds."""
     write_images(root / "black", size=(1500, 2000), count=count, photographs=False)
-    write_images(root / "photos", size=(3000, 4000), count=count // 3, photographs=True)
+    write_images(root / "photos", size=(3000, 4000), count=count // 4, photographs=True)
     # Nothing is kept: every image is decoded anew.
     black = open_capture(root / "black", cache_bytes=0)
     photos = open_capture(root / "photos", cache_bytes=0).resized(0.5)

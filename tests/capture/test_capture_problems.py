@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +12,14 @@ from PIL import Image
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.core.errors import InputError
 from tests.capture.scene import make_scene
-from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_neus2, write_simple
+from tests.capture.writers import (
+    write_4ddress,
+    write_actorshq,
+    write_avatarrex,
+    write_easymocap,
+    write_neus2,
+    write_simple,
+)
 
 
 @pytest.fixture
@@ -39,6 +47,7 @@ def test_a_truncated_image_is_named_and_left_out(rig):
     rest = capture.without(problems)
     assert len(rest.views()) == 5 and ("B", 1) not in rest.views()
     assert all(rest.composited(*view).shape == (256, 192, 3) for view in rest.views())
+    assert find_problems(rest) == []
 
 
 def test_a_camera_missing_from_the_calibration_and_one_without_images(rig):
@@ -186,6 +195,14 @@ def test_several_scales_of_actorshq_have_to_be_chosen_from(tmp_path):
     with pytest.raises(InputError, match="2x, 4x"):
         open_capture(root)
     assert open_capture(root / "4x").frames == (0, 1)
+
+
+def test_cameras_of_4ddress_that_were_not_released_are_left_out(tmp_path):
+    root = write_4ddress(make_scene(), tmp_path / "set")
+    shutil.rmtree(root / "Capture" / "B")
+    capture = open_capture(root)
+    assert list(capture.cameras) == ["A", "C"] and [p.camera for p in capture.problems] == ["B"]
+    assert find_problems(capture.without(capture.problems)) == []
 
 
 def test_a_folder_of_two_layouts_is_ambiguous(rig):

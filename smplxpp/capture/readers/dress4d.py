@@ -12,7 +12,7 @@ from smplxpp.capture.meshes import MeshFiles
 from smplxpp.capture.params import ParamFiles
 from smplxpp.capture.readers.common import chosen_params, pinhole, required, size_of_first_image
 from smplxpp.capture.readers.options import ReaderOptions
-from smplxpp.capture.recording import Recording
+from smplxpp.capture.recording import Problem, Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.safe_pickle import safe_load
@@ -46,6 +46,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         for kind, folder, before in (("image", "images", "capture-f"), ("mask", "masks", "mask-f"))
     }
     files = {kind: {name: s for name, s in series.items() if len(s)} for kind, series in files.items()}
+    # Calibrated with more cameras than were released; their images' size is not known.
+    released = {str(name): entry for name, entry in content.items() if str(name) in files["image"]}
     meshes = FileSeries.find(root / "Meshes_pkl", r"mesh-f(?P<frame>\d+)\.pkl")
     fits = FileSeries.find(root / "SMPLX", r"mesh-f(?P<frame>\d+)_smplx\.pkl")
     fitted = ParamFiles(fits, "smplx", options.body) if len(fits) else None
@@ -53,10 +55,15 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         name="_".join(root.resolve().parts[-3:]),
         root=root,
         format=NAME,
-        cameras={str(name): _camera(str(name), entry, path, files["image"]) for name, entry in content.items()},
+        cameras={name: _camera(name, entry, path, files["image"]) for name, entry in released.items()},
         files=files,
         params=chosen_params(options) or fitted,
         meshes=MeshFiles(meshes),
+        problems=tuple(
+            Problem(f"camera {name}: calibrated, but without any image", str(name))
+            for name in content
+            if str(name) not in released
+        ),
     )
 
 

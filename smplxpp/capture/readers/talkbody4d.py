@@ -18,6 +18,7 @@ from smplxpp.core.errors import InputError
 NAME = "talkbody4d"
 LOOKS_FOR = "a JSON file with `cameras` and `camera_poses`, beside a folder with a folder of images for each camera"
 _FPS = 20.0
+_CALIBRATION_KEYS = ("cameras", "camera_poses")
 _PARAM_KEYS = {"body_pose", "betas", "Rh", "Th"}
 
 
@@ -39,10 +40,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     if path is None:
         raise InputError(f"capture {root}", expected=LOOKS_FOR, received="none")
     cameras, distortions = _read_calibration(path)
-    images = next(
-        (folder for folder in [root, *(root / n for n in subfolders(root) if n != "masks")] if _has(folder, cameras)),
-        None,
-    )
+    places = [root / "images", root, *(root / name for name in subfolders(root) if name != "masks")]
+    images = next((folder for folder in places if _has(folder, cameras)), None)
     if images is None:
         raise InputError(
             f"capture {root}", expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ...",
@@ -69,7 +68,7 @@ def _calibration(root: Path) -> Path | None:
             content = read_json(path)
         except InputError:  # a file of another layout, whose reader will say so
             continue
-        if isinstance(content, Mapping) and {"cameras", "camera_poses"} <= content.keys():
+        if isinstance(content, Mapping) and all(isinstance(content.get(key), Mapping) for key in _CALIBRATION_KEYS):
             return path
     return None
 
