@@ -47,8 +47,15 @@ def rasterize_mesh(mesh: TriangleMesh, camera: Camera, *, near: float = 1e-3, th
 
     A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads`.
     """
-    screen = np.ascontiguousarray(camera.screen_from_world(mesh.vertices), dtype=np.float64)
-    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+    return rasterize_triangles(mesh.vertices, mesh.faces, camera, near=near, threads=threads)
+
+
+def rasterize_triangles(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, near: float = 1e-3, threads: int | None = None
+) -> MeshMaps:
+    """`rasterize_mesh` for arrays that the caller has checked: vertices (N, 3) finite, faces (M, 3) within them."""
+    screen = np.ascontiguousarray(camera.screen_from_world(vertices), dtype=np.float64)
+    faces = np.ascontiguousarray(faces, dtype=np.int32)
     height, width = camera.height, camera.width
     face_id = np.empty((height, width), np.int32)
     barycentric = np.empty((height, width, 3), np.float32)

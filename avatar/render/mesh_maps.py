@@ -1,0 +1,173 @@
+"""Maps of a mesh with gradients: what a z-buffer sees, as tensors.
+
+Gradients reach vertex values, and vertices through the barycentrics and the depth at fixed pixels, as in nvdiffrast's
+rasterise and interpolate. Which face a pixel shows is a constant: there is no gradient of silhouettes.
+
+    maps = mesh_maps(vertices, faces, camera, attributes=colors)
+    normals = vertex_normal_map(maps, vertices)
+    posed = front_back_maps(rest_vertices, faces, MapFrame.of(rest), size=512).interpolate(posed_vertices)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from avatar.render.barycentrics import barycentrics_reference, interpolate_reference
+from avatar.render.native_maps import BarycentricFunction, InterpolateFunction, is_native
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.raster import MeshMaps, rasterize_triangles
+
+if TYPE_CHECKING:
+    from avatar.models.map_sampling import MapFrame
+
+
+@dataclass(frozen=True)
+class MeshMapsTensor:
+    """What one camera, or B cameras of one size, see of a mesh. The leading axis is there for a sequence of cameras.
+
+    Attributes:
+        faces: (F, 3) int64. vertex_count: V. Both of the mesh.
+        face_id: ([B,] H, W) int32, -1 on the background.
+        barycentric: ([B,] H, W, 3) weights of the face's corners, perspective-correct; 0 on the background.
+        depth: ([B,] H, W) metres along the camera's z axis; inf on the background, so mask it before arithmetic.
+        attributes: ([B,] H, W, D) interpolated vertex values, where they were asked for; 0 on the background.
+    """
+
+    faces: Tensor
+    vertex_count: int
+    face_id: Tensor
+    barycentric: Tensor
+    depth: Tensor
+    attributes: Tensor | None = None
+
+    @property
+    def mask(self) -> Tensor:
+        """([B,] H, W) bool: pixels covered by the mesh."""
+        return self.face_id >= 0
+
+    def interpolate(self, values: Tensor) -> Tensor:
+        """Vertex values (V, D) at every pixel: ([B,] H, W, D), 0 on the background; gradients to both.
+
+        Vertices themselves give the position map; so a T-pose's maps carry posed coordinates or semantic colours.
+
+        Raises:
+            InputError: values of the wrong shape, type or device.
+        """
+        if values.dim() != 2 or len(values) != self.vertex_count or not values.is_floating_point():
+            raise InputError(
+                "vertex values",
+                expected=f"floating-point ({self.vertex_count}, D)",
+                received=f"{tuple(values.shape)} {values.dtype}",
+            )
+        if values.device != self.face_id.device:
+            raise InputError("vertex values", expected=f"device {self.face_id.device}", received=str(values.device))
+        if is_native(values, self.barycentric):
+            return InterpolateFunction.apply(values, self.barycentric, self.faces.int(), self.face_id)
+        return interpolate_reference(values, self.barycentric, self.faces, self.face_id)
+
+
+def mesh_maps(
+    vertices: Tensor,
+    faces: Tensor,
+    camera: Camera | Sequence[Camera],
+    attributes: Tensor | None = None,
+    *,
+    near: float = 1e-3,
+) -> MeshMapsTensor:
+    """Rasterise a mesh; both sides of every face are drawn.
+
+    float32 on the CPU runs in the native library; other tensors get faces from the same z-buffer on the CPU and the
+    rest in torch on their device. The same input gives the same bits at one number of threads.
+
+    Args:
+        vertices: (V, 3) world coordinates, metres.
+        faces: (F, 3) integers.
+        camera: perspective or orthographic, one or several of one image size.
+        attributes: (V, D) values to interpolate, as `MeshMapsTensor.interpolate`.
+        near: metres; a face with a corner nearer than this to a perspective camera is skipped whole.
+
+    Raises:
+        InputError: shapes, types, NaN, indices out of range, cameras of several sizes.
+    """
+    cameras = [camera] if isinstance(camera, Camera) else list(camera)
+    _check(vertices, faces, cameras)
+    points, corners = vertices.detach().double().cpu().numpy(), faces.int().cpu()
+    views = []
+    for c in cameras:
+        seen = rasterize_triangles(points, corners.numpy(), c, near=near, threads=torch.get_num_threads())
+        views.append(_view(vertices, corners, seen, c))
+    stacked = views[0] if isinstance(camera, Camera) else [torch.stack(maps) for maps in zip(*views, strict=True)]
+    maps = MeshMapsTensor(faces.to(vertices.device).long(), len(vertices), *stacked)
+    return maps if attributes is None else replace(maps, attributes=maps.interpolate(attributes))
+
+
+def front_back_maps(
+    vertices: Tensor, faces: Tensor, frame: MapFrame, *, size: int = 512, attributes: Tensor | None = None
+) -> MeshMapsTensor:
+    """Orthographic maps (2, size, size) of a canonical mesh from the front and the back, the back mirrored.
+
+    One pixel has the same canonical x and y in both (see `MapFrame`). Rasterise the canonical mesh once and interpolate
+    the values of every frame in it.
+    """
+    return mesh_maps(vertices, faces, frame.cameras(size), attributes)
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """(V, 3) unit normals, faces weighted by their area; zero at a vertex without any. Differentiable."""
+    a, b, c = vertices[faces].unbind(1)
+    cross = torch.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertices).index_add(0, faces.flatten(), cross.repeat_interleave(3, dim=0))
+    return torch.nn.functional.normalize(total, dim=-1, eps=_tiny(vertices))
+
+
+def vertex_normal_map(maps: MeshMapsTensor, vertices: Tensor) -> Tensor:
+    """([B,] H, W, 3) unit world normals interpolated between the vertices'; 0 on the background."""
+    normals = maps.interpolate(vertex_normals(vertices, maps.faces))
+    return torch.nn.functional.normalize(normals, dim=-1, eps=_tiny(normals))
+
+
+def face_normal_map(maps: MeshMapsTensor, vertices: Tensor) -> Tensor:
+    """([B,] H, W, 3) unit world normals of the faces; 0 on the background."""
+    hit = maps.mask
+    a, b, c = vertices[maps.faces].unbind(1)
+    normals = torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=-1), dim=-1, eps=_tiny(vertices))
+    seen = normals[maps.face_id[hit].long()]
+    return vertices.new_zeros((*hit.shape, 3)).index_put(hit.nonzero(as_tuple=True), seen)
+
+
+def _tiny(values: Tensor) -> float:
+    return torch.finfo(values.dtype).tiny
+
+
+def _view(vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Face ids, barycentrics and depth of one camera, the last two with gradients to the vertices."""
+    face_id = torch.from_numpy(seen.face_id).to(vertices.device)
+    if is_native(vertices):
+        return face_id, *BarycentricFunction.apply(vertices, faces, seen, camera)
+    return face_id, *barycentrics_reference(vertices, faces.to(vertices.device).long(), face_id, camera)
+
+
+def _check(vertices: Tensor, faces: Tensor, cameras: list[Camera]) -> None:
+    for name, tensor, kind in (("vertices", vertices, "floating-point"), ("faces", faces, "integer")):
+        right = tensor.is_floating_point() if kind != "integer" else tensor.dtype in (torch.int32, torch.int64)
+        if tensor.dim() != 2 or tensor.shape[1] != 3 or not right:
+            raise InputError(
+                f"mesh {name}", expected=f"{kind} (N, 3)", received=f"{tuple(tensor.shape)} {tensor.dtype}"
+            )
+    if not torch.isfinite(vertices).all():
+        raise InputError("mesh vertices", expected="finite coordinates", received="NaN or infinity")
+    if faces.numel():
+        low, high = (int(v) for v in torch.aminmax(faces))
+        if low < 0 or high >= len(vertices):
+            raise InputError(
+                "mesh faces", expected=f"indices in [0, {len(vertices)})", received=f"indices in [{low}, {high}]"
+            )
+    sizes = {(c.width, c.height) for c in cameras}
+    if len(sizes) != 1:
+        raise InputError("cameras of mesh maps", expected="one or more of one image size", received=f"sizes {sizes}")

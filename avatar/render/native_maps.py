@@ -1,0 +1,86 @@
+"""Kernels of the native library for mesh maps: float32 on the CPU, with gradients (see maps.cpp)."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from avatar.render.barycentrics import ray_from_pixel
+from smplxpp.core.camera import Camera
+from smplxpp.native import native_library
+from smplxpp.raster import MeshMaps
+
+
+def is_native(*tensors: Tensor) -> bool:
+    """Whether the kernels take these tensors: all float32 on the CPU."""
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+
+
+class BarycentricFunction(torch.autograd.Function):
+    """(V, 3) vertices -> barycentrics (H, W, 3) and depth (H, W) as rasterised, with their gradient to the vertices."""
+
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(vertices)
+        ctx.constants = faces, seen.face_id, camera
+        ctx.set_materialize_grads(False)
+        return torch.from_numpy(seen.barycentric), torch.from_numpy(seen.depth)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_barycentric: Tensor | None, grad_depth: Tensor | None) -> tuple[Tensor | None, ...]:
+        (vertices,) = ctx.saved_tensors
+        faces, face_id, camera = ctx.constants
+        pose = torch.from_numpy(camera.cam_from_world)
+        points = vertices.double() @ pose[:3, :3].T + pose[:3, 3]
+        gradients = [None if g is None else g.contiguous() for g in (grad_barycentric, grad_depth)]
+        grad_points = torch.empty_like(points)
+        native_library().smplxpp_barycentric_backward(
+            *map(_pointer, (points, faces, face_id, *gradients, np.ascontiguousarray(ray_from_pixel(camera)))),
+            int(camera.orthographic),
+            camera.width,
+            ctypes.c_int64(face_id.size),
+            ctypes.c_int64(len(points)),
+            _pointer(grad_points),
+            torch.get_num_threads(),
+        )
+        return (grad_points @ pose[:3, :3]).to(vertices.dtype), None, None, None
+
+
+class InterpolateFunction(torch.autograd.Function):
+    """Vertex values (V, D), barycentrics (..., 3), faces (F, 3) int32, face ids (...) int32 -> (..., D)."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, barycentric: Tensor, faces: Tensor, face_id: Tensor) -> Tensor:
+        inputs = [t.contiguous() for t in (values, faces, face_id, barycentric)]
+        ctx.save_for_backward(*inputs)
+        out = values.new_empty((*face_id.shape, values.shape[1]))
+        native_library().smplxpp_interpolate(
+            *map(_pointer, inputs), *map(ctypes.c_int64, (face_id.numel(), values.shape[1])), _pointer(out),
+            torch.get_num_threads(),
+        )  # fmt: skip
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        values, _, face_id, barycentric = inputs
+        grad_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
+        grad_barycentric = torch.empty_like(barycentric) if ctx.needs_input_grad[1] else None
+        native_library().smplxpp_interpolate_backward(
+            *map(_pointer, (*inputs, grad.contiguous())), *map(ctypes.c_int64, (face_id.numel(), *values.shape)),
+            _pointer(grad_values), _pointer(grad_barycentric), torch.get_num_threads(),
+        )  # fmt: skip
+        return grad_values, grad_barycentric, None, None
+
+
+def _pointer(array: Tensor | np.ndarray | None) -> ctypes.c_void_p:
+    if array is None:
+        return ctypes.c_void_p(None)
+    return ctypes.c_void_p(array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
