@@ -1,1 +1,1 @@
-"""The trainer of the compact avatar; nothing is built here yet."""
+"""The trainer of the compact avatar: rasteriser, Gaussians on the template, losses, networks, training, export."""
