@@ -42,8 +42,8 @@ class FitReference:
     body: OptionalPath = None
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     preset: Literal["quick", "default", "paper"] = "default"
-    """quick: 60k Gaussians, 400 iterations, to see whether all fits together; default: 150k and 3,000;
-    paper: 270k and 10,000."""
+    """quick: 60k Gaussians, 200 iterations, to see whether all fits together; default: 150k and 800; paper: 270k and
+    10,000, which is for many cameras."""
     iterations: OptionalInt = None
     """Iterations, in the place of the preset's; each renders one view."""
     gaussians: OptionalInt = None
