@@ -19,6 +19,11 @@ _FEATURES = {
 }
 
 
+def usable_levels() -> tuple[str, ...]:
+    """Those of `LEVELS` that this CPU can run, the best first."""
+    return tuple(level for level in LEVELS if _FEATURES[level] <= _cpu_features())
+
+
 @cache
 def native_library(level: str | None = None) -> ctypes.CDLL:
     """The compiled library, for the best instruction set that this CPU and this build have.

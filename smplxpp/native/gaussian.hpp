@@ -57,11 +57,12 @@ struct Ellipse {
     float a, b, c, log_opacity;
     float pixel_x, pixel_y, rest_x, rest_y;
 };
-// One Gaussian in the list of a tile; bit 4 * row + column of `blocks` says which blocks its ellipse touches.
+// One Gaussian in the list of a tile; bit 4 * row + column of `blocks` says which blocks its ellipse touches, `above` and
+// `below` how many rows of tiles it reaches further (255: that or more).
 struct Hit {
     uint32_t gaussian;
     uint16_t blocks;
-    uint16_t reserved;
+    uint8_t above, below;
 };
 
 // Rows of gradients: 16 floats at a time, so that one transposition sums a row. The first 16 hold six moments and the first
@@ -97,7 +98,8 @@ struct Workspace {
     }
     // Scratch of binning, by thread.
     struct Emission {
-        uint32_t tile, gaussian, blocks;
+        uint32_t tile;
+        Hit hit;
     };
     std::vector<Buffer<Emission>> emissions;
     Buffer<int32_t> counts;          // (threads, tiles)
@@ -109,7 +111,7 @@ void project(const Scene&, const Camera&, Workspace&, float* means2d, float* rad
 void sort_by_depth(int64_t count, const float* depths, const float* radii, Workspace&, int threads);
 void bin(Workspace&, int threads);
 void blend(const Scene&, const Camera&, Workspace&, float* image, float* alpha, int threads);
-void unblend(const Scene&, const Camera&, Workspace&, const float* grad_image, const float* grad_alpha, int threads);
+void unblend(const Scene&, const Camera&, Workspace&, const float* radii, const float* grad_image, const float* grad_alpha, int threads);
 void sum_background(const Scene&, const Workspace&, const float* grad_image, float* grad_background, int threads);
 void chain(const Scene&, const Camera&, const Workspace&, const float* radii, const Gradients&, int threads);
 

@@ -87,7 +87,7 @@ SMPLXPP_EXPORT int32_t gaussian_backward(void* workspace, const Scene* scene, co
         Workspace& w = *(Workspace*)workspace;
         StageClock clock(seconds);
         if (gradients->background) sum_background(*scene, w, grad_image, gradients->background, threads);
-        unblend(*scene, *camera, w, grad_image, grad_alpha, threads);
+        unblend(*scene, *camera, w, radii, grad_image, grad_alpha, threads);
         clock.lap();
         chain(*scene, *camera, w, radii, *gradients, threads);
         clock.lap();

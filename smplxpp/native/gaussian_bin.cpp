@@ -25,15 +25,15 @@ struct Columns {
 // largest at y_right (smallest at -y_right) or at the end of the strip next to it. Widened by `slack` against rounding:
 // the blend tests each pixel.
 struct Outline {
-    float a, b, c, reach, x, y, half_height, y_right, slack;
+    float b, c, inv_a, reach, x, y, half_height, y_right, slack;
 
-    explicit Outline(const Ellipse& e) : a(e.a), b(e.b), c(e.c), reach(e.log_opacity - LOG2_ALPHA_MIN) {
+    explicit Outline(const Ellipse& e) : b(e.b), c(e.c), inv_a(1.0f / e.a), reach(e.log_opacity - LOG2_ALPHA_MIN) {
         x = e.pixel_x + e.rest_x;
         y = e.pixel_y + e.rest_y;
-        const float ratio = b / c, radius = std::sqrt(reach), length = std::sqrt(1.0f + ratio * ratio);
-        slack = 1e-3f + 4e-6f * (radius / c + radius * length / a);
-        half_height = radius / c + slack;
-        y_right = -ratio * radius / (length * c);
+        const float inv_c = 1.0f / c, radius = std::sqrt(reach), length2 = c * c + b * b, inv_length = 1.0f / std::sqrt(length2);
+        slack = 1e-3f + 4e-6f * radius * (inv_c + length2 * inv_length * inv_c * inv_a);
+        half_height = radius * inv_c + slack;
+        y_right = -b * radius * inv_length * inv_c;
     }
 
     void columns(int strip, int width, Columns& out) const {
@@ -46,27 +46,19 @@ struct Outline {
         const Floats right_q = broadcast(c) * right_y, left_q = broadcast(c) * left_y;
         const Floats right_p = square_root(max(fnma(right_q, right_q, broadcast(reach)), zero));
         const Floats left_p = square_root(max(fnma(left_q, left_q, broadcast(reach)), zero));
-        const Floats inv_a = broadcast(1.0f / a), slope = broadcast(b);
-        const Floats right = fma(fnma(slope, right_y, right_p), inv_a, broadcast(x - 0.5f + slack));
-        const Floats left = fnma(fma(slope, left_y, left_p), inv_a, broadcast(x + 0.5f - slack));
+        const Floats right = fma(fnma(broadcast(b), right_y, right_p), broadcast(inv_a), broadcast(x - 0.5f + slack));
+        const Floats left = fnma(fma(broadcast(b), left_y, left_p), broadcast(inv_a), broadcast(x + 0.5f - slack));
         // Pixels of the strip from ceil(left) to floor(right); truncation is floor for what is not negative.
-        const Floats limit = broadcast(width - 1.0f);
-        const Ints first_pixel = truncated(min(max(left, zero), broadcast((float)width)));
-        const Ints last_pixel = truncated(min(max(right, zero), limit));
-        store(out.first, first_pixel);
-        store(out.last, last_pixel);
-        alignas(64) float r[LANES], t[LANES], l[LANES];
-        store(r, right), store(t, top), store(l, bottom);
-        for (int i = 0; i < LANES; ++i) {
-            const bool some = t[i] <= l[i] && r[i] >= 0 && out.first[i] <= out.last[i];
-            out.first[i] = some ? out.first[i] / BLOCK : 1 << 28;
-            out.last[i] = some ? out.last[i] / BLOCK : -1;
-        }
+        const Ints first = truncated(min(max(left, zero), broadcast((float)width)));
+        const Ints last = truncated(min(max(right, zero), broadcast(width - 1.0f)));
+        const Mask some = without((bottom >= top) & (right >= zero), first > last);
+        store(out.first, where(some, shifted_right(first, 2), broadcast(1 << 28)));
+        store(out.last, where(some, shifted_right(last, 2), broadcast(-1)));
     }
 };
 
 // Appends the tiles of one tile row, four strips of columns, to the notes.
-inline Workspace::Emission* emit_tile_row(const int32_t* first, const int32_t* last, int64_t tile_row, uint32_t gaussian,
+inline Workspace::Emission* emit_tile_row(const int32_t* first, const int32_t* last, int64_t tile_row, Hit hit,
                                           int32_t* histogram, Workspace::Emission* out) {
     const int begin = std::min(std::min(first[0], first[1]), std::min(first[2], first[3])) / STRIPS_PER_TILE;
     const int end = std::max(std::max(last[0], last[1]), std::max(last[2], last[3]));
@@ -79,10 +71,10 @@ inline Workspace::Emission* emit_tile_row(const int32_t* first, const int32_t* l
             all |= bits[r];
         }
         for (int64_t tile = tile_row + segment; all; ++tile, all >>= 4) {
-            const uint32_t blocks = (uint32_t)((bits[0] & 15) | (bits[1] & 15) << 4 | (bits[2] & 15) << 8 | (bits[3] & 15) << 12);
+            hit.blocks = (uint16_t)((bits[0] & 15) | (bits[1] & 15) << 4 | (bits[2] & 15) << 8 | (bits[3] & 15) << 12);
             for (uint64_t& b : bits) b >>= 4;
-            if (!blocks) continue;
-            *out++ = {(uint32_t)tile, gaussian, blocks};
+            if (!hit.blocks) continue;
+            *out++ = {(uint32_t)tile, hit};
             ++histogram[tile];
         }
     }
@@ -111,13 +103,14 @@ void bin(Workspace& w, int threads) {
             const float top = std::max(outline.y - outline.half_height - 0.5f, 0.0f);
             const float bottom = std::min(outline.y + outline.half_height - 0.5f, w.height - 1.0f);
             if (!(top <= bottom)) continue;
-            const int begin = (int)top / TILE * STRIPS_PER_TILE, last = (int)bottom / BLOCK;
-            for (int strip = begin; strip <= last; strip += STRIPS) {
+            const int first_row = (int)top / TILE, last_row = (int)bottom / TILE, last_strip = (int)bottom / BLOCK;
+            for (int strip = first_row * STRIPS_PER_TILE; strip <= last_strip; strip += STRIPS) {
                 outline.columns(strip, w.width, columns);
-                for (int r = 0; r < STRIPS && strip + r <= last; r += STRIPS_PER_TILE) {
+                for (int r = 0; r < STRIPS && strip + r <= last_strip; r += STRIPS_PER_TILE) {
+                    const int row = (strip + r) / STRIPS_PER_TILE;
+                    const Hit hit = {gaussian, 0, (uint8_t)std::min(row - first_row, 255), (uint8_t)std::min(last_row - row, 255)};
                     Workspace::Emission* out = notes.grow(used + w.tiles_x, used) + used;
-                    const int64_t row = (strip + r) / STRIPS_PER_TILE;
-                    used = emit_tile_row(columns.first + r, columns.last + r, row * w.tiles_x, gaussian, histogram, out) - notes.data();
+                    used = emit_tile_row(columns.first + r, columns.last + r, (int64_t)row * w.tiles_x, hit, histogram, out) - notes.data();
                 }
             }
         }
@@ -139,7 +132,7 @@ void bin(Workspace& w, int threads) {
     run_threads(threads, [&](int t) {
         int64_t* next = place + t * tiles;
         const Workspace::Emission* notes = w.emissions[t].data();
-        for (int64_t i = 0; i < emitted[t]; ++i) hits[next[notes[i].tile]++] = {notes[i].gaussian, (uint16_t)notes[i].blocks, 0};
+        for (int64_t i = 0; i < emitted[t]; ++i) hits[next[notes[i].tile]++] = notes[i].hit;
     });
 }
 

@@ -122,9 +122,11 @@ void write_empty_tile(const Scene& scene, const Camera& camera, const Workspace&
     }
 }
 
+// FIXED channels, or any number where that is 0.
+template <int FIXED>
 void write_tile(const Scene& scene, const Camera& camera, Workspace& w, Thread& t, int64_t tile, float* image, float* alpha) {
     TileState& s = t.state;
-    const int D = scene.channels, near = std::min(D, ROW_CHANNELS);
+    const int D = FIXED ? FIXED : scene.channels, near = std::min(D, ROW_CHANNELS);
     for (int block = 0; block < BLOCKS; ++block) {
         const BlockPlace place(w, tile, block);
         const int64_t kept = (tile * BLOCKS + block) * LANES;
@@ -189,7 +191,7 @@ void blend_tile(const Scene& scene, const Camera& camera, Workspace& w, Thread& 
         }
     }
     w.tile_work[tile] = visits;
-    write_tile(scene, camera, w, t, tile, image, alpha);
+    (scene.channels == D ? write_tile<D> : write_tile<0>)(scene, camera, w, t, tile, image, alpha);
 }
 
 template <int D, bool MORE>

@@ -94,18 +94,21 @@ void chain(const Scene& scene, const Camera& camera, const Workspace& w, const f
     std::vector<PoseGradient> poses(threads, PoseGradient{});
     Failure failure;
     run_threads(threads, [&](int t) { failure.guard([&] {
-        std::vector<float> row(stride);
+        std::vector<float> sum(stride), nothing(stride, 0.0f);
         for (int64_t i = scene.count * t / threads, end = scene.count * (t + 1) / threads; i < end; ++i) {
             OneGradient one = {};
+            const float* row = nothing.data();
             if (radii[2 * i] > 0) {
                 const Workspace::Owners o = w.owners[i];
-                std::copy(&w.rows[i * stride], &w.rows[(i + 1) * stride], row.begin());
-                for (int64_t extra = o.extra; extra < (int64_t)o.extra + o.last - o.first; ++extra) {
-                    for (int64_t j = 0; j < stride; ++j) row[j] += w.rows[extra * stride + j];
+                row = &w.rows[i * stride];
+                if (o.first != o.last) {
+                    std::copy(row, row + stride, sum.begin());
+                    for (int64_t extra = o.extra; extra < (int64_t)o.extra + o.last - o.first; ++extra) {
+                        for (int64_t j = 0; j < stride; ++j) sum[j] += w.rows[extra * stride + j];
+                    }
+                    row = sum.data();
                 }
-                one = chain_one(projection, scene, i, w.ellipses[i], row.data(), gradients.viewmat ? &poses[t] : nullptr);
-            } else {
-                std::fill(row.begin(), row.end(), 0.0f);
+                one = chain_one(projection, scene, i, w.ellipses[i], row, gradients.viewmat ? &poses[t] : nullptr);
             }
             put<3>(gradients.means + 3 * i, one.mean, gradients.accumulate);
             put<4>(gradients.quats + 4 * i, one.quat, gradients.accumulate);

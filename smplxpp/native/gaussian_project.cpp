@@ -17,8 +17,8 @@ bool project_one(const Projection& camera, const float* mean, const float* quat,
     const Point point = camera.transformed(mean);
     depth = (float)point.z;
     if (!(depth > 0 && depth >= camera.near_plane && depth <= camera.far_plane) || !(opacity >= ALPHA_MIN)) return false;
-    mean2d[0] = camera.fx * point.x / point.z + camera.cx;
-    mean2d[1] = camera.fy * point.y / point.z + camera.cy;
+    mean2d[0] = camera.fx * point.x * point.inv_z + camera.cx;
+    mean2d[1] = camera.fy * point.y * point.inv_z + camera.cy;
     const Footprint f = camera.footprint(point, quat, scale);
     // The determinant by the Cauchy-Binet formula: a sum of squares, where xx * yy - xy^2 would cancel.
     const float n0 = f.u[1] * f.v[2] - f.u[2] * f.v[1], n1 = f.u[2] * f.v[0] - f.u[0] * f.v[2],
@@ -34,9 +34,9 @@ bool project_one(const Projection& camera, const float* mean, const float* quat,
     ellipse.b = -ellipse.a * uv / yy;
     ellipse.c = std::sqrt(s / yy);
     ellipse.log_opacity = std::log2(opacity);
-    const float reach = ellipse.log_opacity - LOG2_ALPHA_MIN;  // p^2 + q^2 on the outline
-    radius[0] = std::sqrt(std::max(reach, 0.0f) * xx / s);
-    radius[1] = std::sqrt(std::max(reach, 0.0f) * yy / s);
+    const float reach = std::max(ellipse.log_opacity - LOG2_ALPHA_MIN, 0.0f) / s;  // p^2 + q^2 on the outline, over s
+    radius[0] = std::sqrt(reach * xx);
+    radius[1] = std::sqrt(reach * yy);
     if (!(mean2d[0] + radius[0] > 0 && mean2d[0] - radius[0] < camera.width) ||
         !(mean2d[1] + radius[1] > 0 && mean2d[1] - radius[1] < camera.height))
         return false;

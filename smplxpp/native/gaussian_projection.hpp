@@ -8,7 +8,7 @@
 namespace smplxpp::gaussian {
 
 struct Point {
-    double x, y, z;
+    double x, y, z, inv_z;
 };
 
 // Rows of J W R S: the covariance on the image is [u u', u v'; u v', v v'] + eps2d I, with the Jacobian J of the
@@ -44,8 +44,9 @@ struct Projection {
     // The mean in the camera's frame, in double precision: 1e-7 of an image of 2000 pixels would be seen in the picture.
     Point transformed(const float* m) const {
         const double x = m[0], y = m[1], z = m[2];
-        return {view[0] * x + view[1] * y + view[2] * z + view[3], view[4] * x + view[5] * y + view[6] * z + view[7],
-                view[8] * x + view[9] * y + view[10] * z + view[11]};
+        const double depth = view[8] * x + view[9] * y + view[10] * z + view[11];
+        return {view[0] * x + view[1] * y + view[2] * z + view[3], view[4] * x + view[5] * y + view[6] * z + view[7], depth,
+                1.0 / depth};
     }
 
     Footprint footprint(const Point& point, const float* quat, const float* scale) const {
@@ -58,8 +59,8 @@ struct Projection {
         r[0] = 1 - 2 * (b * b + c * c), r[1] = 2 * (a * b - w * c), r[2] = 2 * (a * c + w * b);
         r[3] = 2 * (a * b + w * c), r[4] = 1 - 2 * (a * a + c * c), r[5] = 2 * (b * c - w * a);
         r[6] = 2 * (a * c - w * b), r[7] = 2 * (b * c + w * a), r[8] = 1 - 2 * (a * a + b * b);
-        const float z = (float)point.z, x_z = (float)(point.x / point.z), y_z = (float)(point.y / point.z);
-        f.inv_z = 1.0f / z;
+        const float z = (float)point.z, x_z = (float)(point.x * point.inv_z), y_z = (float)(point.y * point.inv_z);
+        f.inv_z = (float)point.inv_z;
         f.free_x = x_z >= x_low && x_z <= x_high;
         f.free_y = y_z >= y_low && y_z <= y_high;
         f.x = z * std::min(x_high, std::max(x_low, x_z));

@@ -48,29 +48,35 @@ std::vector<int64_t> cut_tiles(const Workspace& w, int threads) {
     return cut;
 }
 
-// Which threads touch each visible Gaussian, from the tile rows of its box; returns the number of rows.
-int64_t assign_rows(int64_t count, Workspace& w, const std::vector<int64_t>& cut, int threads) {
-    w.owners.reserve(count);
-    std::vector<int> first_owner(w.tiles_y), last_owner(w.tiles_y);  // of a tile row
-    for (int y = 0; y < w.tiles_y; ++y) {
-        const int64_t first = (int64_t)y * w.tiles_x, last = first + w.tiles_x - 1;
-        first_owner[y] = (int)(std::upper_bound(cut.begin(), cut.end() - 1, first) - cut.begin()) - 1;
-        last_owner[y] = (int)(std::upper_bound(cut.begin(), cut.end() - 1, last) - cut.begin()) - 1;
+// The threads that own the tiles of each row of tiles.
+struct RowOwners {
+    std::vector<int> first, last;
+    RowOwners(const Workspace& w, const std::vector<int64_t>& cut) : first(w.tiles_y), last(w.tiles_y) {
+        const auto owner = [&](int64_t tile) { return (int)(std::upper_bound(cut.begin(), cut.end() - 1, tile) - cut.begin()) - 1; };
+        for (int y = 0; y < w.tiles_y; ++y) {
+            first[y] = owner((int64_t)y * w.tiles_x);
+            last[y] = owner((int64_t)(y + 1) * w.tiles_x - 1);
+        }
     }
+};
+
+// Which threads touch each visible Gaussian, from the tile rows of its box; returns the number of rows of gradients.
+int64_t assign_rows(int64_t count, const float* radii, Workspace& w, const RowOwners& owners, int threads) {
+    w.owners.reserve(count);
     std::vector<int64_t> extra(threads + 1, 0);
     const auto each = [&](int t, auto&& work) {
-        for (int64_t k = w.visible * t / threads, end = w.visible * (t + 1) / threads; k < end; ++k) work((uint32_t)w.order[k]);
+        for (int64_t i = count * t / threads, end = count * (t + 1) / threads; i < end; ++i) {
+            if (radii[2 * i] > 0) work(i);
+        }
     };
     run_threads(threads, [&](int t) {
         int64_t sum = 0;
-        each(t, [&](uint32_t g) {
-            const Ellipse& e = w.ellipses[g];
+        each(t, [&](int64_t i) {
             // A little more than the box that binning took.
-            const float y = e.pixel_y + e.rest_y, height = 1.0001f * std::sqrt(e.log_opacity - LOG2_ALPHA_MIN) / e.c + 1.0f;
-            const float limit = w.tiles_y - 1.0f;
+            const float y = w.ellipses[i].pixel_y, height = 1.0001f * radii[2 * i + 1] + 2.0f, limit = w.tiles_y - 1.0f;
             const int top = (int)std::clamp((y - height) / TILE, 0.0f, limit), bottom = (int)std::clamp((y + height) / TILE, 0.0f, limit);
-            w.owners[g] = {0, (uint16_t)first_owner[top], (uint16_t)last_owner[bottom]};
-            sum += last_owner[bottom] - first_owner[top];
+            w.owners[i] = {0, (uint16_t)owners.first[top], (uint16_t)owners.last[bottom]};
+            sum += owners.last[bottom] - owners.first[top];
         });
         extra[t + 1] = sum;
     });
@@ -78,19 +84,29 @@ int64_t assign_rows(int64_t count, Workspace& w, const std::vector<int64_t>& cut
     for (int t = 0; t < threads; ++t) extra[t + 1] += extra[t];
     run_threads(threads, [&](int t) {
         int64_t next = extra[t];
-        each(t, [&](uint32_t g) {
-            Workspace::Owners& o = w.owners[g];
-            o.extra = (uint32_t)next;
-            next += o.last - o.first;
+        each(t, [&](int64_t i) {
+            w.owners[i].extra = (uint32_t)next;
+            next += w.owners[i].last - w.owners[i].first;
         });
     });
     return extra[threads];
 }
 
-// Gradients and state of a tile's pixels, by block and lane.
+// How many rows of tiles up and down from a tile belong to its thread alone: what reaches no further is nobody else's.
+struct Alone {
+    int above = -1, below = -1;
+    Alone(const RowOwners& owners, int row, int thread) {
+        while (above < 254 && row - above - 1 >= 0 && owners.first[row - above - 1] == thread) ++above;
+        while (below < 254 && row + below + 1 < (int)owners.last.size() && owners.last[row + below + 1] == thread) ++below;
+    }
+    bool holds(const Hit& hit) const { return hit.above <= above && hit.below <= below; }
+};
+
+// Gradients and state of a tile's pixels, by block and lane. FIXED channels, or any number where that is 0.
+template <int FIXED>
 void load_tile(const Scene& scene, const Camera& camera, const Workspace& w, Thread& t, int64_t tile, int64_t count,
                const float* grad_image, const float* grad_alpha) {
-    const int D = scene.channels;
+    const int D = FIXED ? FIXED : scene.channels;
     for (int block = 0; block < BLOCKS; ++block) {
         const BlockPlace place(w, tile, block);
         t.last[block] = 0;
@@ -209,19 +225,21 @@ void unblend_visits(const Scene& scene, Thread& t, const Hit* hits, int visits, 
 
 template <int D, bool MORE>
 void unblend_tile(const Scene& scene, const Camera& camera, const Workspace& w, Thread& t, int thread, int64_t tile,
-                  const float* grad_image, const float* grad_alpha) {
+                  const RowOwners& owners, const float* grad_image, const float* grad_alpha) {
     const int64_t begin = w.tile_start[tile], count = w.tile_start[tile + 1] - begin;
     if (count == 0) return;
-    load_tile(scene, camera, w, t, tile, count, grad_image, grad_alpha);
+    (scene.channels == D ? load_tile<D> : load_tile<0>)(scene, camera, w, t, tile, count, grad_image, grad_alpha);
     const int32_t needed = *std::max_element(t.last, t.last + BLOCKS);
     const float x = (float)((tile % w.tiles_x) * TILE + TILE / 2), y = (float)((tile / w.tiles_x) * TILE + TILE / 2);
     const int64_t stride = (int64_t)LANES * row_groups(scene.channels);
+    const Alone alone(owners, (int)(tile / w.tiles_x), thread);
     for (int32_t base = (needed - 1) / CHUNK * CHUNK; base >= 0 && needed; base -= CHUNK) {
         const Hit* hits = w.hits.data() + begin + base;
         const int n = std::min(CHUNK, needed - base);
         t.chunk.gather<D>(scene, w, hits, n, n, x, y);
         for (int i = 0; i < n; ++i) {
-            t.row[i] = w.rows.data() + w.row_of(hits[i].gaussian, thread) * stride;
+            const int64_t row = alone.holds(hits[i]) ? hits[i].gaussian : w.row_of(hits[i].gaussian, thread);
+            t.row[i] = w.rows.data() + row * stride;
             __builtin_prefetch(t.row[i], 1);
         }
         unblend_visits<D, MORE>(scene, t, hits, list_visits(t, hits, n, base), base);
@@ -229,10 +247,11 @@ void unblend_tile(const Scene& scene, const Camera& camera, const Workspace& w, 
 }
 
 template <int D, bool MORE>
-void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const float* grad_image, const float* grad_alpha,
-                   int threads) {
+void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const float* radii, const float* grad_image,
+                   const float* grad_alpha, int threads) {
     const std::vector<int64_t> cut = cut_tiles(w, threads);
-    const int64_t rows = assign_rows(scene.count, w, cut, threads), stride = (int64_t)LANES * row_groups(scene.channels);
+    const RowOwners owners(w, cut);
+    const int64_t rows = assign_rows(scene.count, radii, w, owners, threads), stride = (int64_t)LANES * row_groups(scene.channels);
     w.rows.reserve(rows * stride);
     Failure failure;
     run_threads(threads, [&](int t) {
@@ -245,7 +264,7 @@ void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const
         thread->gradient.reserve(BLOCKS * thread->plane);
         std::fill(thread->gradient.data(), thread->gradient.data() + thread->gradient.capacity(), 0.0f);
         for (int64_t tile = cut[t]; tile < cut[t + 1]; ++tile) {
-            unblend_tile<D, MORE>(scene, camera, w, *thread, t, tile, grad_image, grad_alpha);
+            unblend_tile<D, MORE>(scene, camera, w, *thread, t, tile, owners, grad_image, grad_alpha);
         }
     }); });
     failure.rethrow();
@@ -253,14 +272,14 @@ void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const
 
 }  // namespace
 
-void unblend(const Scene& scene, const Camera& camera, Workspace& w, const float* grad_image, const float* grad_alpha,
-             int threads) {
+void unblend(const Scene& scene, const Camera& camera, Workspace& w, const float* radii, const float* grad_image,
+             const float* grad_alpha, int threads) {
     const int D = scene.channels;
-    if (D <= 3) return unblend_tiles<3, false>(scene, camera, w, grad_image, grad_alpha, threads);
-    if (D <= 4) return unblend_tiles<4, false>(scene, camera, w, grad_image, grad_alpha, threads);
-    if (D <= 7) return unblend_tiles<7, false>(scene, camera, w, grad_image, grad_alpha, threads);
-    if (D <= ROW_CHANNELS) return unblend_tiles<ROW_CHANNELS, false>(scene, camera, w, grad_image, grad_alpha, threads);
-    return unblend_tiles<ROW_CHANNELS, true>(scene, camera, w, grad_image, grad_alpha, threads);
+    if (D <= 3) return unblend_tiles<3, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
+    if (D <= 4) return unblend_tiles<4, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
+    if (D <= 7) return unblend_tiles<7, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
+    if (D <= ROW_CHANNELS) return unblend_tiles<ROW_CHANNELS, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
+    return unblend_tiles<ROW_CHANNELS, true>(scene, camera, w, radii, grad_image, grad_alpha, threads);
 }
 
 }  // namespace smplxpp::gaussian

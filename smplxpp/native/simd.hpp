@@ -98,6 +98,9 @@ SMPLXPP_INLINE Ints load(const int32_t* p) {
 SMPLXPP_INLINE void store(float* p, Floats a) { std::memcpy(p, &a, sizeof a); }
 SMPLXPP_INLINE void store(int32_t* p, Ints a) { std::memcpy(p, &a, sizeof a); }
 
+SMPLXPP_INLINE Ints shifted_right(Ints a, int bits) {
+    return map<PARTS>([bits](auto x) { return x >> bits; }, a);
+}
 SMPLXPP_INLINE Ints truncated(Floats a) {
     return map<PARTS>([](auto x) { return __builtin_convertvector(x, NativeInt); }, a);
 }

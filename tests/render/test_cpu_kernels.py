@@ -17,7 +17,7 @@ IMAGE_TOLERANCE = {"avx512": 1e-6, "avx2": 1e-6, "generic": 2e-6}
 """Largest error of values of order 1; without fused multiply-add every product is rounded once more."""
 GRADIENT_TOLERANCE = 1e-5
 """Largest error of a gradient, as a share of its largest entry."""
-USABLE = [level for level in native.LEVELS if native._FEATURES[level] <= native._cpu_features()]
+USABLE = native.usable_levels()
 
 
 @pytest.fixture(params=USABLE)
