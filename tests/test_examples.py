@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from avatar.export.splats import read_splat_ply
 from smplxpp import Template
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,6 +21,7 @@ FILES = {
     "02_transfer_weights": {"as_published.ply", "default.ply", "default_for_lower_clothes.ply"},
     "03_metrics": {"comparison.json"},
     "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
+    "05_fit_reference": {"run", "metrics.jsonl", "splats.ply", "Cam004.png"},
 }
 
 
@@ -49,7 +51,13 @@ def test_every_example_is_listed_and_short() -> None:
 def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> None:
     text = run_example(name, tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
-    check = {"01": check_build, "02": check_transfer, "03": check_metrics, "04": check_animate}[name[:2]]
+    check = {
+        "01": check_build,
+        "02": check_transfer,
+        "03": check_metrics,
+        "04": check_animate,
+        "05": check_fit_reference,
+    }[name[:2]]
     check(text, tmp_path / "out")
 
 
@@ -77,7 +85,13 @@ def check_metrics(text: str, out: Path) -> None:
 
 
 def check_animate(text: str, out: Path) -> None:
-    assert numbers(r"motion.glb: (\d+) frames at (\S+) a second", text) == [24, 10]
+    assert numbers(r"motion.glb: (\d+) frames at (\S+) a second", text) == [16, 10]
     squat = trimesh.load(out / "squat.ply", process=False)
     standing = 1.5
     assert 0.5 < squat.extents[1] < standing
+
+
+def check_fit_reference(text: str, out: Path) -> None:
+    psnr, ssim = numbers(r"PSNR (\S+) dB, SSIM (\S+)", text)
+    assert psnr > 19.0 and ssim > 0.93
+    assert len(read_splat_ply(out / "splats.ply")) == 50_000
