@@ -86,5 +86,5 @@ PRESETS: dict[str, FitConfig] = {
     "default": FitConfig(sampling=SamplingConfig(count=150_000), iterations=800),
     "paper": FitConfig(sampling=SamplingConfig(count=270_000, head_share=70 / 270), iterations=10_000),
 }
-"""quick shows whether all fits together; default ends where a dozen cameras have no more to give to views held out; paper
-has TaoAvatar's numbers."""
+"""quick shows whether all fits together; default ends where a dozen cameras have no more to give to views held out;
+paper has TaoAvatar's numbers."""

@@ -115,7 +115,7 @@ class FitReference:
 def _progress(total: int, *, enabled: bool) -> Iterator[Callable[[FitProgress], None]]:
     """A bar with loss, the held-out views' PSNR, speed and the time that is left."""
     columns = (
-        TextColumn("fit"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+        BarColumn(bar_width=10), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     quality: dict[str, Any] = {}

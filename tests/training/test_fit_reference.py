@@ -11,7 +11,7 @@ import torch
 from avatar.export.splats import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.training import DivergedError, FitConfig, FitScene, LearningRates, View, fit_reference
-from avatar.training.fit_reference import FitTask, head_box
+from avatar.training.fit_reference import FitTask, choose_device, head_box
 from avatar.training.metrics_log import read_metrics
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
@@ -140,6 +140,13 @@ def test_choices_out_of_range_are_refused(change):
 def test_learning_rates_are_positive():
     with pytest.raises(InputError, match="learning rate dc"):
         LearningRates(dc=0.0)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is there")
+def test_cuda_is_refused_where_there_is_none():
+    assert choose_device("auto") == choose_device("cpu") == "cpu"
+    with pytest.raises(InputError, match="CUDA device"):
+        choose_device("cuda")
 
 
 def test_the_heads_box_is_around_its_projection():
