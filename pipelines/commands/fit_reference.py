@@ -125,9 +125,11 @@ def _progress(total: int, *, enabled: bool) -> Iterator[Callable[[FitProgress], 
         def show(state: FitProgress) -> None:
             if state.evaluation is not None:
                 quality.update(state.evaluation["mean"], held_out=state.evaluation["held_out"])
-            figures = [f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}"]
+            figures = []
             if state.metrics:
-                figures = [f"loss {state.metrics['loss']:.4f}", *figures, f"{state.rate:.1f} it/s"]
+                figures += [f"loss {state.metrics['loss']:.4f}", f"{state.rate:.1f} it/s"]
+            if quality:  # a fit taken up again has none before its next evaluation
+                figures += [f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}"]
             bar.update(task, completed=state.iteration, figures="  ".join(figures))
 
         yield show

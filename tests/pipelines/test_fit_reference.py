@@ -142,6 +142,14 @@ def _often(init):
     return often
 
 
+def test_progress_shows_a_fit_that_is_taken_up_again():
+    from avatar.training import Progress
+
+    with command._progress(20, enabled=True) as show:
+        show(Progress(10, 20, 1.0, 5.0, {"loss": 0.5}))
+        show(Progress(20, 20, 2.0, 5.0, {"loss": 0.4}, {"held_out": True, "mean": {"psnr": 20.0}}))
+
+
 def test_held_out_cameras_are_the_users_choice(tmp_path, capture, capsys):
     run = write_run(tmp_path / "run")
     assert fit(run, capture, "--hold-out", "Ring1", "--iterations", "1", "--scale", "0.5") == 0
