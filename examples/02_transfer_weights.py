@@ -29,10 +29,12 @@ def main() -> None:
     body = smplxpp.load_body()
     params = smplxpp.load_params(PERSON / "params" / "params.npz").frame(0)
     posed = body.forward(params).frame(0)
-    skirt, authored = read_layer("lower")
+    cut, authored = read_layer("lower")
+    # The layer as it was cut, skinned to the reference pose: the authored weights are exact for it.
+    skirt = cut.with_vertices(pose(cut.vertices, authored, posed.posed_from_rest))
 
     driven = body.forward(hard_poses(params)).posed_from_rest[list(HARD_POSES).index("high_step")]
-    truth = pose(unpose(skirt.vertices, authored, posed.posed_from_rest).vertices, authored, driven)
+    truth = pose(cut.vertices, authored, driven)
     for name, config in SETTINGS.items():
         weights = smplxpp.transfer_weights(body.mesh(posed.vertices), body.weights, skirt, config=config)
         rest = unpose(skirt.vertices, weights, posed.posed_from_rest).vertices
@@ -48,10 +50,10 @@ def main() -> None:
 
 
 def read_layer(name: str) -> tuple[smplxpp.TriangleMesh, np.ndarray]:
-    """A true layer of the fixture in its reference pose, and its authored weights (N, 55)."""
-    topology, frame = (np.load(PERSON / "geometry" / f"{file}.npz") for file in ("topology", "frame_000000"))
+    """A true layer of the fixture in the T-pose, and its authored weights (N, 55)."""
+    topology = np.load(PERSON / "geometry" / "topology.npz")
     chosen = topology["face_part"] == topology["part_names"].tolist().index(name)
-    mesh, used = smplxpp.TriangleMesh(frame["verts"], topology["faces"]).submesh(chosen)
+    mesh, used = smplxpp.TriangleMesh(topology["v_tpose"], topology["faces"]).submesh(chosen)
     weights = topology["weights"][used].astype(np.float64)
     return mesh, weights / weights.sum(axis=1, keepdims=True)
 

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from pipelines.makers.motion import Performance, tracker_noise
-from pipelines.makers.person import PART_NAMES, Person
-from pipelines.makers.scan_simulation import ScanConfig, SimulatedScan, simulate_scan
+from pipelines.makers.person import PART_LABELS, PART_NAMES, Person
+from pipelines.makers.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.makers.synth import files
 from pipelines.makers.synth.camera_rig import RigCamera, camera_rig
 from pipelines.makers.synth.checks import scan_checks, take_checks
@@ -179,8 +179,10 @@ def _scan_attributes(person: Person, scan: SimulatedScan) -> tuple[np.ndarray, n
     corners = person.tpose.faces[scan.face]
     rest = np.einsum("pk,pkx->px", scan.barycentric, person.tpose.vertices[corners])
     nearest = corners[np.arange(len(corners)), np.argmax(scan.barycentric, axis=1)]
-    part, label = person.face_part[scan.face], person.vertex_label[nearest]
-    return part, label, person.colors(rest, part, label)
+    shown, label = person.face_part[scan.face], person.vertex_label[nearest]
+    colors = person.colors(rest, shown, label)
+    part = merge_islands(scan.mesh, shown)
+    return part, np.where(part == shown, label, PART_LABELS[part]), colors
 
 
 def _write_views(

@@ -11,7 +11,7 @@ from pipelines.makers.cloth_mesh import diffuse, smooth
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
-from smplxpp.core.topology import face_components
+from smplxpp.core.topology import component_labels, face_components
 from smplxpp.raster import rasterize_mesh, view_directions
 
 
@@ -207,3 +207,19 @@ def _shown_points(layers: TriangleMesh, seen: np.ndarray, points: np.ndarray) ->
     _, face, closest = igl.point_mesh_squared_distance(points, layers.vertices, layers.faces[candidates])
     face = candidates[face]
     return face, barycentric_coordinates(closest, layers.triangles[face])
+
+
+def merge_islands(mesh: TriangleMesh, part: np.ndarray, *, smallest: int = 30) -> np.ndarray:
+    """(N,) part of each vertex, where pieces of fewer than `smallest` vertices take the part that lies around them.
+
+    Where layers touch, the closest one to a noisy vertex is a matter of chance.
+    """
+    part, edges = part.copy(), mesh.edges
+    piece = component_labels(edges[part[edges[:, 0]] == part[edges[:, 1]]], mesh.vertex_count)
+    for small in np.flatnonzero(np.bincount(piece) < smallest):
+        inside = piece[edges] == small
+        crossing = inside[:, 0] != inside[:, 1]
+        around = part[edges[crossing][~inside[crossing]]]
+        if len(around):
+            part[piece == small] = np.argmax(np.bincount(around))
+    return part
