@@ -28,12 +28,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Build",
         "a scan, a body fit and labels in; an SMPLX++ template and a report out",
     ),
+    "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",
         "FitReference",
         "a built template and one frame's photographs in; textured Gaussians on it and their figures out",
     ),
-    "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "animate": (
         "pipelines.commands.animate",
         "Animate",
@@ -41,6 +41,16 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     ),
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
     "synth": ("pipelines.commands.synth", "Synth", "make a synthetic capture of a clothed person with moving cloth"),
+    "capture check": (
+        "pipelines.commands.capture",
+        "CaptureCheckCommand",
+        "what is wrong with a capture's files, masks, parameters and calibration, and what to do",
+    ),
+    "capture convert": (
+        "pipelines.commands.capture",
+        "CaptureConvertCommand",
+        "any capture that can be opened, to our layout or ActorsHQ's",
+    ),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }
 HELP = ("-h", "--help")

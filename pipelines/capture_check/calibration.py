@@ -1,0 +1,146 @@
+"""The calibration against the silhouettes: which cameras and frames do not fit, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from pipelines.capture_check.diagnosis import Diagnosis, diagnose
+from pipelines.capture_check.findings import Finding
+from pipelines.capture_check.mistakes import Mistake, Sample
+from pipelines.capture_check.silhouettes import MIN_SHARE, FitSummary, summary
+from pipelines.capture_check.views import ViewCheck
+from smplxpp.core.camera import Camera
+
+# A frame does not fit by itself if it is bad in this share of its cameras, while most other frames are good.
+_MOST = 0.6
+_SAMPLE_CAMERAS, _SAMPLE_FRAMES = 4, 3
+
+Sampler = Callable[[str, int], Sample | None]
+
+
+def by_camera(views: Iterable[ViewCheck]) -> dict[str, FitSummary]:
+    """Figures of each camera that sees the body."""
+    return _summaries(views, lambda view: view.camera)
+
+
+def by_frame(views: Iterable[ViewCheck]) -> dict[int, FitSummary]:
+    """Figures of each frame in which the body is seen."""
+    return _summaries(views, lambda view: view.frame)
+
+
+def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], sampler: Sampler) -> Iterator[Finding]:
+    """Single frames that do not fit, single cameras that do not, or all: with the mistake that would explain it.
+
+    Args:
+        views: all that were looked at.
+        rig: cameras by name, of the masks' sizes.
+        sampler: gives the view of a camera and a frame to try corrections on.
+    """
+    frames = by_frame(views)
+    lost = {frame for frame, s in frames.items() if s.views > 1 and s.bad >= _MOST * s.views}
+    if len(lost) > 0.5 * len(frames):
+        lost = set()
+    rest = [view for view in views if view.frame not in lost]
+    cameras = by_camera(rest)
+    bad = [name for name, s in cameras.items() if s.verdict == "bad"]
+    doubtful = [name for name, s in cameras.items() if s.verdict == "doubtful"]
+    for frame in sorted(lost):
+        s = frames[frame]
+        words = f"frame {frame}: the body does not fit the masks in {s.bad} of {s.views} cameras ({_figures(s)})"
+        yield Finding("calibration-frame", words, None, frame)
+    if bad and len(bad) >= 0.5 * len(cameras):
+        yield _everywhere(rest, bad, cameras, sampler)
+        return
+    for name in bad:
+        yield _one_camera(name, rest, cameras[name], sampler, rig)
+    if doubtful:
+        yield _loose(doubtful, cameras)
+
+
+def blind_cameras(views: Sequence[ViewCheck]) -> Iterator[Finding]:
+    """Cameras whose every mask is empty, and into which the body does not project either."""
+    for name in dict.fromkeys(view.camera for view in views):
+        own = [view for view in views if view.camera == name]
+        known = [view for view in own if view.mask_share is not None]
+        shown = any(view.fit or view.findings or view.mask_share > MIN_SHARE for view in known)
+        if known and len(known) == len(own) and not shown:
+            yield Finding("camera-sees-nobody", f"camera {name}: its masks are empty, it never sees the person", name)
+
+
+def _everywhere(
+    views: Sequence[ViewCheck], bad: Sequence[str], cameras: Mapping[str, FitSummary], sampler: Sampler
+) -> Finding:
+    chosen = spread(bad, _SAMPLE_CAMERAS)
+    result = diagnose(_samples(views, chosen, sampler))
+    which = "any camera" if len(bad) == len(cameras) else f"{len(bad)} of {len(cameras)} cameras"
+    words = f"the body does not fit the masks of {which} ({_figures(summary(v.fit for v in views if v.fit))})"
+    words, advice = _explained(words, result)
+    return Finding("calibration", words, advice=advice)
+
+
+def _one_camera(
+    name: str,
+    views: Sequence[ViewCheck],
+    fit: FitSummary,
+    sampler: Sampler,
+    rig: Mapping[str, Camera],
+) -> Finding:
+    swaps = [
+        Mistake(
+            f"its images are those of camera {other.name}",
+            f"exchange the folders, or the calibrations, of {name} and {other.name}",
+            camera=lambda _, other=other: other,
+        )
+        for other in rig.values()
+        if other.name != name and (other.width, other.height) == (rig[name].width, rig[name].height)
+    ]
+    words = f"camera {name}: the body does not fit its masks ({_figures(fit)})"
+    words, advice = _explained(words, diagnose(_samples(views, [name], sampler), swaps))
+    return Finding("calibration-camera", words, name, advice=advice)
+
+
+def _loose(doubtful: Sequence[str], cameras: Mapping[str, FitSummary]) -> Finding:
+    median = float(np.median([cameras[name].outside for name in doubtful]))
+    which = "every camera" if len(doubtful) == len(cameras) else f"camera {', '.join(doubtful)}"
+    return Finding(
+        "calibration-loose", f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
+    )
+
+
+def _explained(words: str, result: Diagnosis | None) -> tuple[str, str]:
+    """Words and advice; the diagnosis goes first where there is one."""
+    if result is None:
+        return words, ""
+    after = f"{result.after.outside:.0%} outside, overlap {result.after.iou:.2f}"
+    return f"{words}. It would fit if {result.mistake.words} ({after})", result.mistake.advice
+
+
+def _samples(views: Sequence[ViewCheck], cameras: Sequence[str], sampler: Sampler) -> list[Sample]:
+    """A few views of each camera to try corrections on."""
+    found = []
+    for name in cameras:
+        frames = [view.frame for view in views if view.camera == name and view.fit is not None]
+        found += [sampler(name, frame) for frame in spread(frames, _SAMPLE_FRAMES)]
+    return [sample for sample in found if sample is not None]
+
+
+def spread(items: Sequence, count: int) -> list:
+    """At most `count` of the items, evenly spread, the first and the last among them."""
+    if not len(items):
+        return []
+    chosen = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return [items[k] for k in chosen]
+
+
+def _figures(s: FitSummary) -> str:
+    return f"{s.outside:.0%} of it outside of them, overlap {s.iou:.2f}"
+
+
+def _summaries(views: Iterable[ViewCheck], key: Callable[[ViewCheck], str | int]) -> dict:
+    groups: dict[str | int, list] = {}
+    for view in views:
+        if view.fit is not None:
+            groups.setdefault(key(view), []).append(view.fit)
+    return {name: summary(fits) for name, fits in groups.items()}

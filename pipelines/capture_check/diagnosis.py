@@ -1,0 +1,58 @@
+"""Which of the usual mistakes would explain a calibration that does not fit the silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.capture_check.mistakes import COMBINED, SINGLE, Mistake, Sample, shifts
+from pipelines.capture_check.silhouettes import (
+    IOU_BAD,
+    OUTSIDE_DOUBTFUL,
+    SilhouetteFit,
+    body_silhouette,
+    compare_silhouettes,
+)
+
+# A correction explains the misfit if the body is then this far inside the masks, and the overlap this much larger.
+_FITS_OUTSIDE, _GAIN = 2 * OUTSIDE_DOUBTFUL, 0.05
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The simplest correction that fits, and how well."""
+
+    mistake: Mistake
+    before: SilhouetteFit
+    after: SilhouetteFit
+
+
+def diagnose(samples: Sequence[Sample], extra: Sequence[Mistake] = ()) -> Diagnosis | None:
+    """The correction that brings the body into the masks; None where none does.
+
+    Args:
+        samples: views that do not fit.
+        extra: corrections to try besides the usual ones (another camera's calibration, say).
+    """
+    before = _score(samples, Mistake("", ""))
+    for level in ((*SINGLE, *extra, *shifts(samples)), COMBINED):
+        scored = [(_score(samples, mistake), mistake) for mistake in level]
+        fitting = [item for item in scored if _explains(before, item[0])]
+        if fitting:
+            after, mistake = max(fitting, key=lambda item: item[0].iou - item[0].outside)
+            return Diagnosis(mistake, before, after)
+    return None
+
+
+def _explains(before: SilhouetteFit, after: SilhouetteFit) -> bool:
+    return after.outside < _FITS_OUTSIDE and after.iou > max(IOU_BAD, before.iou + _GAIN)
+
+
+def _score(samples: Sequence[Sample], mistake: Mistake) -> SilhouetteFit:
+    fits = []
+    for sample in samples:
+        silhouette = body_silhouette(mistake.body(sample), sample.faces, mistake.camera(sample.camera))
+        fits.append(compare_silhouettes(silhouette, sample.mask) or SilhouetteFit(1.0, 0.0))
+    return SilhouetteFit(float(np.mean([f.outside for f in fits])), float(np.mean([f.iou for f in fits])))

@@ -1,0 +1,83 @@
+"""The posed body's silhouette against the mask: by view, by camera, by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from smplxpp.core.camera import Camera
+from smplxpp.raster import rasterize_triangles
+
+Verdict = Literal["good", "doubtful", "bad"]
+# Share of the body's pixels outside of the mask. Exact parameters give up to 0.3 %, a tracker that is 26 mm off on
+# average 2 to 10 %.
+OUTSIDE_DOUBTFUL, OUTSIDE_BAD = 0.03, 0.12
+# Clothes and hair make the mask larger than the body: trousers leave 0.8, a wide skirt 0.6.
+IOU_BAD = 0.35
+# Silhouettes below this share of the image say nothing.
+MIN_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class SilhouetteFit:
+    """Body against mask in one view.
+
+    Attributes:
+        outside: share of the body's pixels that the mask leaves out; 1 where the body is out of the picture.
+        iou: intersection over union.
+    """
+
+    outside: float
+    iou: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the figures say."""
+        if self.outside > OUTSIDE_BAD or self.iou < IOU_BAD:
+            return "bad"
+        return "doubtful" if self.outside > OUTSIDE_DOUBTFUL else "good"
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """Many views: medians, the worst share outside, and how many are bad."""
+
+    views: int
+    outside: float
+    worst: float
+    iou: float
+    bad: int
+
+    @property
+    def verdict(self) -> Verdict:
+        """As of one view with these medians."""
+        return SilhouetteFit(self.outside, self.iou).verdict
+
+
+def body_silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: pixels whose centres the body covers."""
+    return rasterize_triangles(vertices, faces, camera, threads=1).mask
+
+
+def compare_silhouettes(body: np.ndarray, mask: np.ndarray) -> SilhouetteFit | None:
+    """Both (H, W) bool; None where neither shows anything worth speaking of."""
+    least = MIN_SHARE * mask.size
+    covered, shown = int(body.sum()), int(mask.sum())
+    if covered < least:
+        return None if shown < least else SilhouetteFit(1.0, 0.0)
+    common = int((body & mask).sum())
+    return SilhouetteFit(1.0 - common / covered, common / (covered + shown - common))
+
+
+def summary(fits: Iterable[SilhouetteFit]) -> FitSummary | None:
+    """Of several views; None for none."""
+    figures = np.array([(fit.outside, fit.iou, fit.verdict == "bad") for fit in fits], dtype=np.float64)
+    if not len(figures):
+        return None
+    outside, iou, bad = figures.T
+    return FitSummary(
+        len(figures), float(np.median(outside)), float(outside.max()), float(np.median(iou)), int(bad.sum())
+    )

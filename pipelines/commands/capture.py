@@ -1,0 +1,162 @@
+"""`smplxpp capture check` and `smplxpp capture convert`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from pipelines.commands.options import OptionalPath, OptionalText
+from smplxpp.core.errors import InputError
+
+if TYPE_CHECKING:
+    from smplxpp.capture import Capture
+
+FormatName = Literal[
+    "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap"
+]
+_SHOWN = 8
+_FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included), with commas between"
+
+
+@dataclass(frozen=True)
+class CaptureCheckCommand:
+    """Options of the command."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of the capture, in any layout of docs/captures.md."""
+    format: FormatName = "auto"
+    """Layout; auto tells it by the files."""
+    frames: OptionalText = None
+    """Frames whose images are opened: all, or numbers and ranges START:STOP:STEP with commas between. By default as
+    many, evenly spread, as make 2,000 images."""
+    masks: OptionalPath = None
+    """Folder of mattes to check instead of the capture's own masks."""
+    params: OptionalPath = None
+    """Body parameters to check instead of the capture's own."""
+    body: OptionalPath = None
+    """Body model file that the parameters are for; the open body by default."""
+    out: OptionalPath = None
+    """Folder for report.html, contact_sheet.png and check.json."""
+    json: bool = False
+    """Print the findings and figures as JSON."""
+
+    def run(self) -> dict:
+        """Check; exit status 1 if something has to be corrected."""
+        from pipelines.capture_check import CheckConfig, check_capture, write_check_report
+        from pipelines.capture_check.report import check_as_dict
+        from pipelines.capture_check.terminal import print_check
+        from pipelines.progress import counted_progress
+        from smplxpp.body import load_body
+
+        body = load_body(self.body)
+        capture = _open(self.capture, self.format, masks=self.masks, params=self.params, body=body)
+        config = CheckConfig(frames=selected_frames(self.frames, capture))
+        with counted_progress("images", enabled=not self.json) as progress:
+            check = check_capture(capture, body, config, progress=progress)
+        if not self.json:
+            print_check(check, Console())
+        report = None if self.out is None else write_check_report(check, self.out)
+        if report is not None and not self.json:
+            Console().print(f"report  {report}", soft_wrap=True, highlight=False)
+        paths = {"report": None if report is None else str(report)}
+        return {**check_as_dict(check), **paths, "exit_status": int(check.failed)}
+
+
+@dataclass(frozen=True)
+class CaptureConvertCommand:
+    """Options of the command."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of the capture, in any layout of docs/captures.md."""
+    out: Path
+    """New folder to write; the same command goes on with one that was interrupted."""
+    layout: Literal["simple", "actorshq"] = "simple"
+    """Ours, or ActorsHQ's: images on black, masks, cameras, parameters."""
+    format: FormatName = "auto"
+    """Layout of the source; auto tells it by the files."""
+    scale: float = 1.0
+    """Resolution as a factor."""
+    frames: OptionalText = None
+    """Frames to keep: numbers and ranges START:STOP:STEP with commas between; by default all."""
+    cameras: OptionalText = None
+    """Names of the cameras to keep, with commas between; by default all."""
+    masks: OptionalPath = None
+    """Folder of mattes to take instead of the capture's own masks."""
+    params: OptionalPath = None
+    """Body parameters to take instead of the capture's own."""
+    body: OptionalPath = None
+    """Body model file that the parameters are for, where a layout turns it about the origin; the open body by
+    default."""
+    quality: int = 95
+    """Of JPEG images that cannot be copied."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Convert; exit status 1 if something had to be left out."""
+        from pipelines.capture_convert import ConvertConfig, convert_capture
+        from pipelines.progress import counted_progress
+        from smplxpp.body import load_body
+
+        body = None if self.body is None else load_body(self.body)
+        capture = _open(self.capture, self.format, masks=self.masks, params=self.params, body=body, cache_bytes=0)
+        config = ConvertConfig(
+            layout=self.layout,
+            scale=self.scale,
+            frames=selected_frames(self.frames, capture),
+            cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
+            quality=self.quality,
+        )
+        with counted_progress("views", enabled=not self.json) as progress:
+            done = convert_capture(capture, self.out, config, progress=progress)
+        if not self.json:
+            console = Console()
+            for words in done.left_out[:_SHOWN]:
+                console.print(f"[yellow]left out[/]  {escape(words)}", soft_wrap=True, highlight=False)
+            if len(done.left_out) > _SHOWN:
+                console.print(f"[dim]and {len(done.left_out) - _SHOWN} more (--json lists all)[/]")
+            files = f"{done.copied} files copied, {done.encoded} written anew, {done.kept} there already"
+            console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False)
+        return {**vars(done), "exit_status": int(bool(done.left_out))}
+
+
+def _open(path: Path, format: str, **options) -> Capture:
+    from smplxpp.capture import open_capture
+
+    return open_capture(path, format=None if format == "auto" else format, **options)
+
+
+def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | None:
+    """The capture's frames that a text names: `all`, `0,5`, `0:100:10`; None for None.
+
+    Raises:
+        InputError: not understood, a number that is no frame, or a range without any.
+    """
+    if text is None:
+        return None
+    if text.strip() == "all":
+        return capture.frames
+    chosen: set[int] = set()
+    for part in text.split(","):
+        try:
+            numbers = [int(n) if n.strip() else None for n in part.split(":")]
+            if len(numbers) > 3 or numbers == [None] or numbers[2:] == [0]:
+                raise ValueError
+        except ValueError:
+            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
+        if len(numbers) == 1:
+            found = {numbers[0]} & set(capture.frames)
+        else:
+            last = max(capture.frames, default=-1) + 1
+            start, stop, step = (*numbers, None)[:3]
+            found = set(range(start or 0, last if stop is None else min(stop, last), step or 1)) & set(capture.frames)
+        if not found:
+            have = f"{capture.frames[0]} to {capture.frames[-1]}" if capture.frames else "none"
+            raise InputError("--frames", expected=f"frames that the capture has ({have})", received=part)
+        chosen |= found
+    return tuple(sorted(chosen))
