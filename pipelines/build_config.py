@@ -21,6 +21,11 @@ STAGES: tuple[str, ...] = (
     "65_validate",
 )
 
+FIT_STAGE = "70_bind"
+"""The stage that `smplxpp fit-reference` adds to a build."""
+TEMPLATE = "60_assemble/smplxpp.npz"
+"""The template in a run."""
+
 
 def _default_budgets() -> dict[str, int]:
     return {label.name: label.face_budget for label in LABELS if label.face_budget}

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.arrays import load_arrays
-from pipelines.build_config import STAGES, BuildConfig, BuildInputs, load_build
-from pipelines.fit_pictures import FIT_STAGE
+from pipelines.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs, load_build
 from pipelines.fit_report import fit_key_numbers, fit_section, standing_fit
 from pipelines.pictures import (
     blend_joint_colors,

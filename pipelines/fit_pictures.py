@@ -10,8 +10,6 @@ from PIL import Image
 from pipelines.pictures import colormap, encode_png, heat_colors
 from smplxpp.core.atomic import atomic_write_bytes
 
-FIT_STAGE = "70_bind"
-TEMPLATE = "60_assemble/smplxpp.npz"
 ERROR_LIMIT = 64
 """Difference of the worst channel, of 255, that the error's colours end at."""
 

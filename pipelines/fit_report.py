@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.fit_pictures import ERROR_LIMIT, FIT_STAGE, TEMPLATE, enlarge, error_legend, read_strip
+from pipelines.build_config import FIT_STAGE, TEMPLATE
+from pipelines.fit_pictures import ERROR_LIMIT, enlarge, error_legend, read_strip
 from pipelines.pictures import encode_png, row
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from smplxpp.core.artifact import StageRecord, read_manifest

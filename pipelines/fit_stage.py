@@ -18,7 +18,8 @@ from avatar.gaussians.bound_file import save_bound
 from avatar.training import FitConfig, FitResult, FitScene, Progress, View, fit_reference, mean_quality, read_views
 from avatar.training.loop import METRICS_FILE
 from avatar.training.quality import CONVENTION
-from pipelines.fit_pictures import FIT_STAGE, TEMPLATE, write_strip
+from pipelines.build_config import FIT_STAGE, TEMPLATE
+from pipelines.fit_pictures import write_strip
 from pipelines.run_folder import own_run_folder
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture

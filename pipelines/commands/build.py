@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pipelines.build_config import STAGES, BuildConfig, BuildInputs
+from pipelines.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs
 from pipelines.commands.options import OptionalPath
 from pipelines.progress import stage_progress
 from smplxpp.capture import find_reference
@@ -94,8 +94,6 @@ class Build:
 
     def _report_stands(self, records: dict[str, StageRecord]) -> bool:
         """Whether the report was written after every stage, a fit's among them."""
-        from pipelines.fit_pictures import FIT_STAGE
-
         report = self.out / "report.html"
         manifests = [record.folder / "manifest.json" for record in records.values()]
         made = [

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.build_config import STAGES
+from pipelines.build_config import FIT_STAGE, STAGES
 from pipelines.report.model import CheckRow, count_statuses, worst_status
 from smplxpp.core.artifact import read_manifest
 from smplxpp.core.errors import InputError
@@ -74,13 +74,18 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         "seconds": round(sum(stage["seconds"] or 0.0 for stage in stages), 3),
         "stages": stages,
         "unfinished": unfinished,
-        "remedy": f"smplxpp build --out {run} --from-stage {unfinished[0]} (with the build's options)"
-        if unfinished
-        else None,
+        "remedy": _remedy(run, unfinished[0]) if unfinished else None,
         "report": str(report) if report.is_file() else None,
         "checks": [check.__dict__ for check in checks],
     }
     return summary, checks
+
+
+def _remedy(run: Path, stage: str) -> str:
+    """The command that makes a stage."""
+    if stage == FIT_STAGE:
+        return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
+    return f"smplxpp build --out {run} --from-stage {stage} (with the build's options)"
 
 
 def _stage(run: Path, name: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from avatar.export.splats import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
 from pipelines.cli import main
 from pipelines.commands import fit_reference as command
+from pipelines.commands import inspect
 from pipelines.commands.inspect import summarise_run
 from pipelines.fit_pictures import read_strip
 from smplxpp.core.artifact import read_manifest
@@ -88,6 +89,11 @@ def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
     )
     summary, _ = summarise_run(own)
     assert next(s for s in summary["stages"] if s["stage"] == "70_bind")["state"] == "outdated"
+
+
+@pytest.mark.parametrize(("stage", "command"), [("70_bind", "fit-reference"), ("50_unpose", "build")])
+def test_inspect_says_which_command_makes_a_stage(own, stage, command):
+    assert f"smplxpp {command} " in inspect._remedy(own, stage)
 
 
 def test_a_fit_that_stands_is_not_run_again(own, capture, capsys):
