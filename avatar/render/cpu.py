@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from avatar.render.memory import pooled_empty
 from avatar.render.native import View, Workspace
 from avatar.render.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
@@ -66,8 +67,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, features, viewmats, Ks, background, settings):
         cameras, count, channels = len(viewmats), len(means), features.shape[-1]
-        image = means.new_empty(cameras, settings.height, settings.width, channels)
-        alpha = means.new_empty(cameras, settings.height, settings.width, 1)
+        image = pooled_empty(cameras, settings.height, settings.width, channels)
+        alpha = pooled_empty(cameras, settings.height, settings.width, 1)
         means2d, radii = means.new_empty(cameras, count, 2), means.new_empty(cameras, count, 2)
         depths = means.new_empty(cameras, count)
         inputs = (means, quats, scales, opacities, features, viewmats, Ks, background)

@@ -219,7 +219,6 @@ void blend(const Scene& scene, const Camera& camera, Workspace& w, float* image,
     w.stop.reserve(w.tiles() * BLOCKS * LANES);
     const int D = scene.channels;
     if (D <= 3) return blend_tiles<3, false>(scene, camera, w, image, alpha, threads);
-    if (D <= 4) return blend_tiles<4, false>(scene, camera, w, image, alpha, threads);
     if (D <= 7) return blend_tiles<7, false>(scene, camera, w, image, alpha, threads);
     if (D <= ROW_CHANNELS) return blend_tiles<ROW_CHANNELS, false>(scene, camera, w, image, alpha, threads);
     return blend_tiles<ROW_CHANNELS, true>(scene, camera, w, image, alpha, threads);

@@ -276,7 +276,6 @@ void unblend(const Scene& scene, const Camera& camera, Workspace& w, const float
              const float* grad_alpha, int threads) {
     const int D = scene.channels;
     if (D <= 3) return unblend_tiles<3, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
-    if (D <= 4) return unblend_tiles<4, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
     if (D <= 7) return unblend_tiles<7, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
     if (D <= ROW_CHANNELS) return unblend_tiles<ROW_CHANNELS, false>(scene, camera, w, radii, grad_image, grad_alpha, threads);
     return unblend_tiles<ROW_CHANNELS, true>(scene, camera, w, radii, grad_image, grad_alpha, threads);

@@ -84,19 +84,31 @@ SMPLXPP_INLINE Floats broadcast(float x) { return broadcast_tree<NativeFloat, fl
 SMPLXPP_INLINE Ints broadcast(int32_t x) { return broadcast_tree<NativeInt, int32_t, PARTS>(x); }
 SMPLXPP_INLINE Floats zeros() { return Floats{}; }
 
-// A tree is its lanes in order, so it is loaded and stored as they lie.
-SMPLXPP_INLINE Floats load(const float* p) {
-    Floats r;
-    std::memcpy(&r, p, sizeof r);
-    return r;
+// Memory is read and written register by register: a copy of a whole tree would be made in smaller pieces on the stack,
+// which a wider load cannot take up before they have left the store buffer.
+template <class Native, class Element, int P>
+SMPLXPP_INLINE Tree<Native, P> load_tree(const Element* p) {
+    typedef Native Unaligned __attribute__((aligned(4), may_alias));
+    if constexpr (P == 1) {
+        return {*(const Unaligned*)p};
+    } else {
+        return {load_tree<Native, Element, P / 2>(p), load_tree<Native, Element, P / 2>(p + P / 2 * NATIVE)};
+    }
 }
-SMPLXPP_INLINE Ints load(const int32_t* p) {
-    Ints r;
-    std::memcpy(&r, p, sizeof r);
-    return r;
+template <class Native, class Element, int P>
+SMPLXPP_INLINE void store_tree(Element* p, const Tree<Native, P>& a) {
+    typedef Native Unaligned __attribute__((aligned(4), may_alias));
+    if constexpr (P == 1) {
+        *(Unaligned*)p = a.v;
+    } else {
+        store_tree<Native, Element, P / 2>(p, a.lo);
+        store_tree<Native, Element, P / 2>(p + P / 2 * NATIVE, a.hi);
+    }
 }
-SMPLXPP_INLINE void store(float* p, Floats a) { std::memcpy(p, &a, sizeof a); }
-SMPLXPP_INLINE void store(int32_t* p, Ints a) { std::memcpy(p, &a, sizeof a); }
+SMPLXPP_INLINE Floats load(const float* p) { return load_tree<NativeFloat, float, PARTS>(p); }
+SMPLXPP_INLINE Ints load(const int32_t* p) { return load_tree<NativeInt, int32_t, PARTS>(p); }
+SMPLXPP_INLINE void store(float* p, Floats a) { store_tree<NativeFloat, float, PARTS>(p, a); }
+SMPLXPP_INLINE void store(int32_t* p, Ints a) { store_tree<NativeInt, int32_t, PARTS>(p, a); }
 
 SMPLXPP_INLINE Ints shifted_right(Ints a, int bits) {
     return map<PARTS>([bits](auto x) { return x >> bits; }, a);

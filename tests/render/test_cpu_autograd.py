@@ -8,7 +8,7 @@ import threading
 import pytest
 import torch
 
-from avatar.render import native, rasterize
+from avatar.render import memory, native, rasterize
 from avatar.render.cpu import rasterize_cpu
 from avatar.render.settings import RasterSettings
 from smplxpp.core.errors import InputError
@@ -140,6 +140,30 @@ def test_the_pool_frees_what_is_beyond_its_limit(scene, monkeypatch):
     before = len(native._POOL._idle)
     rasterize(**vars(scene))
     assert len(native._POOL._idle) <= before
+
+
+def test_memory_of_large_pictures_is_used_again_but_never_while_it_is_seen(monkeypatch):
+    monkeypatch.setattr(memory, "POOLED_BYTES", 1024)
+    monkeypatch.setattr(memory, "_idle", [])
+    first = memory.pooled_empty(3, 50, 40)
+    address, row = first.data_ptr(), first[1, 2]
+    del first
+    second = memory.pooled_empty(3, 50, 40)
+    assert second.data_ptr() != address
+    row.fill_(7.0)
+    del row
+    assert memory.pooled_empty(50, 3, 40).data_ptr() == address
+    assert memory.pooled_empty(3, 50, 41).data_ptr() != address
+
+
+def test_idle_memory_has_a_limit(monkeypatch):
+    monkeypatch.setattr(memory, "POOLED_BYTES", 1024)
+    monkeypatch.setattr(memory, "IDLE_BYTES", 100_000)
+    monkeypatch.setattr(memory, "_idle", [])
+    tensors = [memory.pooled_empty(10_000) for _ in range(5)]
+    del tensors
+    assert sum(array.nbytes for array in memory._idle) <= 100_000
+    assert len(memory._idle) == 2
 
 
 def test_two_threads_of_python_at_once(scene):
