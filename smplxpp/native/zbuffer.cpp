@@ -42,6 +42,14 @@ void clear_band(const Target& t, int y0, int y1) {
     std::fill(t.depth + begin, t.depth + end, std::numeric_limits<float>::infinity());
 }
 
+// Pixels whose centres lie in the box of three corners; empty where x0 > x1 or y0 > y1.
+struct Box {
+    int x0, x1, y0, y1;
+    Box(const double* a, const double* b, const double* c, int width, int height)
+        : x0(first_pixel(std::min({a[0], b[0], c[0]}), width)), x1(last_pixel(std::max({a[0], b[0], c[0]}), width)),
+          y0(first_pixel(std::min({a[1], b[1], c[1]}), height)), y1(last_pixel(std::max({a[1], b[1], c[1]}), height)) {}
+};
+
 // `screen` holds x, y in pixels (pixel centres at +0.5), z, and the interpolation weight (1/z for perspective,
 // 1 for orthographic) of each vertex, in double: edge functions of slivers lose their sign in float.
 void raster_rows(const double* screen, const int32_t* faces, int64_t first, int64_t last, const int32_t* order,
@@ -54,16 +62,14 @@ void raster_rows(const double* screen, const int32_t* faces, int64_t first, int6
         if (a[2] <= near || b[2] <= near || c[2] <= near) continue;
         const double area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]);
         if (area == 0.0) continue;
-        const double ymin = std::min({a[1], b[1], c[1]}), ymax = std::max({a[1], b[1], c[1]});
-        const double xmin = std::min({a[0], b[0], c[0]}), xmax = std::max({a[0], b[0], c[0]});
-        const int y0 = std::max(y_begin, first_pixel(ymin, t.height)), y1 = std::min(y_end - 1, last_pixel(ymax, t.height));
-        const int x0 = first_pixel(xmin, t.width), x1 = last_pixel(xmax, t.width);
+        const Box box(a, b, c, t.width, t.height);
+        const int y0 = std::max(y_begin, box.y0), y1 = std::min(y_end - 1, box.y1);
         const double inv = 1.0 / area;
         const double ax = (b[1] - c[1]) * inv, ay = (c[0] - b[0]) * inv;
         const double bx = (c[1] - a[1]) * inv, by = (a[0] - c[0]) * inv;
         for (int y = y0; y <= y1; ++y) {
             const double py = y + 0.5 - c[1];
-            for (int x = x0; x <= x1; ++x) {
+            for (int x = box.x0; x <= box.x1; ++x) {
                 const double px = x + 0.5 - c[0];
                 const double wa = ax * px + ay * py, wb = bx * px + by * py, wc = 1.0 - wa - wb;
                 if (wa < 0 || wb < 0 || wc < 0) continue;
@@ -90,36 +96,40 @@ SMPLXPP_EXPORT void smplxpp_zbuffer(
     const Target target{width, height, face_id, barycentric, depth};
     const int bands = (height + kBandRows - 1) / kBandRows;
 
-    // Faces of each band, in index order (counting sort): small faces are touched by one band alone, and those that
-    // cover no pixel centre by none.
+    // Faces of each band, in index order (counting sort): small faces are touched by one band alone, and those that cover no
+    // pixel centre by none. Each thread sorts one run of faces; cells are in the order band, run.
     struct Span { int32_t first = 0, last = -1; };
     std::vector<Span> spans(static_cast<size_t>(face_count));
-    std::vector<int64_t> start(size_t(bands) + 1, 0);
-    for (int64_t f = 0; f < face_count; ++f) {
-        const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
-        const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
-        const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
-        // The sum is NaN or infinite where a coordinate is (a corner on the camera's plane).
-        if (!std::isfinite(a[0] + b[0] + c[0] + a[1] + b[1] + c[1])) continue;
-        const int y0 = first_pixel(std::min({a[1], b[1], c[1]}), height);
-        const int y1 = last_pixel(std::max({a[1], b[1], c[1]}), height);
-        if (y0 > y1) continue;
-        if (first_pixel(std::min({a[0], b[0], c[0]}), width) > last_pixel(std::max({a[0], b[0], c[0]}), width)) continue;
-        spans[size_t(f)] = {y0 / kBandRows, y1 / kBandRows};
-        for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k) ++start[size_t(k) + 1];
-    }
-    for (int b = 0; b < bands; ++b) start[size_t(b) + 1] += start[size_t(b)];
-    std::vector<int32_t> order(static_cast<size_t>(start[size_t(bands)]));
+    std::vector<int64_t> start(size_t(bands) * size_t(threads) + 1, 0);
+    const auto cell = [&](int band, int run) { return size_t(band) * size_t(threads) + size_t(run); };
+    const auto run_begin = [&](int run) { return face_count * run / threads; };
+    smplxpp::run_threads(threads, [&](int run) {
+        for (int64_t f = run_begin(run); f < run_begin(run + 1); ++f) {
+            const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
+            const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
+            const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
+            // The sum is NaN or infinite where a coordinate is (a corner on the camera's plane).
+            if (!std::isfinite(a[0] + b[0] + c[0] + a[1] + b[1] + c[1])) continue;
+            const Box box(a, b, c, width, height);
+            if (box.y0 > box.y1 || box.x0 > box.x1) continue;
+            spans[size_t(f)] = {box.y0 / kBandRows, box.y1 / kBandRows};
+            for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k) ++start[cell(k, run) + 1];
+        }
+    });
+    for (size_t k = 1; k < start.size(); ++k) start[k] += start[k - 1];
+    std::vector<int32_t> order(static_cast<size_t>(start.back()));
     std::vector<int64_t> cursor(start.begin(), start.end() - 1);
-    for (int64_t f = 0; f < face_count; ++f)
-        for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k)
-            order[size_t(cursor[size_t(k)]++)] = int32_t(f);
+    smplxpp::run_threads(threads, [&](int run) {
+        for (int64_t f = run_begin(run); f < run_begin(run + 1); ++f)
+            for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k)
+                order[size_t(cursor[cell(k, run)]++)] = int32_t(f);
+    });
 
     smplxpp::run_threads(threads, [&](int thread) {
         for (int b = thread; b < bands; b += threads) {
             const int y0 = b * kBandRows, y1 = std::min(height, y0 + kBandRows);
             clear_band(target, y0, y1);
-            raster_rows(screen, faces, start[size_t(b)], start[size_t(b) + 1], order.data(), near, y0, y1, target);
+            raster_rows(screen, faces, start[cell(b, 0)], start[cell(b + 1, 0)], order.data(), near, y0, y1, target);
         }
     });
 }
