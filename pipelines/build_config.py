@@ -89,7 +89,7 @@ _PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
 
 
 def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
-    """Write `build.json` into a run."""
+    """Write `build.json` into a run, unless it says the same already."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Path):
@@ -97,7 +97,9 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
         return {k: plain(v) for k, v in value.items()} if isinstance(value, dict) else value
 
     content = {"inputs": plain(asdict(inputs)), "config": asdict(config)}
-    atomic_write_text(run / BUILD_FILE, json.dumps(content, indent=1) + "\n")
+    text, path = json.dumps(content, indent=1) + "\n", run / BUILD_FILE
+    if not path.is_file() or path.read_text() != text:
+        atomic_write_text(path, text)
 
 
 def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:

@@ -183,7 +183,7 @@ def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
     (run / ".metrics.abc.json").write_text("{")
     (run / ".notes").write_text("mine")
     small.build("run", small.inputs(), last="00_capture")
-    assert sorted(p.name for p in run.iterdir()) == [".lock", ".notes", "00_capture", "metrics.json"]
+    assert sorted(p.name for p in run.iterdir()) == [".lock", ".notes", "00_capture", "build.json", "metrics.json"]
 
 
 def test_two_builds_do_not_share_a_folder(small):
