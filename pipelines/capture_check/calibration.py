@@ -56,7 +56,7 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
     for name in bad:
         yield _one_camera(name, rest, cameras[name], sampler, rig)
     if doubtful:
-        yield _loose(doubtful, cameras)
+        yield _loose(doubtful, rest, cameras, sampler)
 
 
 def blind_cameras(views: Sequence[ViewCheck]) -> Iterator[Finding]:
@@ -101,12 +101,14 @@ def _one_camera(
     return Finding("calibration-camera", words, name, advice=advice)
 
 
-def _loose(doubtful: Sequence[str], cameras: Mapping[str, FitSummary]) -> Finding:
+def _loose(
+    doubtful: Sequence[str], views: Sequence[ViewCheck], cameras: Mapping[str, FitSummary], sampler: Sampler
+) -> Finding:
     median = float(np.median([cameras[name].outside for name in doubtful]))
     which = "every camera" if len(doubtful) == len(cameras) else f"camera {', '.join(doubtful)}"
-    return Finding(
-        "calibration-loose", f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
-    )
+    words = f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
+    words, advice = _explained(words, diagnose(_samples(views, spread(doubtful, _SAMPLE_CAMERAS), sampler)))
+    return Finding("calibration-loose", words, advice=advice)
 
 
 def _explained(words: str, result: Diagnosis | None) -> tuple[str, str]:

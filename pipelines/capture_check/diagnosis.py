@@ -47,12 +47,18 @@ def diagnose(samples: Sequence[Sample], extra: Sequence[Mistake] = ()) -> Diagno
 
 
 def _explains(before: SilhouetteFit, after: SilhouetteFit) -> bool:
-    return after.outside < _FITS_OUTSIDE and after.iou > max(IOU_BAD, before.iou + _GAIN)
+    inside = after.outside < min(_FITS_OUTSIDE, 0.5 * before.outside)
+    return inside and after.iou > max(IOU_BAD, before.iou + _GAIN)
 
 
 def _score(samples: Sequence[Sample], mistake: Mistake) -> SilhouetteFit:
+    """Mean figures over the samples that the correction applies to, which have to be half of them."""
     fits = []
     for sample in samples:
-        silhouette = body_silhouette(mistake.body(sample), sample.faces, mistake.camera(sample.camera))
-        fits.append(compare_silhouettes(silhouette, sample.mask) or SilhouetteFit(1.0, 0.0))
+        vertices = mistake.body(sample)
+        if vertices is not None:
+            silhouette = body_silhouette(vertices, sample.faces, mistake.camera(sample.camera))
+            fits.append(compare_silhouettes(silhouette, sample.mask) or SilhouetteFit(1.0, 0.0))
+    if 2 * len(fits) < max(1, len(samples)):
+        return SilhouetteFit(1.0, 0.0)
     return SilhouetteFit(float(np.mean([f.outside for f in fits])), float(np.mean([f.iou for f in fits])))

@@ -42,12 +42,13 @@ class Mistake:
 
     Attributes:
         words: what is wrong if the correction fits. advice: what to do then.
+        camera: the corrected camera. body: the corrected vertices, None where a sample does not know them.
     """
 
     words: str
     advice: str
     camera: Callable[[Camera], Camera] = lambda camera: camera
-    body: Callable[[Sample], np.ndarray] = lambda sample: sample.vertices
+    body: Callable[[Sample], np.ndarray | None] = lambda sample: sample.vertices
 
 
 def _posed(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Callable[[Camera], Camera]:
@@ -166,13 +167,13 @@ COMBINED: tuple[Mistake, ...] = (
 
 
 def shifts(samples: Sequence[Sample]) -> tuple[Mistake, ...]:
-    """Images that show another frame's pose, as far as all samples know their neighbours."""
-    common = set.intersection(*(set(sample.neighbours) for sample in samples)) if samples else set()
+    """Images that show another frame's pose, as far as the samples know their neighbours."""
+    known = {k for sample in samples for k in sample.neighbours}
     return tuple(
         Mistake(
             f"the images show the pose {abs(k)} frame{'s' if abs(k) > 1 else ''} {'later' if k > 0 else 'earlier'}",
             "number images and parameters by one clock",
-            body=lambda sample, k=k: sample.neighbours[k],
+            body=lambda sample, k=k: sample.neighbours.get(k),
         )
-        for k in sorted(common, key=lambda k: (abs(k), k))
+        for k in sorted(known, key=lambda k: (abs(k), k))
     )

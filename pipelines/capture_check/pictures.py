@@ -14,12 +14,12 @@ from pipelines.pictures import caption, contact_sheet
 from smplxpp.core.errors import InputError
 
 BODY_COLOR, MASK_COLOR = (255, 60, 140), (0, 210, 255)
-_CELL_HEIGHT = 300
+_CELL_HEIGHT, _CAPTION_WIDTH = 300, 190
 _MOST_CAMERAS, _MOST_FRAMES = 24, 4
 
 
 def draw_contact_sheet(check: CaptureCheck) -> np.ndarray | None:
-    """(H, W, 3) uint8: cameras from top to bottom, a few frames from left to right; None without any image."""
+    """(H, W, 3) uint8: a few frames of each camera beside each other; None without any image."""
     frames = spread(check.frames, _MOST_FRAMES)
     cameras = spread(list(dict.fromkeys(view.camera for view in check.views)), _MOST_CAMERAS)
     if not frames or not cameras:
@@ -29,10 +29,16 @@ def draw_contact_sheet(check: CaptureCheck) -> np.ndarray | None:
         for frame in frames:
             cells.append(_cell(check, camera, frame))
             captions.append(_words(check, camera, frame))
-    width = max(cell.shape[1] for cell in cells)
-    padded = [np.pad(c, ((0, 0), (0, width - c.shape[1]), (0, 0)), constant_values=255) for c in cells]
-    named = [caption(cell, words, size=13) for cell, words in zip(padded, captions, strict=True)]
-    return contact_sheet(named, columns=len(frames), gap=8)
+    named = [caption(_widened(cell), words, size=13) for cell, words in zip(cells, captions, strict=True)]
+    # Several cameras side by side, so that the sheet is about as wide as it is high.
+    beside = max(1, round(len(cameras) ** 0.5 / 2))
+    return contact_sheet(named, columns=len(frames) * beside, gap=8)
+
+
+def _widened(cell: np.ndarray) -> np.ndarray:
+    """On white, wide enough for the caption."""
+    missing = max(0, _CAPTION_WIDTH - cell.shape[1])
+    return np.pad(cell, ((0, 0), (missing // 2, missing - missing // 2), (0, 0)), constant_values=255)
 
 
 def _cell(check: CaptureCheck, camera: str, frame: int) -> np.ndarray:

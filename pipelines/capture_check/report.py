@@ -55,7 +55,7 @@ def write_check_report(check: CaptureCheck, folder: Path) -> Path:
     if sheet is not None:
         data = encode_png(sheet)
         atomic_write_bytes(folder / "contact_sheet.png", data)
-        pictures = (Picture("cameras from top to bottom, frames from left to right", data),)
+        pictures = (Picture("each camera's images with the outlines of posed body and mask", data),)
     return write_report(folder / "report.html", _report(check, pictures))
 
 

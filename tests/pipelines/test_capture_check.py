@@ -1,0 +1,411 @@
+"""`smplxpp capture check`: a sound capture passes, every planted fault is found and named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.capture_check import CheckConfig, check_capture, write_check_report
+from pipelines.capture_check.findings import KINDS
+from pipelines.capture_check.silhouettes import compare_silhouettes
+from pipelines.cli import main
+from smplxpp.body import load_body
+from smplxpp.capture import open_capture
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from tests.capture.scene import make_scene
+from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_simple
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "capture_check.md"
+VIEWS = [(camera, frame) for camera in "ABC" for frame in range(4)]
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    """Our layout: three cameras, four frames in two poses, photographs, two of the cameras and frames held out."""
+    root = write_simple(make_scene(), tmp_path_factory.mktemp("captures") / "rig")
+    for source in sorted(root.rglob("*00000[01].*")):
+        target = source.with_name(source.name.replace("00000", "x").replace("x0", "000002").replace("x1", "000003"))
+        shutil.copy(source, target)
+    description = {"background": None, "novel_views": ["C"], "novel_pose_frames": [3, 3]}
+    (root / "capture.json").write_text(json.dumps(description))
+    return root
+
+
+@pytest.fixture
+def rig(sound, tmp_path) -> Path:
+    return Path(shutil.copytree(sound, tmp_path / "rig"))
+
+
+def found(root: Path, body, **options) -> dict[str, list[str]]:
+    """Messages by kind."""
+    out: dict[str, list[str]] = {}
+    for finding in check_capture(open_capture(root, **options), body).findings:
+        assert finding.remedy
+        out.setdefault(finding.kind, []).append(finding.message)
+    return out
+
+
+def image(camera: str, frame: int) -> str:
+    return f"rgbs/{camera}/{camera}_rgb{frame:06d}.jpg"
+
+
+def mask(camera: str, frame: int) -> str:
+    return f"masks/{camera}/{camera}_mask{frame:06d}.png"
+
+
+def edit_mask(root: Path, camera: str, frame: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    Image.fromarray(change(np.array(Image.open(root / mask(camera, frame))))).save(root / mask(camera, frame))
+
+
+def edit_json(path: Path, change: Callable[[dict], None]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def edit_cameras(root: Path, change: Callable[[dict], None], names: str = "ABC") -> None:
+    """Change the calibration of some cameras; `change` gets arrays K, R, T."""
+
+    def edit(content: dict) -> None:
+        for entry in content["cameras"]:
+            if entry["name"] in names:
+                arrays = {key: np.array(entry[key], dtype=float) for key in "KRT"}
+                change(arrays)
+                entry |= {key: value.tolist() for key, value in arrays.items()}
+
+    edit_json(root / "cameras.json", edit)
+
+
+def edit_params(root: Path, change: Callable[[BodyParams], BodyParams], frames=range(4)) -> None:
+    for frame in frames:
+        path = root / f"params/{frame:06d}.npz"
+        change(BodyParams.from_mapping(dict(np.load(path)))).save(path)
+
+
+@pytest.mark.parametrize("lens", [None, "wide"])
+def test_a_sound_capture_has_no_complaint(lens, tmp_path, sound, body):
+    from tests.capture.scene import LENS
+
+    root = sound if lens is None else write_simple(make_scene(lens=LENS), tmp_path / "rig")
+    check = check_capture(open_capture(root), body)
+    assert check.findings == () and not check.failed
+    assert {view.camera for view in check.views} == set("ABC")
+    for fit in check.cameras().values():
+        assert fit.outside < 0.01 and fit.iou > 0.97 and fit.verdict == "good"
+
+
+@pytest.mark.parametrize("write", [write_actorshq, write_avatarrex, write_easymocap])
+def test_sound_captures_of_other_layouts_have_no_complaint(write, tmp_path, body):
+    scene = make_scene(lens=(0.0,) * 5) if write is write_easymocap else make_scene()
+    assert found(write(scene, tmp_path / "set"), body) == {}
+
+
+def truncate(root: Path) -> None:
+    path = root / image("B", 1)
+    path.write_bytes(path.read_bytes()[:-400])
+
+
+def wider(root: Path) -> None:
+    Image.open(root / mask("A", 2)).resize((96, 128)).save(root / mask("A", 2))
+
+
+def uncalibrated(root: Path) -> None:
+    edit_json(root / "cameras.json", lambda content: content["cameras"][0].update(name="Z"))
+
+
+def composited(root: Path, colour: int) -> None:
+    for camera, frame in VIEWS:
+        share = np.array(Image.open(root / mask(camera, frame)))[..., None] / 255.0
+        pixels = np.array(Image.open(root / image(camera, frame))) * share + (1 - share) * colour
+        Image.fromarray(pixels.astype(np.uint8)).save(root / image(camera, frame), quality=95)
+
+
+def black_with_another_frames_mask(root: Path) -> None:
+    composited(root, 0)
+    edit_json(root / "capture.json", lambda content: content.update(background=[0, 0, 0]))
+    shutil.copy(root / mask("A", 0), root / mask("A", 1))
+
+
+def nobody(root: Path) -> None:
+    """A fourth camera that looks away from the person."""
+
+    def add(content: dict) -> None:
+        entry = dict(content["cameras"][0])
+        R, T = np.diag([-1.0, 1.0, -1.0]) @ np.array(entry["R"]), np.diag([-1.0, 1.0, -1.0]) @ np.array(entry["T"])
+        content["cameras"].append(entry | {"name": "D", "R": R.tolist(), "T": T.tolist()})
+
+    edit_json(root / "cameras.json", add)
+    for folder in ("rgbs", "masks"):
+        (root / folder / "D").mkdir()
+    for frame in range(4):
+        shutil.copy(root / image("A", frame), root / image("D", frame))
+        Image.fromarray(np.zeros((256, 192), np.uint8)).save(root / mask("D", frame))
+
+
+def drop(*names: str) -> Callable[[Path], None]:
+    return lambda root: [(root / name).unlink() for name in names]
+
+
+def describe(**entries) -> Callable[[Path], None]:
+    return lambda root: edit_json(root / "capture.json", lambda content: content.update(entries))
+
+
+FILE_FAULTS = {
+    "a truncated image": (truncate, "file-damaged", image("B", 1)),
+    "a mask of another size": (wider, "file-size", mask("A", 2)),
+    "a folder that is not calibrated": (uncalibrated, "camera-uncalibrated", "rgbs/A"),
+    "a camera without images": (uncalibrated, "camera-without-images", "camera Z"),
+    "a missing image": (drop(image("A", 1)), "image-missing", "camera A: no image of frame 1"),
+    "a frame in one camera": (drop(image("A", 1), image("B", 1)), "frame-alone", "frame 1: an image in camera C alone"),
+    "a missing mask": (drop(mask("C", 0)), "mask-missing", image("C", 0)),
+    "no mask at all": (lambda root: shutil.rmtree(root / "masks"), "masks-none", "no masks"),
+    "an empty mask": (lambda root: edit_mask(root, "B", 2, np.zeros_like), "mask-empty", mask("B", 2)),
+    "a full mask": (lambda root: edit_mask(root, "B", 2, lambda m: m * 0 + 255), "mask-full", mask("B", 2)),
+    "an inverted mask": (lambda root: edit_mask(root, "C", 3, lambda m: 255 - m), "mask-inverted", mask("C", 3)),
+    "a mask of another frame": (black_with_another_frames_mask, "mask-mismatch", image("A", 1)),
+    "photographs declared as composited": (describe(background=[0, 0, 0]), "background", image("A", 0)),
+    "composited images declared as photographs": (lambda r: composited(r, 255), "background-plain", "[255, 255, 255]"),
+    "a camera that sees nobody": (nobody, "camera-sees-nobody", "camera D"),
+    "missing parameters": (drop("params/000002.npz"), "params-missing", "frame 2"),
+    "no parameters": (lambda root: shutil.rmtree(root / "params"), "params-none", "no body parameters"),
+    "a held-out camera without images": (
+        lambda root: shutil.rmtree(root / "rgbs/C"), "split-empty", "camera C is held out"),
+    "splits without frames": (describe(train_frames=[100, 200]), "split-empty", "no frame with images is trained on"),
+    "a camera in no split": (describe(train_views=["A"]), "split-leftover", "B"),
+    "frames in no split": (describe(train_frames=[0, 0]), "split-leftover", "1-2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FILE_FAULTS)
+def test_faults_of_files_and_masks_are_named(fault, rig, body):
+    plant, kind, words = FILE_FAULTS[fault]
+    plant(rig)
+    messages = found(rig, body)
+    assert any(words in message for message in messages.get(kind, [])), messages
+    assert not any(k.startswith("calibration") for k in messages)
+
+
+def changed(**arrays: Callable[[np.ndarray], np.ndarray]) -> Callable[[BodyParams], BodyParams]:
+    return lambda p: replace(p, **{name: change(getattr(p, name).copy()) for name, change in arrays.items()})
+
+
+PARAMETER_FAULTS = {
+    "betas out of range": (changed(betas=lambda b: b * 0 + 7), [2], "params-betas", "frame 2: betas reach 7"),
+    "betas that vary": (changed(betas=lambda b: b + 0.4), [1], "params-betas-vary", "differ by up to 0.4"),
+    "expression out of range": (changed(expression=lambda e: e - 30), [0], "params-expression", "frame 0"),
+    "degrees": (changed(body_pose=np.degrees), range(4), "params-angles", "as degrees would"),
+    "a jump": (changed(transl=lambda t: t + [1.5, 0, 0]), [2], "params-jump", "frame 2: transl jumps by"),
+    "centimetres": (changed(transl=lambda t: t * 100), range(4), "params-units", "in centimetres it would be"),
+    "more betas than the body": (
+        changed(betas=lambda b: np.zeros((1, 300))), range(4), "params-body", "at most 20 numbers"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", PARAMETER_FAULTS)
+def test_parameters_out_of_range_are_named(fault, rig, body):
+    change, frames, kind, words = PARAMETER_FAULTS[fault]
+    edit_params(rig, change, frames)
+    messages = found(rig, body)
+    assert any(words in message for message in messages.get(kind, [])), messages
+
+
+def test_nan_in_a_frames_file_is_named(rig, body):
+    path = rig / "params/000001.npz"
+    np.savez(path, **{**np.load(path), "transl": np.full((1, 3), np.nan)})
+    assert any("000001.npz" in message for message in found(rig, body)["params-broken"])
+
+
+def pose(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Callable[[Path], None]:
+    """What is written down instead of the right R and T."""
+
+    def apply(arrays: dict) -> None:
+        arrays["R"], arrays["T"] = change(arrays["R"], arrays["T"])
+
+    return lambda root: edit_cameras(root, apply)
+
+
+def intrinsics(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    return lambda root: edit_cameras(root, lambda arrays: arrays.update(K=change(arrays["K"])))
+
+
+def swap_axes_of_K(K: np.ndarray) -> np.ndarray:
+    return np.array([[K[1, 1], 0, K[1, 2]], [0, K[0, 0], K[0, 2]], [0, 0, 1]])
+
+
+def turn_parameters(rotation: np.ndarray) -> Callable[[Path], None]:
+    """The same person in a turned world."""
+
+    def change(p: BodyParams) -> BodyParams:
+        root = load_body().rest_joints(p)[:, 0]
+        orient = rotation @ matrix_from_rotvec(p.global_orient)
+        return replace(p, global_orient=rotvec_from_matrix(orient), transl=(root + p.transl) @ rotation.T - root)
+
+    return lambda root: edit_params(root, change)
+
+
+def as_easymocap(p: BodyParams) -> BodyParams:
+    root = load_body().rest_joints(p)[:, 0]
+    return replace(p, transl=p.transl + root - (matrix_from_rotvec(p.global_orient) @ root[..., None])[..., 0])
+
+
+def swap_folders(root: Path) -> None:
+    for frame in range(4):
+        for name in (image, mask):
+            a, b = root / name("A", frame), root / name("B", frame)
+            first, second = a.read_bytes(), b.read_bytes()
+            a.write_bytes(second)
+            b.write_bytes(first)
+
+
+FLIP, Z_UP = np.diag([1.0, -1.0, -1.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+CALIBRATION_FAULTS = {
+    "camera to world": (pose(lambda R, T: (R.T, -R.T @ T)), "R and T are camera to world"),
+    "R alone transposed": (pose(lambda R, T: (R.T, T)), "R is camera to world, T is not"),
+    "the position as T": (pose(lambda R, T: (R, -R.T @ T)), "T is the camera's position"),
+    "OpenGL's axes": (pose(lambda R, T: (FLIP @ R, FLIP @ T)), "OpenGL"),
+    "PyTorch3D's axes": (pose(lambda R, T: (np.diag([-1, -1, 1]) @ R, np.diag([-1, -1, 1]) @ T)), "PyTorch3D"),
+    "OpenGL's camera to world": (
+        pose(lambda R, T: ((FLIP @ R).T, -R.T @ T)), "R and T are camera to world, and the camera looks along -z"),
+    "millimetres": (pose(lambda R, T: (R, 1000 * T)), "T is in millimetres"),
+    "T's sign": (pose(lambda R, T: (R, -T)), "T has the wrong sign"),
+    "x and y of K": (intrinsics(swap_axes_of_K), "x and y are swapped in K"),
+    "K of larger images": (intrinsics(lambda K: np.diag([2.0, 2.0, 1.0]) @ K), "K is of images twice as large"),
+    "parameters with z up": (turn_parameters(Z_UP), "the parameters are in a world with z up"),
+    "Rh and Th": (lambda root: edit_params(root, as_easymocap), "global_orient turns about the origin"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", CALIBRATION_FAULTS)
+def test_the_usual_mistakes_of_calibrations_are_recognised(fault, rig, body):
+    plant, words = CALIBRATION_FAULTS[fault]
+    plant(rig)
+    messages = found(rig, body)
+    # Less than a decimetre off, Rh and Th may pass for a rough fit.
+    (message,) = messages.get("calibration") or messages["calibration-loose"]
+    assert words in message and "It would fit if" in message, message
+
+
+def test_swapped_folders_are_recognised(rig, body):
+    edit_json(rig / "cameras.json", lambda content: content["cameras"].extend(
+        {**content["cameras"][2], "name": name} for name in ("D", "E")))  # fmt: skip
+    for name in "DE":
+        for kind, path in (("rgbs", image), ("masks", mask)):
+            (rig / kind / name).mkdir()
+            for frame in range(4):
+                shutil.copy(rig / path("C", frame), rig / path(name, frame))
+    swap_folders(rig)
+    messages = found(rig, body)["calibration-camera"]
+    assert ["those of camera B" in messages[0], "those of camera A" in messages[1]] == [True, True], messages
+
+
+def test_one_camera_that_was_moved_is_named_without_a_guess(rig, body):
+    turn = matrix_from_rotvec(np.array([0.0, 0.12, 0.05]))
+    edit_cameras(rig, lambda arrays: arrays.update(R=turn @ arrays["R"], T=turn @ arrays["T"]), "B")
+    (message,) = found(rig, body)["calibration-camera"]
+    assert message.startswith("camera B") and "It would fit" not in message
+
+
+def test_one_frame_with_the_wrong_pose_is_named(rig, body):
+    edit_params(rig, changed(transl=lambda t: t + [0.3, 0, 0.2]), [2])
+    messages = found(rig, body)
+    assert [m.startswith("frame 2: the body does not fit") for m in messages["calibration-frame"]] == [True]
+    assert "calibration" not in messages
+
+
+def test_parameters_of_another_clock_are_recognised(rig, body):
+    """Frames alternate between two poses: one frame late is one frame early."""
+    for frame in (0, 2):
+        a, b = rig / f"params/{frame:06d}.npz", rig / f"params/{frame + 1:06d}.npz"
+        first, second = a.read_bytes(), b.read_bytes()
+        a.write_bytes(second)
+        b.write_bytes(first)
+    (message,) = found(rig, body)["calibration"]
+    assert "1 frame later" in message or "1 frame earlier" in message
+
+
+def test_a_noisy_tracker_is_a_warning(rig, body):
+    edit_params(rig, changed(transl=lambda t: t + [0.015, 0.01, 0.0]))
+    check = check_capture(open_capture(rig), body)
+    assert [f.kind for f in check.findings] == ["calibration-loose"] and not check.failed
+
+
+def test_silhouettes_are_compared_as_sets():
+    a, b = np.zeros((100, 100), bool), np.zeros((100, 100), bool)
+    a[:40], b[20:60] = True, True
+    fit = compare_silhouettes(a, b)
+    assert fit.outside == pytest.approx(0.5) and fit.iou == pytest.approx(1 / 3)
+    empty = np.zeros_like(a)
+    assert compare_silhouettes(empty, empty) is None
+    assert compare_silhouettes(empty, b).outside == 1.0 and compare_silhouettes(a, empty).outside == 1.0
+
+
+def test_frames_are_spread_where_there_are_many(sound, body):
+    check = check_capture(open_capture(sound), body, CheckConfig(max_views=6))
+    assert check.frames == (0, 3)
+    assert check_capture(open_capture(sound), body, CheckConfig(frames=(2,))).frames == (2,)
+
+
+def test_the_command_answers_in_tables_json_and_files(rig, tmp_path, capsys):
+    assert main(["capture", "check", str(rig), "--out", str(tmp_path / "report")]) == 0
+    text = capsys.readouterr().out
+    assert "no complaint" in text and "3 cameras" in text and "1 cameras and 1 frames held out" in text
+    html = (tmp_path / "report" / "report.html").read_text()
+    assert "Every check passes" in html and "http" not in html.replace("http://www.w3.org", "")
+    sheet = np.asarray(Image.open(tmp_path / "report" / "contact_sheet.png"))
+    # Outlines of the body, and of the mask where it is another.
+    assert (sheet == (255, 60, 140)).all(axis=2).sum() > 500 and (sheet == (0, 210, 255)).all(axis=2).any()
+    truncate(rig)
+    assert main(["capture", "check", str(rig), "--json", "--frames", "1"]) == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["failed"] and answer["opened_frames"] == 1
+    assert [(f["kind"], f["camera"], f["frame"]) for f in answer["findings"]] == [("file-damaged", "B", 1)]
+
+
+def test_the_terminal_says_what_to_do(rig, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    pose(lambda R, T: (R.T, -R.T @ T))(rig)
+    assert main(["capture", "check", str(rig)]) == 1
+    text = capsys.readouterr().out
+    assert "R and T are camera to world" in text and "do: invert them" in text and "bad" in text
+
+
+@pytest.mark.parametrize("frames", ["x", "0:4:0", "9", "1:2:3:4", ""])
+def test_frames_that_are_none_are_refused(frames, sound, capsys):
+    assert main(["capture", "check", str(sound), "--frames", frames]) == 2
+    assert "--frames" in capsys.readouterr().err
+
+
+def test_a_report_is_written_without_parameters_and_masks(rig, tmp_path, body):
+    shutil.rmtree(rig / "masks")
+    shutil.rmtree(rig / "params")
+    check = check_capture(open_capture(rig), body)
+    write_check_report(check, tmp_path / "out")
+    assert {f.kind for f in check.findings} == {"masks-none", "params-none"}
+    assert (tmp_path / "out" / "contact_sheet.png").is_file()
+
+
+def test_every_kind_of_finding_is_explained():
+    text = DOCS.read_text()
+    assert [kind for kind in KINDS if f"`{kind}`" not in text] == []
+
+
+@pytest.mark.slow
+def test_exact_parameters_fit_and_a_trackers_are_doubtful(captures, body):
+    root = captures / "woman_casual"
+    exact = check_capture(open_capture(root), body, CheckConfig(frames=(0, 30)))
+    assert exact.findings == () and max(fit.worst for fit in exact.cameras().values()) < 0.01
+    noisy = check_capture(open_capture(root, params=root / "params/params_noisy.npz"), body, CheckConfig(frames=(0,)))
+    assert [f.kind for f in noisy.findings] == ["calibration-loose"]
