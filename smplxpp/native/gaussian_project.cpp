@@ -40,8 +40,9 @@ bool project_one(const Projection& camera, const float* mean, const float* quat,
     if (!(mean2d[0] + radius[0] > 0 && mean2d[0] - radius[0] < camera.width) ||
         !(mean2d[1] + radius[1] > 0 && mean2d[1] - radius[1] < camera.height))
         return false;
-    // Zero comes with opacity = ALPHA_MIN exactly, infinity with scales beyond any use.
+    // Zero comes with opacity = ALPHA_MIN exactly, infinity with scales beyond any use or, without blur, with none at all.
     if (!(radius[0] > 0 && radius[1] > 0 && radius[0] < 1e9f && radius[1] < 1e9f)) return false;
+    if (!(ellipse.a < 1e18f && ellipse.c < 1e18f)) return false;
     const double pixel_x = std::rint(mean2d[0]), pixel_y = std::rint(mean2d[1]);
     ellipse.pixel_x = (float)pixel_x;
     ellipse.pixel_y = (float)pixel_y;

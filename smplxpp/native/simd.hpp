@@ -28,6 +28,7 @@ constexpr int NATIVE = 4;
 #endif
 typedef float NativeFloat __attribute__((vector_size(4 * NATIVE)));
 typedef int32_t NativeInt __attribute__((vector_size(4 * NATIVE)));
+typedef uint32_t NativeUnsigned __attribute__((vector_size(4 * NATIVE)));
 
 // A binary tree of native vectors: unlike an array it is taken apart into registers before loops are unrolled.
 template <class Native, int Parts>
@@ -203,7 +204,8 @@ SMPLXPP_INLINE Floats square_root(Floats a) {
 
 // 2^x for -126 < x < 126 with a relative error of 9e-8; anything at all elsewhere, which callers mask away.
 // x is split into its nearest integer n (adding 1.5 * 2^23 leaves n in the low bits) and the rest, for which a minimax
-// polynomial of degree 5 stands, in Estrin's order: what waits for it waits less. n is added to the exponent.
+// polynomial of degree 5 stands, in Estrin's order: what waits for it waits less. n is added to the exponent (unsigned:
+// far outside of the range it wraps).
 SMPLXPP_INLINE Floats exp2(Floats a) {
     return map<PARTS>([](auto x) {
         const float shift = 12582912.0f;
@@ -211,7 +213,7 @@ SMPLXPP_INLINE Floats exp2(Floats a) {
         NativeFloat low = 0.69314694f * f + 1.0f, middle = 0.055507287f * f + 0.24022213f;
         NativeFloat high = 0.0013264814f * f + 0.0096716740f;
         NativeFloat r = (high * f2 + middle) * f2 + low;
-        return (NativeFloat)((NativeInt)r + ((NativeInt)shifted << 23));
+        return (NativeFloat)((NativeUnsigned)r + ((NativeUnsigned)shifted << 23));
     }, a);
 }
 
