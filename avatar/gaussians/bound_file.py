@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from avatar.gaussians.binding import BoundGaussians
-from smplxpp.core.atomic import atomic_path
+from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 
 SCHEMA = 1
@@ -19,10 +20,11 @@ _KIND = "bound_gaussians"
 
 def save_bound(bound: BoundGaussians, path: str | Path) -> None:
     """Write all tensors and the mesh's digest, whole or not at all."""
-    metadata = {"kind": _KIND, "schema": str(SCHEMA), "face_count": str(bound.face_count), "topology": bound.topology}
+    # One entry: safetensors writes several in an order that differs from run to run.
+    about = {"schema": SCHEMA, "face_count": bound.face_count, "topology": bound.topology}
+    metadata = {_KIND: json.dumps(about, sort_keys=True)}
     tensors = {name: value.detach().cpu().contiguous() for name, value in bound.tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=metadata)
+    atomic_write_bytes(path, save(tensors, metadata=metadata))
 
 
 def load_bound(path: str | Path, *, faces: np.ndarray | None = None) -> BoundGaussians:
@@ -45,14 +47,15 @@ def load_bound(path: str | Path, *, faces: np.ndarray | None = None) -> BoundGau
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError as error:
         raise InputError(subject, expected="a safetensors file", received=str(error)) from None
-    if metadata.get("kind") != _KIND or metadata.get("schema") != str(SCHEMA):
-        raise InputError(
-            subject,
-            expected=f"{_KIND} of schema {SCHEMA}",
-            received=f"{metadata.get('kind', 'something else')} of schema {metadata.get('schema', '?')}",
-        )
     try:
-        bound = BoundGaussians(**tensors, face_count=int(metadata["face_count"]), topology=metadata["topology"])
+        about = json.loads(metadata.get(_KIND, "{}"))
+        schema = about.get("schema", "?") if _KIND in metadata else "something else"
+    except (ValueError, AttributeError):
+        about, schema = {}, "unreadable"
+    if schema != SCHEMA:
+        raise InputError(subject, expected=f"{_KIND} of schema {SCHEMA}", received=f"schema: {schema}")
+    try:
+        bound = BoundGaussians(**tensors, face_count=int(about["face_count"]), topology=about["topology"])
     except InputError as error:
         raise InputError(f"{subject}: {error.subject}", expected=error.expected, received=error.received) from None
     except (TypeError, KeyError, AttributeError, ValueError) as error:

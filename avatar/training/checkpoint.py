@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from smplxpp.core.atomic import atomic_path
+from smplxpp.core.atomic import atomic_write_bytes
 
 SCHEMA = 1
 
@@ -37,8 +37,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint as safetensors, whole or not at all: a kill leaves the one before."""
     about = {"iteration": checkpoint.iteration, "seconds": checkpoint.seconds, "key": checkpoint.key}
     tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"schema": str(SCHEMA), "training": json.dumps(about)})
+    atomic_write_bytes(path, save(tensors, metadata={"training": json.dumps({"schema": SCHEMA, **about})}))
 
 
 def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
@@ -48,11 +47,8 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
     """
     try:
         with safe_open(Path(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("schema") != str(SCHEMA):
-                return None
-            about = json.loads(metadata["training"])
-            if about["key"] != key:
+            about = json.loads((file.metadata() or {})["training"])
+            if about["schema"] != SCHEMA or about["key"] != key:
                 return None
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError, KeyError, ValueError):
