@@ -34,7 +34,7 @@ def body() -> tuple[torch.Tensor, torch.Tensor]:
     points, corners = fast_simplification.simplify(
         vertices.astype(np.float32), faces.astype(np.int32), target_count=FACES
     )
-    return torch.from_numpy(points), torch.from_numpy(corners.astype(np.int64))
+    return torch.from_numpy(points).float(), torch.from_numpy(corners.astype(np.int64))
 
 
 def subdivide(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

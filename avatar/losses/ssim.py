@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from avatar.losses.checks import check_images, mean, total_weight
+from avatar.render.memory import pooled_empty
 from smplxpp.core.errors import InputError
 from smplxpp.native import native_library
 
@@ -147,7 +148,7 @@ def _call(
         value, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
         return value, values, None, by_y
     B, H, W, C = x.shape
-    values, by_x, by_y = (torch.empty_like(x) if wanted else None for wanted in (map_, grad_x, grad_y))
+    values, by_x, by_y = (pooled_empty(*x.shape) if wanted else None for wanted in (map_, grad_x, grad_y))
     value = ctypes.c_double()
 
     def pointer(tensor: Tensor | None) -> ctypes.c_void_p:

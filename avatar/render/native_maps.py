@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.render.barycentrics import ray_from_pixel
+from avatar.render.memory import pooled_empty
 from smplxpp.core.camera import Camera
 from smplxpp.native import native_library
 from smplxpp.raster import MeshMaps
@@ -59,7 +60,7 @@ class InterpolateFunction(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, barycentric: Tensor, faces: Tensor, face_id: Tensor) -> Tensor:
         inputs = [t.contiguous() for t in (values, faces, face_id, barycentric)]
         ctx.save_for_backward(*inputs)
-        out = values.new_empty((*face_id.shape, values.shape[1]))
+        out = pooled_empty(*face_id.shape, values.shape[1])
         native_library().smplxpp_interpolate(
             *map(_pointer, inputs), *map(ctypes.c_int64, (face_id.numel(), values.shape[1])), _pointer(out),
             torch.get_num_threads(),
@@ -72,7 +73,7 @@ class InterpolateFunction(torch.autograd.Function):
         inputs = ctx.saved_tensors
         values, _, face_id, barycentric = inputs
         grad_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
-        grad_barycentric = torch.empty_like(barycentric) if ctx.needs_input_grad[1] else None
+        grad_barycentric = pooled_empty(*barycentric.shape) if ctx.needs_input_grad[1] else None
         native_library().smplxpp_interpolate_backward(
             *map(_pointer, (*inputs, grad.contiguous())), *map(ctypes.c_int64, (face_id.numel(), *values.shape)),
             _pointer(grad_values), _pointer(grad_barycentric), torch.get_num_threads(),
