@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from pipelines.capture_check.diagnosis import Diagnosis, diagnose
 from pipelines.capture_check.findings import Finding
 from pipelines.capture_check.mistakes import Mistake, Sample
-from pipelines.capture_check.silhouettes import MIN_SHARE, FitSummary, summary
+from pipelines.capture_check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, summary
 from pipelines.capture_check.views import ViewCheck
 from smplxpp.core.camera import Camera
 
-# A frame does not fit by itself if it is bad in this share of its cameras, while most other frames are good.
-_MOST = 0.6
+# A frame does not fit by itself if it is bad in this share of its cameras. Single frames and cameras are to blame if
+# they are this much worse than the median.
+_MOST, _WORSE = 0.6, 2.5
 _SAMPLE_CAMERAS, _SAMPLE_FRAMES = 4, 3
 
 Sampler = Callable[[str, int], Sample | None]
@@ -39,18 +41,18 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
         sampler: gives the view of a camera and a frame to try corrections on.
     """
     frames = by_frame(views)
-    lost = {frame for frame, s in frames.items() if s.views > 1 and s.bad >= _MOST * s.views}
-    if len(lost) > 0.5 * len(frames):
-        lost = set()
+    lost = {frame for frame in _outliers(frames) if frames[frame].views > 1}
+    lost = {frame for frame in lost if frames[frame].bad >= _MOST * frames[frame].views}
     rest = [view for view in views if view.frame not in lost]
     cameras = by_camera(rest)
-    bad = [name for name, s in cameras.items() if s.verdict == "bad"]
-    doubtful = [name for name, s in cameras.items() if s.verdict == "doubtful"]
+    everywhere = [name for name, s in cameras.items() if s.verdict == "bad"]
+    bad = everywhere if 2 * len(everywhere) >= len(cameras) else _outliers(cameras)
+    doubtful = [name for name, s in cameras.items() if s.verdict != "good" and name not in bad]
     for frame in sorted(lost):
         s = frames[frame]
         words = f"frame {frame}: the body does not fit the masks in {s.bad} of {s.views} cameras ({_figures(s)})"
         yield Finding("calibration-frame", words, None, frame)
-    if bad and len(bad) >= 0.5 * len(cameras):
+    if bad and bad is everywhere:
         yield _everywhere(rest, bad, cameras, sampler)
         return
     for name in bad:
@@ -59,14 +61,25 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
         yield _loose(doubtful, rest, cameras, sampler)
 
 
-def blind_cameras(views: Sequence[ViewCheck]) -> Iterator[Finding]:
+def _outliers(fits: Mapping[Any, FitSummary]) -> list[Any]:
+    """Bad ones that are much worse than most: with rough parameters all are, and none is to blame."""
+    if not fits:
+        return []
+    usual = float(np.median([fit.outside for fit in fits.values()]))
+    return [
+        key for key, fit in fits.items()
+        if fit.verdict == "bad" and usual < OUTSIDE_BAD and (fit.outside > _WORSE * usual or fit.iou < IOU_BAD)
+    ]  # fmt: skip
+
+
+def blind_cameras(views: Iterable[ViewCheck]) -> Iterator[Finding]:
     """Cameras whose every mask is empty, and into which the body does not project either."""
-    for name in dict.fromkeys(view.camera for view in views):
-        own = [view for view in views if view.camera == name]
-        known = [view for view in own if view.mask_share is not None]
-        shown = any(view.fit or view.findings or view.mask_share > MIN_SHARE for view in known)
-        if known and len(known) == len(own) and not shown:
-            yield Finding("camera-sees-nobody", f"camera {name}: its masks are empty, it never sees the person", name)
+    blind: dict[str, bool] = {}
+    for view in views:
+        nobody = view.mask_share is not None and view.mask_share < MIN_SHARE and not view.fit and not view.findings
+        blind[view.camera] = blind.get(view.camera, True) and nobody
+    for name in (name for name, nobody in blind.items() if nobody):
+        yield Finding("camera-sees-nobody", f"camera {name}: its masks are empty, it never sees the person", name)
 
 
 def _everywhere(
@@ -105,7 +118,9 @@ def _loose(
     doubtful: Sequence[str], views: Sequence[ViewCheck], cameras: Mapping[str, FitSummary], sampler: Sampler
 ) -> Finding:
     median = float(np.median([cameras[name].outside for name in doubtful]))
-    which = "every camera" if len(doubtful) == len(cameras) else f"camera {', '.join(doubtful)}"
+    which = (
+        "every camera" if len(doubtful) == len(cameras) else f"camera{'s' * (len(doubtful) > 1)} {', '.join(doubtful)}"
+    )
     words = f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
     words, advice = _explained(words, diagnose(_samples(views, spread(doubtful, _SAMPLE_CAMERAS), sampler)))
     return Finding("calibration-loose", words, advice=advice)

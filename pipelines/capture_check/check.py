@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,8 @@ from smplxpp.core.rotations import matrix_from_rotvec
 Progress = Callable[[int, int], None]
 # Frames before and after that are tried where images and parameters may not be of one clock.
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
+# Posed bodies held in memory.
+_KEPT = 32
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class CaptureCheck:
         small: the same at the size of the comparison.
         findings: what is wrong; empty for a sound capture.
         views: all views that were opened.
-        vertices: of the posed body in the opened frames, by frame.
+        vertices: gives those of the posed body in a frame, (V, 3), or None.
         faces: (F, 3) of the body.
     """
 
@@ -62,7 +66,7 @@ class CaptureCheck:
     small: Capture
     findings: tuple[Finding, ...]
     views: tuple[ViewCheck, ...]
-    vertices: dict[int, np.ndarray]
+    vertices: Callable[[int], np.ndarray | None]
     faces: np.ndarray
 
     @property
@@ -112,38 +116,43 @@ def check_capture(
     views: list[ViewCheck] = []
     wanted = small.views(frames=frames)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for frame in frames:
+        for frame, group in groupby(wanted, key=lambda view: view[1]):
             vertices = poser.vertices(frame)
             posed = None if vertices is None else (vertices, body.faces)
-            cameras = [camera for camera, number in wanted if number == frame]
+            cameras = [camera for camera, _ in group]
             views += pool.map(lambda camera, f=frame, b=posed: check_view(small, camera, f, b), cameras)
             progress(len(views), len(wanted))
     findings += [finding for view in views for finding in view.findings]
     findings += [*poser.findings, *_plain_background(views), *blind_cameras(views)]
     findings += calibration_findings(views, small.cameras, lambda camera, frame: _sample(small, poser, camera, frame))
-    posed_frames = {frame: poser.vertices(frame) for frame in frames if poser.vertices(frame) is not None}
     shown = tuple(_relative(finding, capture.root) for finding in dict.fromkeys(findings))
-    return CaptureCheck(capture, small, shown, tuple(views), posed_frames, body.faces)
+    return CaptureCheck(capture, small, shown, tuple(views), poser.vertices, body.faces)
 
 
 class _Poser:
-    """The posed body by frame, made once each; what cannot be posed becomes a finding."""
+    """The posed body by frame; what cannot be posed becomes a finding."""
 
     def __init__(self, body: BodyModel, params: dict[int, BodyParams]) -> None:
         self.body, self.params = body, params
         self.findings: list[Finding] = []
-        self._posed: dict[int, np.ndarray | None] = {}
+        self._posed: OrderedDict[int, np.ndarray | None] = OrderedDict()
 
     def vertices(self, frame: int) -> np.ndarray | None:
-        """(V, 3), None without usable parameters."""
+        """(V, 3), None without usable parameters. The last few are kept."""
         if frame not in self._posed:
-            self._posed[frame] = None
-            if frame in self.params:
-                try:
-                    self._posed[frame] = self.body.forward(self.params[frame]).vertices[0]
-                except InputError as error:
-                    self.findings.append(Finding("params-body", f"frame {frame}: {error}", None, frame))
+            self._posed[frame] = self._pose(frame)
+            if len(self._posed) > _KEPT:
+                self._posed.popitem(last=False)
         return self._posed[frame]
+
+    def _pose(self, frame: int) -> np.ndarray | None:
+        if frame not in self.params:
+            return None
+        try:
+            return self.body.forward(self.params[frame]).vertices[0]
+        except InputError as error:
+            self.findings.append(Finding("params-body", f"frame {frame}: {error}", None, frame))
+            return None
 
 
 def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | None:

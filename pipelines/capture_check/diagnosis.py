@@ -18,6 +18,7 @@ from pipelines.capture_check.silhouettes import (
 
 # A correction explains the misfit if the body is then this far inside the masks, and the overlap this much larger.
 _FITS_OUTSIDE, _GAIN = 2 * OUTSIDE_DOUBTFUL, 0.05
+_FEW, _HOPELESS = 4, 6 * OUTSIDE_DOUBTFUL
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,9 @@ def diagnose(samples: Sequence[Sample], extra: Sequence[Mistake] = ()) -> Diagno
     """
     before = _score(samples, Mistake("", ""))
     for level in ((*SINGLE, *extra, *shifts(samples)), COMBINED):
-        scored = [(_score(samples, mistake), mistake) for mistake in level]
+        # Most corrections are hopeless, which a few views show.
+        likely = [mistake for mistake in level if _score(samples[::_FEW], mistake).outside < _HOPELESS]
+        scored = [(_score(samples, mistake), mistake) for mistake in likely]
         fitting = [item for item in scored if _explains(before, item[0])]
         if fitting:
             after, mistake = max(fitting, key=lambda item: item[0].iou - item[0].outside)

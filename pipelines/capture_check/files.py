@@ -15,9 +15,10 @@ _KINDS = (
     (r"not calibrated$", "camera-uncalibrated"),
     (r"calibrated, but without any image$", "camera-without-images"),
     (r"an image in camera .* alone$", "frame-alone"),
-    (r"no image of frame \d+$|image_c_|: no image\b", "image-missing"),
+    (r"no image of frame \d+$|: named in .*, but missing$", "image-missing"),
     (r"^no masks: ", "masks-none"),
     (r"no mask( of frame \d+)?$", "mask-missing"),
+    (r"no (label|normal) of frame \d+$", "map-missing"),
     (r"no body parameters$", "params-missing"),
     (r"NaN or infinity|\bparam|smpl", "params-broken"),
 )
@@ -62,6 +63,8 @@ def split_findings(capture: Capture) -> Iterator[Finding]:
 
 
 def in_ranges(numbers: np.ndarray) -> str:
-    """Ascending numbers in words: `0-3, 7, 9-10`."""
+    """Ascending numbers in words: `0-3, 7, 9-10`; "" for none."""
+    if not len(numbers):
+        return ""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

@@ -19,6 +19,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "camera-uncalibrated": ("files", "fail", "add the camera to the calibration, or delete the folder"),
     "camera-without-images": ("files", "fail", "add its images, or take the camera out of the calibration"),
     "image-missing": ("files", "warn", "copy the missing images; the views are left out until then"),
+    "map-missing": ("files", "warn", "copy the missing maps, or correct the lists in capture.json"),
     "frame-alone": ("files", "fail", "copy the other cameras' images of these frames, or delete the single ones"),
     "split-empty": ("splits", "fail", "correct the cameras and frames of the splits in capture.json"),
     "split-leftover": ("splits", "warn", "add them to one of the splits in capture.json if they should be used"),

@@ -9,7 +9,7 @@ from scipy import ndimage
 from pipelines.capture_check.calibration import spread
 from pipelines.capture_check.check import CaptureCheck
 from pipelines.capture_check.silhouettes import body_silhouette
-from pipelines.capture_check.views import OPAQUE
+from pipelines.capture_check.views import OPAQUE, ViewCheck
 from pipelines.pictures import caption, contact_sheet
 from smplxpp.core.errors import InputError
 
@@ -24,11 +24,12 @@ def draw_contact_sheet(check: CaptureCheck) -> np.ndarray | None:
     cameras = spread(list(dict.fromkeys(view.camera for view in check.views)), _MOST_CAMERAS)
     if not frames or not cameras:
         return None
+    known = {(view.camera, view.frame): view for view in check.views}
     cells, captions = [], []
     for camera in cameras:
         for frame in frames:
             cells.append(_cell(check, camera, frame))
-            captions.append(_words(check, camera, frame))
+            captions.append(_words(known.get((camera, frame)), camera, frame))
     named = [caption(_widened(cell), words, size=13) for cell, words in zip(cells, captions, strict=True)]
     # Several cameras side by side, so that the sheet is about as wide as it is high.
     beside = max(1, round(len(cameras) ** 0.5 / 2))
@@ -53,16 +54,16 @@ def _cell(check: CaptureCheck, camera: str, frame: int) -> np.ndarray:
     size = (max(1, round(full.width * height / full.height)), height)
     cell = np.array(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
     outlines = [] if mask is None else [(mask > OPAQUE, MASK_COLOR)]
-    if frame in check.vertices:
-        outlines.append((body_silhouette(check.vertices[frame], check.faces, full), BODY_COLOR))
+    vertices = check.vertices(frame)
+    if vertices is not None:
+        outlines.append((body_silhouette(vertices, check.faces, full), BODY_COLOR))
     for shape, color in outlines:
         reduced = np.array(Image.fromarray(shape).resize(size, Image.Resampling.NEAREST))
         cell[reduced & ~ndimage.binary_erosion(reduced, border_value=1)] = color
     return cell
 
 
-def _words(check: CaptureCheck, camera: str, frame: int) -> str:
-    view = next((v for v in check.views if (v.camera, v.frame) == (camera, frame)), None)
+def _words(view: ViewCheck | None, camera: str, frame: int) -> str:
     if view is None:
         return f"{camera}, {frame}: no image"
     return f"{camera}, {frame}" + (f": {view.fit.outside:.1%} outside" if view.fit else "")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from pipelines.capture_check.check import CaptureCheck
+from pipelines.capture_check.files import in_ranges
 from pipelines.capture_check.findings import Finding, grouped
 from pipelines.capture_check.report import check_as_dict
 
@@ -17,7 +19,7 @@ _MESSAGES, _FRAMES = 6, 8
 def print_check(check: CaptureCheck, console: Console) -> None:
     """Print everything that a person needs to act."""
     content = check_as_dict(check)
-    _print_head(content, console)
+    _print_head(check, content, console)
     console.print(_camera_table(content))
     frames = _frame_table(content)
     if frames.row_count:
@@ -35,7 +37,7 @@ def print_check(check: CaptureCheck, console: Console) -> None:
         console.print(Text(f"{counts[1]} to look at", style="yellow" if counts[1] else "dim"))
 
 
-def _print_head(content: dict, console: Console) -> None:
+def _print_head(check: CaptureCheck, content: dict, console: Console) -> None:
     sizes = sorted({f"{camera['width']} x {camera['height']}" for camera in content["cameras"]})
     rate = f" at {content['fps']:g} a second" if content["fps"] else ""
     console.print(Text(content["name"], style="bold") + Text(f"  {content['capture']}", style="dim"), soft_wrap=True)
@@ -44,9 +46,14 @@ def _print_head(content: dict, console: Console) -> None:
         f"{content['frames']} frames{rate}",
         highlight=False,
     )
-    s = content["splits"]
-    held = f"{s['novel_view_cameras']} cameras and {s['novel_pose_frames']} frames held out"
-    console.print(f"trained on {s['train_cameras']} cameras and {s['train_frames']} frames; {held}", highlight=False)
+    splits = check.capture.splits
+    cameras, frames = ", ".join(splits.novel_view_cameras), in_ranges(np.array(splits.novel_pose_frames, dtype=int))
+    held = " and ".join(f"{what} {names}" for what, names in (("cameras", cameras), ("frames", frames)) if names)
+    console.print(
+        f"trained on {len(splits.train_cameras)} cameras and {len(splits.train_frames)} frames; held out: "
+        + (held or "nothing, so that nothing can be measured on what was not trained on"),
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
     if content["opened_frames"] < content["frames"]:
         console.print(
             f"opened the images of {content['opened_frames']} frames, evenly spread; `--frames all` opens all",

@@ -21,7 +21,7 @@ from smplxpp.capture import open_capture
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from tests.capture.scene import make_scene
-from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_simple
+from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_neus2, write_simple
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "capture_check.md"
 VIEWS = [(camera, frame) for camera in "ABC" for frame in range(4)]
@@ -185,6 +185,8 @@ FILE_FAULTS = {
         lambda root: shutil.rmtree(root / "rgbs/C"), "split-empty", "camera C is held out"),
     "splits without frames": (describe(train_frames=[100, 200]), "split-empty", "no frame with images is trained on"),
     "a camera in no split": (describe(train_views=["A"]), "split-leftover", "B"),
+    "listed maps that are missing": (
+        describe(labels={"A": [0, 2]}), "map-missing", "labels/A: no label of frame 2"),
     "frames in no split": (describe(train_frames=[0, 0]), "split-leftover", "1-2"),
 }  # fmt: skip
 
@@ -361,7 +363,7 @@ def test_frames_are_spread_where_there_are_many(sound, body):
 def test_the_command_answers_in_tables_json_and_files(rig, tmp_path, capsys):
     assert main(["capture", "check", str(rig), "--out", str(tmp_path / "report")]) == 0
     text = capsys.readouterr().out
-    assert "no complaint" in text and "3 cameras" in text and "1 cameras and 1 frames held out" in text
+    assert "no complaint" in text and "3 cameras" in text and "held out: cameras C and frames 3" in text
     html = (tmp_path / "report" / "report.html").read_text()
     assert "Every check passes" in html and "http" not in html.replace("http://www.w3.org", "")
     sheet = np.asarray(Image.open(tmp_path / "report" / "contact_sheet.png"))
@@ -380,6 +382,12 @@ def test_the_terminal_says_what_to_do(rig, capsys, monkeypatch):
     assert main(["capture", "check", str(rig)]) == 1
     text = capsys.readouterr().out
     assert "R and T are camera to world" in text and "do: invert them" in text and "bad" in text
+
+
+def test_images_that_a_transform_file_names_in_vain(tmp_path, body):
+    root = write_neus2(make_scene(), tmp_path / "scene")
+    (root / "images/000001/image_c_002_f_000001.png").unlink()
+    assert "image_c_002_f_000001.png" in found(root, body)["image-missing"][0]
 
 
 @pytest.mark.parametrize("frames", ["x", "0:4:0", "9", "1:2:3:4", ""])

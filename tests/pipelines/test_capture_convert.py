@@ -67,7 +67,7 @@ def test_what_needs_no_change_is_copied_byte_for_byte(tmp_path):
 
 @pytest.mark.parametrize("layout", ["avatarrex", "easymocap", "instant-ngp", "neus2", "talkbody4d", "colmap-binary"])
 def test_every_layout_comes_out_as_it_was_given_out(layout, tmp_path):
-    name, write, lens = WRITERS[layout]
+    _, write, lens = WRITERS[layout]
     source = open_capture(write(make_scene(lens=lens, square_pixels=layout == "colmap-binary"), tmp_path / "set"))
     done = convert_capture(source, tmp_path / "new")
     new = open_capture(tmp_path / "new", format="simple")
