@@ -11,7 +11,7 @@
 
 namespace smplxpp {
 
-// An array of trivial elements, aligned to a cache line, or to a huge page where it is as large as one.
+// An array of trivial elements, aligned to a cache line, or to a huge page where it fills half of one.
 template <class T>
 class Buffer {
 public:
@@ -56,7 +56,7 @@ public:
 private:
     void allocate(int64_t n) {
         constexpr size_t line = 64, huge = size_t(1) << 21;
-        const size_t bytes = sizeof(T) * (size_t)n, align = bytes >= huge ? huge : line;
+        const size_t bytes = sizeof(T) * (size_t)n, align = bytes >= huge / 2 ? huge : line;
         data_ = (T*)std::aligned_alloc(align, (bytes + align - 1) / align * align);
         if (!data_) throw std::bad_alloc();
         capacity_ = n;
