@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.capture_convert_views import OURS, ViewWriter
+from pipelines.capture_convert_views import ViewWriter
 from pipelines.makers.synth.camera_rig import RigCamera
 from pipelines.makers.synth.files import write_calibration_csv
 from smplxpp.capture import Capture
@@ -238,7 +238,7 @@ def _write_ours(capture: Capture, out: Path, cameras: Sequence[str], frames: Seq
         "novel_pose_frames": _ranges(splits.novel_pose_frames, frames),
     }
     atomic_write_text(out / "cameras.json", json.dumps({"cameras": entries}, indent=1) + "\n")
-    atomic_write_text(out / OURS, json.dumps(description, indent=1) + "\n")
+    atomic_write_text(out / "capture.json", json.dumps(description, indent=1) + "\n")
 
 
 def _ranges(chosen: Sequence[int], frames: Sequence[int]) -> list[list[int]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from smplxpp.capture.window import Window
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 
-OURS = "capture.json"
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _JPEG = (".jpg", ".jpeg")
 
@@ -52,11 +50,11 @@ class ViewWriter:
         targets = self._targets(camera, frame)
         if all(path.is_file() for path, _ in targets.values()):
             return ViewOutcome(kept=len(targets))
+        read = {"image": self._image, "mask": self.capture.mask, "label": self.capture.labels, "normal": self._normals}
         contents, copied = {}, 0
         try:
             for kind, (path, same) in targets.items():
-                make: Callable[[str, int], np.ndarray] = getattr(self, f"_{kind}")
-                value = make(camera, frame)  # decoded in any case: a damaged file is not passed on
+                value = read[kind](camera, frame)  # decoded in any case: a damaged file is not passed on
                 if same:
                     contents[path] = self.capture.file(camera, frame, kind).read_bytes()
                     copied += 1
@@ -93,14 +91,10 @@ class ViewWriter:
         targets = {"image": (place("rgbs", "rgb", kept), unchanged)}
         if found["mask"] is not None:
             targets["mask"] = (place("masks", "mask", ".png"), unchanged and _is_plain_mask(found["mask"]))
-        if found["label"] is not None:
-            targets["label"] = (
-                place("labels", "label", found["label"].suffix.lower() if unchanged else ".png"),
-                unchanged,
-            )
-        if found["normal"] is not None:
-            ending = found["normal"].suffix.lower() if unchanged else ".png"
-            targets["normal"] = (place("normals", "normal", ending), unchanged)
+        for kind, folder in (("label", "labels"), ("normal", "normals")):
+            if found[kind] is not None:
+                ending = found[kind].suffix.lower() if unchanged else ".png"
+                targets[kind] = (place(folder, kind, ending), unchanged)
         return targets
 
     def _image(self, camera: str, frame: int) -> np.ndarray:
@@ -108,13 +102,7 @@ class ViewWriter:
             return self.capture.foreground(camera, frame)[0]
         return self.capture.image(camera, frame)
 
-    def _mask(self, camera: str, frame: int) -> np.ndarray:
-        return self.capture.mask(camera, frame)
-
-    def _label(self, camera: str, frame: int) -> np.ndarray:
-        return self.capture.labels(camera, frame)
-
-    def _normal(self, camera: str, frame: int) -> np.ndarray:
+    def _normals(self, camera: str, frame: int) -> np.ndarray:
         """(H, W, 3) uint16 codes, n = value / 65535 * 2 - 1, black outside."""
         normals = self.capture.normals(camera, frame)
         codes = np.clip(np.round((normals + 1.0) * 32767.5), 1, 65535)

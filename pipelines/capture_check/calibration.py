@@ -45,18 +45,18 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
     lost = {frame for frame in lost if frames[frame].bad >= _MOST * frames[frame].views}
     rest = [view for view in views if view.frame not in lost]
     cameras = by_camera(rest)
-    everywhere = [name for name, s in cameras.items() if s.verdict == "bad"]
-    bad = everywhere if 2 * len(everywhere) >= len(cameras) else _outliers(cameras)
-    doubtful = [name for name, s in cameras.items() if s.verdict != "good" and name not in bad]
     for frame in sorted(lost):
         s = frames[frame]
         words = f"frame {frame}: the body does not fit the masks in {s.bad} of {s.views} cameras ({_figures(s)})"
         yield Finding("calibration-frame", words, None, frame)
-    if bad and bad is everywhere:
+    bad = [name for name, s in cameras.items() if s.verdict == "bad"]
+    if bad and 2 * len(bad) >= len(cameras):
         yield _everywhere(rest, bad, cameras, sampler)
         return
-    for name in bad:
+    to_blame = _outliers(cameras)
+    for name in to_blame:
         yield _one_camera(name, rest, cameras[name], sampler, rig)
+    doubtful = [name for name, s in cameras.items() if s.verdict != "good" and name not in to_blame]
     if doubtful:
         yield _loose(doubtful, rest, cameras, sampler)
 
@@ -118,9 +118,7 @@ def _loose(
     doubtful: Sequence[str], views: Sequence[ViewCheck], cameras: Mapping[str, FitSummary], sampler: Sampler
 ) -> Finding:
     median = float(np.median([cameras[name].outside for name in doubtful]))
-    which = (
-        "every camera" if len(doubtful) == len(cameras) else f"camera{'s' * (len(doubtful) > 1)} {', '.join(doubtful)}"
-    )
+    which = "every camera" if len(doubtful) == len(cameras) else ", ".join(doubtful)
     words = f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
     words, advice = _explained(words, diagnose(_samples(views, spread(doubtful, _SAMPLE_CAMERAS), sampler)))
     return Finding("calibration-loose", words, advice=advice)

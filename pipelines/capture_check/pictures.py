@@ -10,7 +10,7 @@ from pipelines.capture_check.calibration import spread
 from pipelines.capture_check.check import CaptureCheck
 from pipelines.capture_check.silhouettes import body_silhouette
 from pipelines.capture_check.views import OPAQUE, ViewCheck
-from pipelines.pictures import caption, contact_sheet
+from pipelines.pictures import caption, contact_sheet, row
 from smplxpp.core.errors import InputError
 
 BODY_COLOR, MASK_COLOR = (255, 60, 140), (0, 210, 255)
@@ -18,22 +18,23 @@ _CELL_HEIGHT, _CAPTION_WIDTH = 300, 190
 _MOST_CAMERAS, _MOST_FRAMES = 24, 4
 
 
-def draw_contact_sheet(check: CaptureCheck) -> np.ndarray | None:
-    """(H, W, 3) uint8: a few frames of each camera beside each other; None without any image."""
+def draw_strips(check: CaptureCheck) -> dict[str, np.ndarray]:
+    """For each camera a few frames beside each other, (H, W, 3) uint8; of many cameras some, evenly spread."""
     frames = spread(check.frames, _MOST_FRAMES)
-    cameras = spread(list(dict.fromkeys(view.camera for view in check.views)), _MOST_CAMERAS)
-    if not frames or not cameras:
-        return None
     known = {(view.camera, view.frame): view for view in check.views}
-    cells, captions = [], []
-    for camera in cameras:
-        for frame in frames:
-            cells.append(_cell(check, camera, frame))
-            captions.append(_words(known.get((camera, frame)), camera, frame))
-    named = [caption(_widened(cell), words, size=13) for cell, words in zip(cells, captions, strict=True)]
-    # Several cameras side by side, so that the sheet is about as wide as it is high.
-    beside = max(1, round(len(cameras) ** 0.5 / 2))
-    return contact_sheet(named, columns=len(frames) * beside, gap=8)
+    strips = {}
+    for camera in spread(list(dict.fromkeys(view.camera for view in check.views)), _MOST_CAMERAS):
+        cells = [
+            caption(_widened(_cell(check, camera, frame)), _words(known.get((camera, frame)), camera, frame), size=13)
+            for frame in frames
+        ]
+        strips[camera] = row(cells, gap=8)
+    return strips
+
+
+def contact_sheet_of(strips: dict[str, np.ndarray]) -> np.ndarray:
+    """All strips in one picture, several beside each other where there are many."""
+    return contact_sheet(list(strips.values()), columns=max(1, round(len(strips) ** 0.5 / 2)), gap=8)
 
 
 def _widened(cell: np.ndarray) -> np.ndarray:

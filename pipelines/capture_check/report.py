@@ -11,9 +11,9 @@ import numpy as np
 from pipelines.capture_check.calibration import spread
 from pipelines.capture_check.check import CaptureCheck
 from pipelines.capture_check.findings import AREAS, grouped
-from pipelines.capture_check.pictures import BODY_COLOR, MASK_COLOR, draw_contact_sheet
+from pipelines.capture_check.pictures import BODY_COLOR, MASK_COLOR, contact_sheet_of, draw_strips
 from pipelines.capture_check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary
-from pipelines.pictures import encode_png
+from pipelines.pictures import encode_jpeg, encode_png
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from smplxpp.core.artifact import jsonable, versions
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
@@ -50,30 +50,28 @@ def check_as_dict(check: CaptureCheck) -> dict[str, Any]:
 def write_check_report(check: CaptureCheck, folder: Path) -> Path:
     """Write `report.html`, `contact_sheet.png` and `check.json` to the folder; returns the report's path."""
     atomic_write_text(folder / "check.json", json.dumps(jsonable(check_as_dict(check)), indent=1) + "\n")
-    sheet = draw_contact_sheet(check)
-    pictures = ()
-    if sheet is not None:
-        data = encode_png(sheet)
-        atomic_write_bytes(folder / "contact_sheet.png", data)
-        pictures = (Picture("each camera's images with the outlines of posed body and mask", data),)
+    strips = draw_strips(check)
+    if strips:
+        atomic_write_bytes(folder / "contact_sheet.png", encode_png(contact_sheet_of(strips)))
+    pictures = tuple(Picture(camera, encode_jpeg(strip)) for camera, strip in strips.items())
     return write_report(folder / "report.html", _report(check, pictures))
 
 
 def _report(check: CaptureCheck, pictures: tuple[Picture, ...]) -> Report:
     capture = check.capture
-    rows = {area: _check_row(check, area) for area in AREAS}
     fits = check.cameras()
     numbers = [KeyNumber("cameras", str(len(capture.cameras))), KeyNumber("frames", f"{len(capture.frames):,}")]
     if fits:
         outside = float(np.median([fit.outside for fit in fits.values()]))
         numbers.append(KeyNumber("body outside the masks", f"{outside:.1%}", "median of the cameras"))
     return Report(
-        subject=f"capture {capture.name}",
+        kind="capture",
+        subject=capture.name,
         summary=f"Layout {capture.format}, {len(check.views):,} views of {len(check.frames):,} frames opened.",
         key_numbers=tuple(numbers),
-        checks=tuple(rows.values()),
+        checks=tuple(_check_row(check, area) for area in AREAS),
         sections=(
-            _findings_section(check, rows), _silhouette_section(check, pictures), _frame_section(check),
+            _findings_section(check), _silhouette_section(check, pictures), _frame_section(check),
         ),
         provenance={"capture": {"folder": str(capture.root), "format": capture.format}, "versions": versions()},
     )  # fmt: skip
@@ -86,7 +84,7 @@ def _check_row(check: CaptureCheck, area: str) -> CheckRow:
     return CheckRow(area, float(len(own)), "findings", status, "none", stage="capture")
 
 
-def _findings_section(check: CaptureCheck, rows: dict[str, CheckRow]) -> Section:
+def _findings_section(check: CaptureCheck) -> Section:
     table = []
     for group in grouped(check.findings):
         messages = [finding.message for finding in group[:SHOWN_MESSAGES]]
@@ -95,7 +93,7 @@ def _findings_section(check: CaptureCheck, rows: dict[str, CheckRow]) -> Section
         table.append((group[0].status, group[0].kind, len(group), "; ".join(messages), group[0].remedy))
     text = () if table else ("Nothing to complain about.",)
     tables = (Table(("status", "kind", "count", "what", "do"), tuple(table)),) if table else ()
-    return Section("Findings", text=text, tables=tables, checks=tuple(rows.values()))
+    return Section("Findings", text=text, tables=tables)
 
 
 def _silhouette_section(check: CaptureCheck, pictures: tuple[Picture, ...]) -> Section:
@@ -130,8 +128,8 @@ def _frame_section(check: CaptureCheck) -> Section:
     if len(fits) > 1:
         numbers = np.array(list(fits))
         lines = {
-            "median of the cameras": (numbers, np.array([100 * fit.outside for fit in fits.values()])),
-            "worst camera": (numbers, np.array([100 * fit.worst for fit in fits.values()])),
+            "median": (numbers, np.array([100 * fit.outside for fit in fits.values()])),
+            "worst": (numbers, np.array([100 * fit.worst for fit in fits.values()])),
         }
         curves = (Curve("share of the body outside the masks", lines, "frame", "%"),)
     return Section("By frame", curves=curves, tables=(Table(header, rows, "figures by frame"),))

@@ -177,6 +177,7 @@ class Report:
         checks: all checks of the run; the verdict counts them.
         seconds: wall-clock seconds by stage, in order.
         provenance: title -> {key: value}: configuration, versions, seeds, SHA-256 of the inputs.
+        kind: what of the project the report is on, in a word.
     """
 
     subject: str
@@ -187,6 +188,7 @@ class Report:
     seconds: Mapping[str, float] = field(default_factory=dict)
     sections: tuple[Section, ...] = ()
     provenance: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    kind: str = "template"
 
 
 def count_statuses(checks: Iterable[CheckRow]) -> dict[str, int]:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from pipelines.capture_check import CheckConfig, check_capture, write_check_repo
 from pipelines.capture_check.findings import KINDS
 from pipelines.capture_check.silhouettes import compare_silhouettes
 from pipelines.cli import main
+from pipelines.commands.capture import FormatName
 from smplxpp.body import load_body
-from smplxpp.capture import open_capture
+from smplxpp.capture import FORMATS, open_capture
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from tests.capture.scene import make_scene
@@ -403,6 +405,10 @@ def test_a_report_is_written_without_parameters_and_masks(rig, tmp_path, body):
     write_check_report(check, tmp_path / "out")
     assert {f.kind for f in check.findings} == {"masks-none", "params-none"}
     assert (tmp_path / "out" / "contact_sheet.png").is_file()
+
+
+def test_every_layout_that_is_read_can_be_named():
+    assert set(get_args(FormatName)) == {"auto", *FORMATS}
 
 
 def test_every_kind_of_finding_is_explained():
