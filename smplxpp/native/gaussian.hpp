@@ -72,6 +72,13 @@ constexpr int MOMENTS = 6;
 constexpr int ROW_CHANNELS = 10;
 inline int row_groups(int channels) { return channels <= ROW_CHANNELS ? 1 : 1 + (channels - ROW_CHANNELS + 15) / 16; }
 
+// Threads for a pass that takes nanoseconds an item: waking and awaiting more of them would cost more than it saves, and on a
+// busy machine many times that.
+inline int threads_for(int64_t items, int threads) {
+    constexpr int64_t ENOUGH = 65536;
+    return (int)(items / ENOUGH < threads ? items / ENOUGH + 1 : threads);
+}
+
 struct Workspace {
     int32_t width = 0, height = 0, tiles_x = 0, tiles_y = 0;
     int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }

@@ -110,7 +110,8 @@ void bin(Workspace& w, int threads) {
                     const int row = (strip + r) / STRIPS_PER_TILE;
                     const Hit hit = {gaussian, 0, (uint8_t)std::min(row - first_row, 255), (uint8_t)std::min(last_row - row, 255)};
                     Workspace::Emission* out = notes.grow(used + w.tiles_x, used) + used;
-                    used = emit_tile_row(columns.first + r, columns.last + r, (int64_t)row * w.tiles_x, hit, histogram, out) - notes.data();
+                    out = emit_tile_row(columns.first + r, columns.last + r, (int64_t)row * w.tiles_x, hit, histogram, out);
+                    used = out - notes.data();
                 }
             }
         }

@@ -26,6 +26,7 @@ inline Share share(int64_t n, int thread, int threads) { return {n * thread / th
 }  // namespace
 
 void sort_by_depth(int64_t count, const float* depths, const float* radii, Workspace& w, int threads) {
+    threads = threads_for(count, threads);
     struct Found {
         int64_t visible = 0;
         uint32_t low = ~0u, high = 0;

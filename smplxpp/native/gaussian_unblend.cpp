@@ -63,6 +63,7 @@ struct RowOwners {
 // Which threads touch each visible Gaussian, from the tile rows of its box; returns the number of rows of gradients.
 int64_t assign_rows(int64_t count, const float* radii, Workspace& w, const RowOwners& owners, int threads) {
     w.owners.reserve(count);
+    threads = threads_for(count, threads);
     std::vector<int64_t> extra(threads + 1, 0);
     const auto each = [&](int t, auto&& work) {
         for (int64_t i = count * t / threads, end = count * (t + 1) / threads; i < end; ++i) {
@@ -74,7 +75,8 @@ int64_t assign_rows(int64_t count, const float* radii, Workspace& w, const RowOw
         each(t, [&](int64_t i) {
             // A little more than the box that binning took.
             const float y = w.ellipses[i].pixel_y, height = 1.0001f * radii[2 * i + 1] + 2.0f, limit = w.tiles_y - 1.0f;
-            const int top = (int)std::clamp((y - height) / TILE, 0.0f, limit), bottom = (int)std::clamp((y + height) / TILE, 0.0f, limit);
+            const int top = (int)std::clamp((y - height) / TILE, 0.0f, limit);
+            const int bottom = (int)std::clamp((y + height) / TILE, 0.0f, limit);
             w.owners[i] = {0, (uint16_t)owners.first[top], (uint16_t)owners.last[bottom]};
             sum += owners.last[bottom] - owners.first[top];
         });
