@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <utility>
 #include <vector>
 
 #include "parallel.hpp"
@@ -97,11 +98,12 @@ SMPLXPP_EXPORT void smplxpp_zbuffer(
     const int bands = (height + kBandRows - 1) / kBandRows;
 
     // Faces of each band, in index order (counting sort): small faces are touched by one band alone, and those that cover no
-    // pixel centre by none. Each thread sorts one run of faces; cells are in the order band, run.
+    // pixel centre by none. Each thread sorts one run of faces and counts in memory of its own, lines away from the others'.
     struct Span { int32_t first = 0, last = -1; };
     std::vector<Span> spans(static_cast<size_t>(face_count));
-    std::vector<int64_t> start(size_t(bands) * size_t(threads) + 1, 0);
-    const auto cell = [&](int band, int run) { return size_t(band) * size_t(threads) + size_t(run); };
+    const size_t stride = size_t(bands) + 16;
+    std::vector<int64_t> cursor(stride * size_t(threads), 0), start(size_t(bands) + 1);
+    const auto cell = [&](int band, int run) { return size_t(run) * stride + size_t(band); };
     const auto run_begin = [&](int run) { return face_count * run / threads; };
     smplxpp::run_threads(threads, [&](int run) {
         for (int64_t f = run_begin(run); f < run_begin(run + 1); ++f) {
@@ -113,12 +115,16 @@ SMPLXPP_EXPORT void smplxpp_zbuffer(
             const Box box(a, b, c, width, height);
             if (box.y0 > box.y1 || box.x0 > box.x1) continue;
             spans[size_t(f)] = {box.y0 / kBandRows, box.y1 / kBandRows};
-            for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k) ++start[cell(k, run) + 1];
+            for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k) ++cursor[cell(k, run)];
         }
     });
-    for (size_t k = 1; k < start.size(); ++k) start[k] += start[k - 1];
-    std::vector<int32_t> order(static_cast<size_t>(start.back()));
-    std::vector<int64_t> cursor(start.begin(), start.end() - 1);
+    int64_t sum = 0;
+    for (int b = 0; b < bands; ++b) {
+        start[size_t(b)] = sum;
+        for (int run = 0; run < threads; ++run) sum += std::exchange(cursor[cell(b, run)], sum);
+    }
+    start.back() = sum;
+    std::vector<int32_t> order(static_cast<size_t>(sum));
     smplxpp::run_threads(threads, [&](int run) {
         for (int64_t f = run_begin(run); f < run_begin(run + 1); ++f)
             for (int k = spans[size_t(f)].first; k <= spans[size_t(f)].last; ++k)
@@ -129,7 +135,7 @@ SMPLXPP_EXPORT void smplxpp_zbuffer(
         for (int b = thread; b < bands; b += threads) {
             const int y0 = b * kBandRows, y1 = std::min(height, y0 + kBandRows);
             clear_band(target, y0, y1);
-            raster_rows(screen, faces, start[cell(b, 0)], start[cell(b + 1, 0)], order.data(), near, y0, y1, target);
+            raster_rows(screen, faces, start[size_t(b)], start[size_t(b) + 1], order.data(), near, y0, y1, target);
         }
     });
 }

@@ -86,7 +86,6 @@ def test_unknown_commands_are_answered_with_the_known(capsys):
         (["build", "--out", "x", "--scan", SCAN], "--params with --scan"),
         (["build", "--out", "x", "--capture", "nowhere"], "an existing folder, received nowhere"),
         (["build", "--out", "x", "--capture", FIXTURE, "--frame", "7"], "another frame with --frame"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--label-source", "views"], "--labels"),
         (["build", "--out", "x", "--capture", FIXTURE, "--budgets", "hat", "500"], "hat"),
         (["build", "--out", "x", "--capture", FIXTURE, "--clearance-mm", "nan"], "received nan"),
         (["build", "--out", "x", "--capture", FIXTURE, "--seed", "-1"], "at least 0"),
@@ -105,6 +104,15 @@ def test_mistakes_are_named_with_what_helps(args, words, capsys, tmp_path, monke
     text = fails(capsys, *args)
     assert "error: " in text and "expected" in text and "received" in text and words in text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_of_views_that_are_not_there(capsys, tmp_path):
+    capture = tmp_path / "capture"
+    capture.mkdir()
+    for part in ("scans", "params"):
+        (capture / part).symlink_to(FIXTURE / part)
+    text = fails(capsys, "build", "--out", tmp_path / "x", "--capture", capture, "--label-source", "views")
+    assert "--labels" in text and not (tmp_path / "x").exists()
 
 
 def test_an_unknown_option_ends_with_status_2_and_nothing_on_stdout(capsys):
