@@ -71,7 +71,8 @@ class RasterizerBenchmark:
             figures["OpenSplat, blending alone"] = against_opensplat(*self.opensplat)
         print(json.dumps(figures, indent=1))
         if self.store:
-            store_results("rasterizer", "python -m benchmarks.rasterizer", figures)
+            command = "python -m benchmarks.rasterizer" + " --peer-lib LIB" * bool(self.peer_lib)
+            store_results("rasterizer", command + " --opensplat CHECKOUT BUILD" * bool(self.opensplat), figures)
 
 
 class Job:
@@ -127,7 +128,7 @@ def accuracy(level: str) -> dict[str, float]:
     ]
     names = ("means", "quats", "scales", "opacities", "features")
     return {
-        "image": float(error[~decided_otherwise].max()),
+        "image": float(error[~decided_otherwise].detach().max()),
         "pixels decided otherwise": int(decided_otherwise.sum()),
         "pixels": decided_otherwise.numel(),
         **{f"gradient of {name}, of its largest": value for name, value in zip(names, relative, strict=True)},
