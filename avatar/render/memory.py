@@ -30,6 +30,8 @@ def pooled_empty(*shape: int) -> Tensor:
     with _lock:
         place = next((i for i in reversed(range(len(_idle))) if len(_idle[i]) == count), None)
         array = None if place is None else _idle.pop(place)
+        while array is None and _idle and 4 * count + _idle_bytes() > IDLE_BYTES:
+            _idle.pop(0)
     lease = _Lease(np.empty(count, np.float32) if array is None else array)
     return torch.from_numpy(np.asarray(lease)).view(shape)
 
@@ -42,8 +44,10 @@ class _Lease:
         self.__array_interface__ = array.__array_interface__
 
     def __del__(self):
-        dropped = []  # freed after the lock is
-        with _lock:
+        # The garbage collector may call this in the middle of `pooled_empty`: no lock, and nothing but an append.
+        if self.array.nbytes + _idle_bytes() <= IDLE_BYTES:
             _idle.append(self.array)
-            while _idle and sum(array.nbytes for array in _idle) > IDLE_BYTES:
-                dropped.append(_idle.pop(0))
+
+
+def _idle_bytes() -> int:
+    return sum(array.nbytes for array in list(_idle))

@@ -138,16 +138,16 @@ class _Pool:
         return handle
 
     def give_back(self, library: ctypes.CDLL, handle: int) -> None:
+        # The garbage collector may call this in the middle of `take`: no lock, and nothing but an append.
         size = library.gaussian_workspace_bytes(handle)
-        with self._lock:
-            if size + self.idle_bytes <= IDLE_BYTES:
-                self._idle.append((library, handle, size))
-                return
-        library.gaussian_workspace_free(handle)
+        if size + self.idle_bytes <= IDLE_BYTES:
+            self._idle.append((library, handle, size))
+        else:
+            library.gaussian_workspace_free(handle)
 
     @property
     def idle_bytes(self) -> int:
-        return sum(size for _, _, size in self._idle)
+        return sum(size for _, _, size in list(self._idle))
 
 
 _POOL = _Pool()

@@ -87,6 +87,8 @@ class CaptureConvertCommand:
     """Names of the cameras to keep, with commas between; by default all."""
     masks: OptionalPath = None
     """Folder of mattes to take instead of the capture's own masks."""
+    matting: OptionalPath = None
+    """ONNX model of your own that makes the mattes; they go into the folder of --masks, those there are left alone."""
     params: OptionalPath = None
     """Body parameters to take instead of the capture's own."""
     body: OptionalPath = None
@@ -104,6 +106,8 @@ class CaptureConvertCommand:
         from smplxpp.body import load_body
 
         body = None if self.body is None else load_body(self.body)
+        if self.matting is not None:
+            self._matte()
         capture = _open(self.capture, self.format, masks=self.masks, params=self.params, body=body, cache_bytes=0)
         config = ConvertConfig(
             layout=self.layout,
@@ -123,6 +127,19 @@ class CaptureConvertCommand:
             files = f"{done.copied} files copied, {done.encoded} written anew, {done.kept} there already"
             console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
+
+    def _matte(self) -> None:
+        """Run the model over every image that has no matte yet."""
+        from pipelines.progress import counted_progress
+        from smplxpp.capture.matting import MattingModel, write_mattes
+
+        if self.masks is None:
+            raise InputError("--matting", expected="--masks FOLDER for the mattes", received="no folder")
+        capture = _open(self.capture, self.format, cache_bytes=0)
+        model, total = MattingModel(self.matting), len(capture.views())
+        with counted_progress("mattes", enabled=not self.json) as progress:
+            for done, _ in enumerate(write_mattes(capture, model, self.masks), start=1):
+                progress(done, total)
 
 
 def _open(path: Path, format: str, **options) -> Capture:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipelines.cli import main
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from tests.capture.scene import make_scene
@@ -139,6 +140,18 @@ def test_a_users_model_writes_masks_in_our_layout(rig, tmp_path, side, logits):
         inside = matted.mask("A", 0) > 127
         truth = scene.masks["A", 0] > 127
         assert (inside & truth).sum() / (inside | truth).sum() > 0.95
+
+
+def test_convert_takes_the_mattes_of_a_users_model(rig, tmp_path, capsys):
+    pytest.importorskip("onnxruntime")
+    model_file(tmp_path / "red.onnx", side="side", logits=True)
+    command = ["capture", "convert", str(rig), "--matting", str(tmp_path / "red.onnx"), "--json"]
+    assert main([*command, "--out", str(tmp_path / "new")]) == 2
+    assert "--masks" in capsys.readouterr().out and not (tmp_path / "new").exists()
+    assert main([*command, "--out", str(tmp_path / "new"), "--masks", str(tmp_path / "mattes")]) == 0
+    matted, converted = open_capture(rig, masks=tmp_path / "mattes"), open_capture(tmp_path / "new")
+    assert np.array_equal(converted.mask("A", 0), matted.mask("A", 0))
+    assert not np.array_equal(converted.mask("A", 0), open_capture(rig).mask("A", 0))
 
 
 def test_what_is_no_matting_model_is_refused(tmp_path):
