@@ -6,6 +6,7 @@ They are different metrics with different numbers: each carries its own name, wh
 from __future__ import annotations
 
 import importlib.util
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -30,7 +31,7 @@ class MissingPackageError(MissingExtraError):
         ImportError.__init__(self, f"{purpose} needs {package}, which is not installed: {command}")
 
 
-class PerceptualDistance(nn.Module):
+class PerceptualDistance(nn.Module, ABC):
     """Distance between features of two images; differentiable in the images, its own weights are fixed.
 
     Attributes:
@@ -60,9 +61,9 @@ class PerceptualDistance(nn.Module):
         x, y = (2.0 * pixels.permute(0, 3, 1, 2) - 1.0 for pixels in (image, reference))
         return self.distance(x, y)
 
+    @abstractmethod
     def distance(self, x: Tensor, y: Tensor) -> Tensor:
         """(B, 3, H, W) images in [-1, 1] -> (B,)."""
-        raise NotImplementedError
 
 
 class ShiftTolerantLPIPS(PerceptualDistance):
