@@ -15,23 +15,29 @@ from avatar.export.splats import Splats, posed_splats
 from avatar.gaussians.binding import BoundGaussians, WorldGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.regularizers import offset_penalty, scale_penalty
-from avatar.gaussians.sampling import head_faces, sample_on_mesh
+from avatar.gaussians.sampling import sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.losses.ssim import ssim
 from avatar.render.api import rasterize
 from avatar.training.fit_config import FitConfig
+from avatar.training.gradient_task import GradientTask, OptimiserConfig, ParameterGroup
 from avatar.training.initial_colors import colors_from_views
-from avatar.training.loop import LoopConfig, Progress, require_finite, run_training
-from avatar.training.quality import Box, ViewQuality, decibels, eight_bit, mean_quality, view_quality
+from avatar.training.loop import LoopConfig, Progress, run_training
+from avatar.training.quality import (
+    Box,
+    ViewQuality,
+    decibels,
+    eight_bit,
+    head_box,
+    head_vertices,
+    mean_quality,
+    view_quality,
+)
 from avatar.training.views import View
-from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.template import Template
 
 LEARNED = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-HEAD_MARGIN = 0.08
-"""Of the head's box, added on every side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +136,8 @@ def choose_device(name: str) -> str:
     return name
 
 
-class FitTask:
-    """Parameters and optimiser of a reference fit, as `run_training` wants them."""
+class FitTask(GradientTask):
+    """A reference fit, as `run_training` wants it; a step renders one view."""
 
     def __init__(
         self,
@@ -155,15 +161,19 @@ class FitTask:
         self.parameters = {name: getattr(self.start, name).clone().requires_grad_() for name in LEARNED}
         pixel = pixel_size(scene)
         unit = {"normal_offset": pixel, "offset": pixel}
-        self.rates = {name: getattr(config.rates, name) * unit.get(name, 1.0) for name in LEARNED}
-        self.optimiser = torch.optim.Adam(
-            [{"params": [self.parameters[name]], "lr": rate} for name, rate in self.rates.items()],
-            betas=(0.9, 0.99), eps=1e-15, fused=True,
-        )  # fmt: skip
+        groups = [
+            ParameterGroup(
+                "gaussians", {name: value}, getattr(config.rates, name) * unit.get(name, 1.0), config.rates.final
+            )
+            for name, value in self.parameters.items()
+        ]
+        super().__init__(groups, OptimiserConfig(
+            iterations=config.iterations, schedule="exponential", betas=(0.9, 0.99), eps=1e-15,
+        ))  # fmt: skip
         self.train = [view.cropped(config.margin).to(device) for view in scene.train]
         self.held_out = [view.to(device) for view in scene.held_out]
         self.background = torch.tensor(scene.background, dtype=torch.float32, device=device)
-        corners = scene.vertices[np.unique(template.faces[_head(template)])]
+        corners = scene.vertices[head_vertices(template)]
         self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
 
     def gaussians(self) -> BoundGaussians:
@@ -188,7 +198,18 @@ class FitTask:
         )  # fmt: skip
         return image[0], alpha[0, ..., 0]
 
-    def loss(self, view: View, image: Tensor, alpha: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def items(self, iteration: int) -> list[View]:
+        """One view."""
+        return [self.train[self.view_index(iteration)]]
+
+    def name_of(self, item: View) -> str:
+        return f"view {item.name}"
+
+    def loss(self, item: View) -> tuple[Tensor, dict[str, float]]:
+        """Of a view, rendered."""
+        return self.compare(item, *self.render(item))
+
+    def compare(self, view: View, image: Tensor, alpha: Tensor) -> tuple[Tensor, dict[str, float]]:
         """The loss of a rendered view, and its terms as numbers."""
         config, real = self.config, view.composited(self.background)
         bound = replace(self.start, **self.parameters)
@@ -202,20 +223,6 @@ class FitTask:
         square = (image.detach().clamp(0.0, 1.0) - real).square().mean()
         terms = {"loss": total.item(), "l1": l1.item(), "ssim": similarity.item(), "psnr_crop": decibels(square.item())}
         return total, terms
-
-    def step(self, iteration: int) -> Mapping[str, Any]:
-        """One view, one step of Adam."""
-        view = self.train[self.view_index(iteration)]
-        share = self.config.rates.final ** (iteration / self.config.iterations)
-        for group, rate in zip(self.optimiser.param_groups, self.rates.values(), strict=True):
-            group["lr"] = rate * share
-        self.optimiser.zero_grad(set_to_none=True)
-        loss, terms = self.loss(view, *self.render(view))
-        loss.backward()
-        gradients = [value.grad for value in self.parameters.values() if value.grad is not None]
-        require_finite((loss, *gradients), iteration=iteration, view=view.name)
-        self.optimiser.step()
-        return {**terms, "view": view.name}
 
     def view_index(self, iteration: int) -> int:
         """Every view once an epoch, in an order that the seed and the epoch alone decide."""
@@ -240,42 +247,9 @@ class FitTask:
         views = {name: asdict(q) for name, q in quality.items()}
         return {"held_out": bool(self.held_out), "mean": mean_quality(quality), "views": views}
 
-    def state(self) -> Mapping[str, Tensor]:
-        """Parameters and Adam's moments."""
-        tensors = dict(self.parameters)
-        for name, value in self.parameters.items():
-            for key, moment in self.optimiser.state.get(value, {}).items():
-                tensors[f"adam.{key}.{name}"] = moment
-        return tensors
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `state` gave."""
-        with torch.no_grad():
-            for name, value in self.parameters.items():
-                value.copy_(tensors[name])
-                moments = {key: tensors[f"adam.{key}.{name}"] for key in MOMENTS if f"adam.{key}.{name}" in tensors}
-                self.optimiser.state[value] = {key: moment.to(value.device) for key, moment in moments.items()}
-
-
-def _head(template: Template) -> np.ndarray:
-    """(F,) bool faces of the head, or all of a body without one."""
-    return head_faces(template) if "head" in template.joint_names else np.ones(len(template.faces), dtype=bool)
-
 
 def pixel_size(scene: FitScene) -> float:
     """Metres that a pixel covers at the person: median over the training views of `distance / f`."""
     center = scene.vertices.mean(0)
     sizes = [np.linalg.norm(view.camera.position - center) / view.camera.K[0, 0] for view in scene.train]
     return float(np.median(sizes))
-
-
-def head_box(points: np.ndarray, camera: Camera) -> Box | None:
-    """x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing of it is in the image."""
-    x, y, depth = camera.screen_from_world(points).T[:3]
-    if not (depth > 0).all():
-        return None
-    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
-    margin = HEAD_MARGIN * (high - low)
-    x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
-    x1, y1 = np.minimum(np.ceil(high + margin), (camera.width, camera.height)).astype(int)
-    return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None

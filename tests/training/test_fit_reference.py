@@ -11,8 +11,9 @@ import torch
 from avatar.export.splats import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.training import DivergedError, FitConfig, FitScene, LearningRates, View, fit_reference
-from avatar.training.fit_reference import FitTask, choose_device, head_box
+from avatar.training.fit_reference import FitTask, choose_device
 from avatar.training.metrics_log import read_metrics
+from avatar.training.quality import head_box
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from tests.training.doll import HELD_OUT, TRAIN, doll

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.losses.perceptual import PerceptualDistance
 from avatar.training import View, ViewQuality, mean_quality
 from avatar.training.quality import decibels, eight_bit, view_quality
 from tests.training.doll import doll
@@ -23,7 +24,7 @@ def test_an_equal_image_is_perfect():
     it = view()
     quality = view_quality(it, it.composited(BLACK), it.opacity(), BLACK, head=(10, 10, 50, 40))
     assert quality.psnr == quality.psnr_image == quality.psnr_head == math.inf
-    assert quality.ssim == pytest.approx(1.0)
+    assert quality.ssim == pytest.approx(1.0) and quality.ssim_head == pytest.approx(1.0)
 
 
 def test_a_known_error_on_the_person_alone():
@@ -53,10 +54,31 @@ def test_colours_outside_the_screen_are_clamped_first():
     assert view_quality(it, image, it.opacity(), BLACK, head=None).psnr_image == math.inf
 
 
-def test_means_leave_out_what_some_view_lacks():
+def test_means_are_over_the_views_that_have_a_figure():
     views = {"a": ViewQuality(20.0, 30.0, 0.9, 25.0), "b": ViewQuality(22.0, 32.0, 0.8, None)}
-    assert mean_quality(views) == {"psnr": 21.0, "psnr_image": 31.0, "ssim": pytest.approx(0.85)}
+    assert mean_quality(views) == {"psnr": 21.0, "psnr_image": 31.0, "ssim": pytest.approx(0.85), "psnr_head": 25.0}
     assert mean_quality({}) == {}
+
+
+class MeanDifference(PerceptualDistance):
+    """Stands for a metric; blind to what it is not shown."""
+
+    name = "mean difference"
+
+    def distance(self, x, y):
+        return (x - y).abs().mean((1, 2, 3))
+
+
+def test_perceptual_distance_and_ssim_of_the_crop_see_the_crop_alone():
+    it, metric = view(), MeanDifference()
+    image = it.composited(BLACK).clone()
+    image[60:] = 1.0  # below the head's box
+    quality = view_quality(it, image, it.opacity(), BLACK, head=(8, 4, 56, 44), metric=metric)
+    assert (quality.ssim_head, quality.perceptual_head) == (pytest.approx(1.0), 0.0)
+    assert quality.ssim < 0.95 and quality.perceptual > 0.1
+    small = view_quality(it, image, it.opacity(), BLACK, head=(8, 4, 39, 44), metric=metric)
+    assert small.perceptual_head is None and small.psnr_head is not None
+    assert view_quality(it, image, it.opacity(), BLACK, head=None).perceptual is None
 
 
 def test_decibels_and_eight_bits():
