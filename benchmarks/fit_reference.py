@@ -109,7 +109,7 @@ def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
         leaves = [value.detach().requires_grad_() for value in outputs]
         placed = replace(world, **dict(zip(WORLD, leaves, strict=False)))
         drawn = timed("rasteriser, forward", lambda p=placed, c=leaves[-1], v=view: task.draw(p, c, v))
-        loss = timed("loss, forward", lambda v=view, d=drawn: task.loss(v, *d)[0])
+        loss = timed("loss, forward", lambda v=view, d=drawn: task.compare(v, *d)[0])
         grads = timed("loss, backward", lambda x=loss, d=drawn: torch.autograd.grad(x, [*d, *parameters],
                                                                                    allow_unused=True))  # fmt: skip
         pulled = timed("rasteriser, backward", lambda d=drawn, v=leaves, g=grads[:2]: torch.autograd.grad(d, v, g))

@@ -2,7 +2,8 @@
 
 from avatar.training.fit_config import PRESETS, FitConfig, LearningRates
 from avatar.training.fit_reference import FitResult, FitScene, choose_device, fit_reference
-from avatar.training.loop import DivergedError, Progress
+from avatar.training.gradient_task import DivergedError
+from avatar.training.loop import Progress
 from avatar.training.quality import ViewQuality, mean_quality
 from avatar.training.views import View, read_views
 

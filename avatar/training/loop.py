@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import torch
 from torch import Tensor
 
 from avatar.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.metrics_log import append_metrics, truncate_metrics
-from smplxpp.core.errors import InputError
 
 STATE_FILE = "state.safetensors"
 METRICS_FILE = "metrics.jsonl"
@@ -77,29 +75,6 @@ class Progress:
         return self.iteration >= self.iterations
 
 
-class DivergedError(InputError):
-    """Training met a number that is not finite. The last checkpoint is kept."""
-
-
-def require_finite(values: Iterable[Tensor], *, iteration: int, view: str) -> None:
-    """Stop before a step spoils the parameters.
-
-    Args:
-        values: the loss and the gradients; a sum is NaN or infinite when any of its terms is.
-        iteration, view: of the step, for the message.
-
-    Raises:
-        DivergedError: something is NaN or infinite.
-    """
-    if not bool(torch.isfinite(torch.stack([value.detach().sum() for value in values]).sum())):
-        raise DivergedError(
-            f"training step {iteration}, view {view}",
-            expected="a finite loss and finite gradients",
-            received="NaN or infinity",
-            remedy="look at that camera's image, mask and calibration; lower the learning rates",
-        )
-
-
 def run_training(
     task: Task, config: LoopConfig, folder: Path, *, key: str, report: Callable[[Progress], None] = lambda p: None
 ) -> Progress:
@@ -111,7 +86,7 @@ def run_training(
         Where training ended: before the last step only when `max_seconds` was over.
 
     Raises:
-        DivergedError: from `require_finite`.
+        DivergedError: from the task; the last checkpoint is kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
     state, metrics = folder / STATE_FILE, folder / METRICS_FILE
