@@ -23,11 +23,13 @@ class View:
     Attributes:
         camera: of these pixels.
         foreground: (H, W, 3) uint8 sRGB times opacity. alpha: (H, W) uint8 opacity of the person.
+        normals: (H, W, 3) float16 world normals, 0 on the background; None where the capture has none.
     """
 
     camera: Camera
     foreground: Tensor
     alpha: Tensor
+    normals: Tensor | None = None
 
     @property
     def name(self) -> str:
@@ -74,11 +76,40 @@ class View:
         K[:2, 2] -= (left, top)
         camera = replace(self.camera, K=K, width=right - left, height=bottom - top)
         part = (slice(top, bottom), slice(left, right))
-        return View(camera, self.foreground[part].contiguous(), self.alpha[part].contiguous())
+        normals = None if self.normals is None else self.normals[part].contiguous()
+        return View(camera, self.foreground[part].contiguous(), self.alpha[part].contiguous(), normals)
+
+    def halved(self) -> View:
+        """Every 2 x 2 pixels averaged to one; a last odd row or column is left out. Normals are sampled."""
+        height, width = self.camera.height // 2, self.camera.width // 2
+        K = self.camera.K.copy()
+        K[:2] *= 0.5
+        camera = replace(self.camera, K=K, width=width, height=height)
+        stacked = torch.cat([self.foreground, self.alpha[..., None]], dim=-1)[: 2 * height, : 2 * width]
+        small = stacked.view(height, 2, width, 2, 4).float().mean(dim=(1, 3)).round().to(torch.uint8)
+        normals = None if self.normals is None else self.normals[: 2 * height : 2, : 2 * width : 2].contiguous()
+        return View(camera, small[..., :3].contiguous(), small[..., 3].contiguous(), normals)
 
     def to(self, device: torch.device | str) -> View:
         """The same view on another device."""
-        return View(self.camera, self.foreground.to(device), self.alpha.to(device))
+        normals = None if self.normals is None else self.normals.to(device)
+        return View(self.camera, self.foreground.to(device), self.alpha.to(device), normals)
+
+
+def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = False) -> View:
+    """The whole image of a camera, composited as the capture says, with its normal map if asked for and there.
+
+    Raises:
+        InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
+    """
+    foreground, alpha = capture.foreground(camera, frame)
+    normal_map = capture.normals(camera, frame) if normals else None
+    return View(
+        capture.cameras[camera],
+        torch.tensor(np.array(foreground)),
+        torch.tensor(np.array(alpha)),
+        None if normal_map is None else torch.tensor(np.array(normal_map), dtype=torch.float16),
+    )
 
 
 def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[View]:
@@ -96,11 +127,11 @@ def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[Vie
             raise InputError(
                 f"camera of capture {capture.name}", expected=f"one of {', '.join(capture.cameras)}", received=name
             )
-        foreground, alpha = capture.foreground(name, frame)
-        if not alpha.any():
+        view = read_view(capture, name, frame)
+        if not view.alpha.any():
             warnings.warn(
                 f"camera {name}: nobody in the mask of frame {frame}; it is left out", GeometryWarning, stacklevel=2
             )
             continue
-        views.append(View(capture.cameras[name], torch.tensor(np.array(foreground)), torch.tensor(np.array(alpha))))
+        views.append(view)
     return views

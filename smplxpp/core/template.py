@@ -237,16 +237,17 @@ class Template:
         """
         from smplxpp.body.skinning import skin
 
-        posed = self._posed_body(params)
+        posed = self.posed_body(params)
         count = self.body_vertex_count
         parts = skin(self.vertices[count:], self._dense_weights[count:], posed.posed_from_rest)
         return np.concatenate([posed.vertices, parts], axis=1)
 
     def posed_from_rest(self, params: BodyParams) -> np.ndarray:
         """(T, J, 4, 4) transforms of the joints in T poses, as `pose` applies them."""
-        return self._posed_body(params).posed_from_rest
+        return self.posed_body(params).posed_from_rest
 
-    def _posed_body(self, params: BodyParams) -> PosedBody:
+    def posed_body(self, params: BodyParams) -> PosedBody:
+        """The naked body of this identity in T poses: what `pose` skins the parts with."""
         return self.body_model.forward(replace(params, betas=np.zeros((len(params), 0))))
 
     def save(self, path: str | Path) -> None:

@@ -1,0 +1,90 @@
+"""The loss between a rendered view and its photograph that teacher, bake and compensation share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
+from avatar.losses.ssim import ssim
+from smplxpp.core.errors import InputError
+
+if TYPE_CHECKING:
+    from avatar.render.avatar_view import Rendering
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionWeights:
+    """Weights of `L_rec = L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha`. The defaults are the paper's.
+
+    Attributes:
+        dssim: of `1 - SSIM`. perceptual: of LPIPS or ST-LPIPS. normal: of the L1 between normals.
+        alpha: of the L1 between opacity and mask, which the paper does not have: on a black background dark hair could
+            be a hole.
+    """
+
+    dssim: float = 0.2
+    perceptual: float = 0.01
+    normal: float = 0.02
+    alpha: float = 0.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"loss weight {f.name}", expected="a number, at least 0", received=repr(value))
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a rendering should look like.
+
+    Attributes:
+        image: (H, W, 3) sRGB on the background. alpha: (H, W). normals: (H, W, 3) world, 0 on the background, or None.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    normals: Tensor | None = None
+
+
+def reconstruction_loss(
+    rendering: Rendering,
+    target: Target,
+    weights: ReconstructionWeights,
+    *,
+    perceptual: PerceptualDistance | None = None,
+) -> tuple[Tensor, dict[str, float]]:
+    """The weighted sum, and its terms as numbers.
+
+    D-SSIM is `1 - SSIM` as in 3DGS's code. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a normal.
+    Terms without what they need (no normals, no perceptual distance, an image below its size) are left out.
+    """
+    l1 = (rendering.image - target.image).abs().mean()
+    total, terms = l1, {"l1": l1}
+    if weights.dssim:
+        terms["dssim"] = 1.0 - ssim(rendering.image, target.image)
+        total = total + weights.dssim * terms["dssim"]
+    if weights.alpha:
+        terms["alpha"] = (rendering.alpha - target.alpha).abs().mean()
+        total = total + weights.alpha * terms["alpha"]
+    if weights.perceptual and perceptual is not None and min(target.alpha.shape) >= MIN_SIZE:
+        image = rendering.image.clamp(0.0, 1.0)
+        terms["perceptual"] = perceptual(image[None], target.image[None])[0]
+        total = total + weights.perceptual * terms["perceptual"]
+    if weights.normal and rendering.normals is not None and target.normals is not None:
+        known = (target.normals != 0).any(-1)
+        if bool(known.any()):
+            difference = (rendering.normals - target.normals.float()).abs().sum(-1)
+            terms["normal"] = difference[known].mean()
+            total = total + weights.normal * terms["normal"]
+    with torch.no_grad():
+        square = float((rendering.image.clamp(0.0, 1.0) - target.image).square().mean())
+    return total, {
+        **{name: float(term.detach()) for name, term in terms.items()},
+        "psnr_crop": -10.0 * math.log10(max(square, 1e-12)),
+    }

@@ -1,0 +1,49 @@
+"""Bound Gaussians whose attributes are parameters of a module."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import nn
+
+from avatar.gaussians.binding import BoundGaussians
+
+LEARNED = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
+"""Attributes that are learned; triangles and barycentric coordinates stay."""
+
+
+class LearnedGaussians(nn.Module):
+    """Parameters named as the attributes of `BoundGaussians`; the rest of them are buffers.
+
+    Args:
+        start: where the attributes begin.
+    """
+
+    def __init__(self, start: BoundGaussians) -> None:
+        super().__init__()
+        self.face_count, self.topology = start.face_count, start.topology
+        for name, value in start.tensors.items():
+            if name in LEARNED:
+                setattr(self, name, nn.Parameter(value.detach().clone()))
+            else:
+                self.register_buffer(name, value.detach().clone())
+
+    def __len__(self) -> int:
+        return len(self.face_index)
+
+    def forward(self) -> BoundGaussians:
+        """The Gaussians as they stand, with gradients to the attributes."""
+        named = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+        return BoundGaussians(**named, face_count=self.face_count, topology=self.topology)
+
+    def snapshot(self) -> BoundGaussians:
+        """Detached copies on the CPU."""
+        bound = self()
+        copies = {name: value.detach().cpu().clone() for name, value in bound.tensors.items()}
+        return replace(bound, **copies)
+
+    def normalise_quats(self) -> None:
+        """Give all quaternions length 1, so that residuals added to them have one scale."""
+        with torch.no_grad():
+            self.quats.div_(self.quats.norm(dim=-1, keepdim=True))

@@ -1,0 +1,140 @@
+"""The student: Gaussians on a mesh that a small field moves, with blend shapes for what that leaves over."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.sampling import head_faces
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
+from avatar.models.config import require_at_least
+from avatar.models.control_points import choose_control_points
+from avatar.models.deformation_field import DeformationField, FieldConfig, FrameCodes
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion, Rig
+
+
+@dataclass(frozen=True)
+class StudentConfig:
+    """What a student is made of. The defaults are the paper's.
+
+    Attributes:
+        field: of the mesh's motion; None: the mesh follows its joints alone.
+        blend_shapes: of the Gaussians; None: they have none (as before the compensation).
+        control_points: vertices that the field is evaluated on, interpolated to the rest; 0: all vertices.
+    """
+
+    field: FieldConfig | None = dataclasses.field(default_factory=FieldConfig)
+    blend_shapes: BlendShapeConfig | None = None
+    control_points: int = 0
+
+    def __post_init__(self) -> None:
+        require_at_least("student control_points", self.control_points, 0)
+
+
+class Student(nn.Module):
+    """Template, field, frame codes, Gaussians and blend shapes as one avatar (an `AvatarModel`).
+
+    `v = v_rest + S(v, theta, z_t)` is skinned, Gaussians hang on its triangles, and the blend shapes add
+    `du = U z` to their offsets and `dc = C z` to their colours.
+
+    Args:
+        config: which of these there are.
+        rig: of the template. gaussians: on it.
+        frames: the frames that have a code.
+        blend_shapes: fitted to these Gaussians; None makes new ones where the configuration has them.
+    """
+
+    def __init__(
+        self,
+        config: StudentConfig,
+        rig: Rig,
+        gaussians: BoundGaussians,
+        frames: tuple[int, ...],
+        *,
+        blend_shapes: BlendShapes | None = None,
+    ) -> None:
+        super().__init__()
+        gaussians.check_topology(rig.faces, "template of the student")
+        self.config, self.rig = config, rig
+        self.gaussians = LearnedGaussians(gaussians)
+        self.field = None if config.field is None else _make_field(config, rig)
+        self.codes = None if config.field is None else FrameCodes(frames, config.field.code_size)
+        if blend_shapes is None and config.blend_shapes is not None:
+            blend_shapes = make_blend_shapes(config.blend_shapes, rig, gaussians)
+        self.blend_shapes = blend_shapes
+        self.to(rig.device)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Frames that have a code."""
+        return () if self.codes is None else self.codes.frames
+
+    def displacements(self, motion: Motion) -> Tensor | None:
+        """(V, 3) metres of the field in a pose; None without a field."""
+        if self.field is None:
+            return None
+        frame = motion.frame if motion.frame in self.codes.row else None
+        return self.field(motion.pose[None], self.codes([frame]))[0]
+
+    def compensated(self, motion: Motion) -> BoundGaussians:
+        """The Gaussians with their blend shapes of a pose added."""
+        bound = self.gaussians()
+        if self.blend_shapes is None:
+            return bound
+        jaw = motion.jaw[None] if self.blend_shapes.config.jaw else None
+        du, dc = self.blend_shapes(self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw))
+        return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The student in a pose, as C cameras at `eyes` (C, 3) see it."""
+        displacements = self.displacements(motion)
+        vertices = self.rig.pose(motion, displacements)
+        frames = triangle_frames(vertices, self.rig.faces)
+        bound = self.compensated(motion)
+        world = world_from_frames(bound, frames)
+        # Directions count as constants: a colour must not pull its Gaussian to the side.
+        colors = view_colors(bound, frames, world.means.detach(), eyes)
+        return PosedAvatar(vertices, world, colors, bound, displacements)
+
+    def with_blend_shapes(self, blend_shapes: BlendShapes | BlendShapeConfig | None) -> Student:
+        """The same student with other blend shapes; a configuration makes new ones, which start at zero."""
+        given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
+        shapes_config = given.config if given is not None else blend_shapes
+        other = Student(
+            replace(self.config, blend_shapes=shapes_config), self.rig, self.gaussians(), self.frames,
+            blend_shapes=given,
+        )  # fmt: skip
+        if self.field is not None:
+            other.field.load_state_dict(self.field.state_dict())
+            other.codes.load_state_dict(self.codes.state_dict())
+        return other
+
+
+def _make_field(config: StudentConfig, rig: Rig) -> DeformationField:
+    control = None
+    if config.control_points:
+        template = rig.template
+        control = choose_control_points(template.vertices, template.vertex_part, count=config.control_points)
+    return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control)
+
+
+def make_blend_shapes(config: BlendShapeConfig, rig: Rig, gaussians: BoundGaussians) -> BlendShapes:
+    """Blend shapes at zero for Gaussians on a template: parts by place, head weights by the head's faces."""
+    part = head_weight = None
+    if config.parts > 1:
+        centers = rig.template.mesh.triangles.mean(axis=1)[gaussians.face_index.cpu().numpy()]
+        groups = rig.template.vertex_part[rig.template.faces[gaussians.face_index.cpu().numpy(), 0]]
+        control = choose_control_points(centers, groups, count=config.parts, neighbour_count=1)
+        part = torch.tensor(control.neighbours[:, 0])
+    if config.gated:
+        on_head = head_faces(rig.template)[gaussians.face_index.cpu().numpy()]
+        head_weight = torch.tensor(on_head, dtype=torch.float32)
+    return BlendShapes(config, len(gaussians), part=part, head_weight=head_weight)

@@ -1,0 +1,119 @@
+"""The teacher at work: position maps of a pose in, Gaussians with residuals out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.map_sampling import MapFrame, MapSampler
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion, Rig
+from avatar.models.teacher import Residuals, Teacher, TeacherConfig, local_offsets
+from avatar.render.mesh_maps import front_back_maps, vertex_normals
+
+HALF_EXTENT = 1.0
+"""Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherMaps:
+    """What the networks are shown of a pose.
+
+    Attributes:
+        positions: (1, 2, S, S, 3) posed coordinates without the root's motion, metres.
+        cosines: (C, 2, S, S) between posed normals and the directions to C cameras, or None.
+    """
+
+    positions: Tensor
+    cosines: Tensor | None
+
+
+class TeacherAvatar(nn.Module):
+    """Template, Gaussians and teacher as one avatar (an `AvatarModel`).
+
+    The mesh follows its joints alone; `du = R^T dU` and the other residuals are added to the Gaussians' local
+    attributes, R the rotation of the triangle in the T-pose.
+
+    Args:
+        config: of the networks.
+        rig: of the template. gaussians: on it; their quaternions are brought to length 1.
+    """
+
+    def __init__(self, config: TeacherConfig, rig: Rig, gaussians: BoundGaussians) -> None:
+        super().__init__()
+        gaussians.check_topology(rig.faces, "template of the teacher")
+        self.config, self.rig = config, rig
+        self.networks = Teacher(config)
+        self.gaussians = LearnedGaussians(gaussians)
+        self.gaussians.normalise_quats()
+
+        self.frame = map_frame(rig)
+        canonical = triangle_frames(rig.vertices, rig.faces)
+        placed = world_from_frames(gaussians.to(device=rig.device), canonical)
+        normals = canonical.rotations[gaussians.face_index.to(rig.device), :, 0]
+        self.sampler = MapSampler(self.frame, config.out_size, placed.means.detach(), normals)
+        self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)
+        self.register_buffer("canonical_from_local", canonical.rotations[gaussians.face_index], persistent=False)
+        self.register_buffer("semantics", self.maps.interpolate(rig.semantic_colors)[None], persistent=False)
+        self.to(rig.device)
+
+    def inputs(self, motion: Motion, eyes: Tensor) -> TeacherMaps:
+        """Maps of a pose and of C cameras at `eyes` (C, 3); constants for gradients."""
+        with torch.no_grad():
+            to_root = motion.root_from_world
+            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
+            positions = self.maps.interpolate(vertices)
+            if not self.config.sees_view:
+                return TeacherMaps(positions[None], None)
+            normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
+            from_root = eyes @ to_root[:3, :3].T + to_root[:3, 3]
+            directions = F.normalize(from_root[:, None, None, None] - positions, dim=-1)
+            cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
+            return TeacherMaps(positions[None], cosines * self.maps.mask)
+
+    def residual_maps(self, motion: Motion, eyes: Tensor) -> Residuals:
+        """Maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
+        maps = self.inputs(motion, eyes)
+        return self.networks(maps.positions, self.semantics, maps.cosines)
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The teacher in a pose, as C cameras at `eyes` (C, 3) see it."""
+        return self.posed(motion, eyes, self.residual_maps(motion, eyes))
+
+    def posed(self, motion: Motion, eyes: Tensor, maps: Residuals) -> PosedAvatar:
+        """`forward` from residual maps at hand."""
+        residuals = maps.sampled(self.sampler)
+        bound = self.gaussians()
+        bound = replace(
+            bound,
+            offset=bound.offset + local_offsets(residuals.position[0], self.canonical_from_local),
+            opacity_logits=bound.opacity_logits + residuals.opacity_logit[0],
+            log_scales=bound.log_scales + residuals.log_scales[0],
+            quats=bound.quats + residuals.quats[0],
+        )
+        vertices = self.rig.pose(motion)
+        frames = triangle_frames(vertices, self.rig.faces)
+        world = world_from_frames(bound, frames)
+        means = world.means.detach()
+        color = residuals.colour.expand(len(eyes), -1, -1)
+        # dc joins before the clamp, so each camera's residual is part of it.
+        colors = [
+            view_colors(replace(bound, dc=bound.dc + color[c]), frames, means, eyes[c : c + 1])
+            for c in range(len(eyes))
+        ]
+        return PosedAvatar(vertices, world, torch.cat(colors), bound)
+
+
+def map_frame(rig: Rig) -> MapFrame:
+    """Square of the canonical maps: +- 1 m about the middle of the T-pose's box, and larger for a larger body."""
+    vertices = rig.template.vertices
+    reach = float((vertices.max(axis=0) - vertices.min(axis=0))[:2].max() / 2.0)
+    # A Gaussian may stand a little off the surface.
+    return MapFrame.of(vertices, half_extent=max(HALF_EXTENT, reach + 0.05))
