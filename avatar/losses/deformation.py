@@ -1,0 +1,53 @@
+"""The bake's losses on the mesh: its displacements against the teacher's maps, and its labels against the teacher's."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from avatar.gaussians.binding import BoundGaussians
+from avatar.models.map_sampling import MapFrame
+from avatar.models.rig import Rig
+from avatar.render.mesh_maps import front_back_maps
+
+TAU = 8.0 * math.pi
+"""Radians a metre of the semantic labels' waves: one every 25 cm."""
+
+
+class DisplacementLoss:
+    """`L_non = mean |dV - dU|` over the mesh's pixels of the front and back maps of the T-pose.
+
+    dV are the mesh's displacements rasterised, dU the teacher's maps. Both are divided by `unit`, the metres of an
+    output of 1 of the teacher, so that the loss is one between maps and does not depend on the unit of length.
+
+    Args:
+        rig: of the template. frame, size: of the teacher's maps. unit: metres.
+    """
+
+    def __init__(self, rig: Rig, frame: MapFrame, size: int, unit: float) -> None:
+        self.maps = front_back_maps(rig.vertices, rig.faces, frame, size=size)
+        self.mask = self.maps.mask
+        self.unit = unit
+
+    def __call__(self, displacements: Tensor, teacher: Tensor) -> Tensor:
+        """Scalar, with gradients to the displacements.
+
+        Args:
+            displacements: (V, 3) metres. teacher: (2, size, size, 3) metres.
+        """
+        difference = (self.maps.interpolate(displacements) - teacher).abs().sum(-1)
+        return difference[self.mask].mean() / self.unit
+
+
+def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) -> Tensor:
+    """(N, 3) labels of the Gaussians, `e = c + sin(tau v)` interpolated from their triangles' corners.
+
+    Args:
+        tau: radians a metre; v are the corners in the T-pose, c their semantic colours in [0, 1].
+    """
+    labels = rig.semantic_colors + torch.sin(tau * rig.vertices)
+    corners = labels[rig.faces[gaussians.face_index]]
+    u, v = gaussians.barycentric.unbind(-1)
+    return (torch.stack([u, v, 1.0 - u - v], dim=-1)[..., None] * corners).sum(1)

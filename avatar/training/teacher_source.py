@@ -1,0 +1,108 @@
+"""What the teacher says of the training frames: renderings, labels and maps, kept while they fit in memory."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avatar.losses.deformation import semantic_labels
+from avatar.losses.reconstruction import Target
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.render.avatar_view import render_view
+from avatar.training.sequence import AvatarSequence, eyes_of
+from avatar.training.views import View
+
+SEEN = 0.5
+"""Opacity from which a blended normal counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What the student is to imitate in one view.
+
+    Attributes:
+        target: the teacher's image, opacity and, if asked for, normals. labels: (H, W, 3) its semantic map.
+    """
+
+    target: Target
+    labels: Tensor
+
+
+class TeacherSource:
+    """The frozen teacher, asked for lessons; the latest used are kept, in half precision.
+
+    Args:
+        teacher: its weights are not changed. sequence: of the frames.
+        background: (3,) behind the person. eps2d: see `rasterize`.
+        tau: of the semantic labels. normals: whether lessons have them.
+        max_bytes: of what is kept.
+    """
+
+    def __init__(
+        self, teacher: TeacherAvatar, sequence: AvatarSequence, *, eps2d: float, tau: float, normals: bool,
+        max_bytes: int = 2 << 30,
+    ) -> None:  # fmt: skip
+        self.teacher, self.sequence = teacher.requires_grad_(False), sequence
+        self.eps2d, self.normals, self.max_bytes = eps2d, normals, max_bytes
+        self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
+        self._kept: OrderedDict[Hashable, tuple[Tensor, ...]] = OrderedDict()
+        self._bytes = 0
+
+    def displacements(self, frame: int) -> Tensor:
+        """(2, R, R, 3) metres, the teacher's position maps dU of a frame."""
+
+        def make() -> tuple[Tensor, ...]:
+            motion = self.sequence.motion(frame)
+            maps = self.teacher.residual_maps(motion, motion.root_from_world.new_zeros(1, 3))
+            return (maps.position[0].half(),)
+
+        return self._get(("maps", frame), make)[0].float()
+
+    def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
+        """What the teacher shows in views of a frame."""
+        keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
+        missing = [k for k, key in enumerate(keys) if key not in self._kept]
+        drawn: dict[int, tuple[Tensor, ...]] = {}
+        if missing:
+            with torch.no_grad():
+                eyes = eyes_of([views[k] for k in missing])
+                posed = self.teacher(self.sequence.motion(frame), eyes)
+                for index, k in enumerate(missing):
+                    drawn[k] = self._draw(posed, index, views[k])
+        return [_lesson(self._get(key, lambda k=k: drawn[k])) for k, key in enumerate(keys)]
+
+    def _draw(self, posed, index: int, view: View) -> tuple[Tensor, ...]:
+        seen = render_view(
+            posed, index, view, self.sequence.background, eps2d=self.eps2d, normals=self.normals, extra=self.labels
+        )
+        tensors = [seen.image, seen.alpha, seen.extra]
+        if self.normals:
+            tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
+        return tuple(tensor.half() for tensor in tensors)
+
+    def _get(self, key: Hashable, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        with torch.no_grad():
+            made = make()
+        size = _bytes(made)
+        if size <= self.max_bytes:
+            self._kept[key] = made
+            self._bytes += size
+            while self._bytes > self.max_bytes:
+                self._bytes -= _bytes(self._kept.popitem(last=False)[1])
+        return made
+
+
+def _bytes(tensors: Sequence[Tensor]) -> int:
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+
+def _lesson(tensors: tuple[Tensor, ...]) -> Lesson:
+    image, alpha, labels, *normals = (tensor.float() for tensor in tensors)
+    return Lesson(Target(image, alpha, normals[0] if normals else None), labels)
