@@ -94,17 +94,18 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})[HEADER])
-            schema = about["schema"]
-            if schema > SCHEMA:
-                raise InputError(
-                    f"avatar {path}", expected=f"version {SCHEMA} or older", received=f"version {schema}",
-                    remedy="update smplxpp to the version that wrote it",
-                )  # fmt: skip
-            return about, {name: file.get_tensor(name) for name in file.keys()}
+            newer = about["schema"] > SCHEMA
+            tensors = {} if newer else {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(
             f"avatar {path}", expected="a file that `smplxpp train` wrote", received=str(error) or type(error).__name__
         ) from error
+    if newer:
+        raise InputError(
+            f"avatar {path}", expected=f"version {SCHEMA} or older", received=f"version {about['schema']}",
+            remedy="update smplxpp to the version that wrote it",
+        )  # fmt: skip
+    return about, tensors
 
 
 def _gaussians(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> BoundGaussians:

@@ -56,11 +56,13 @@ class TeacherAvatar(nn.Module):
 
         self.frame = map_frame(rig)
         canonical = triangle_frames(rig.vertices, rig.faces)
-        placed = world_from_frames(gaussians.to(device=rig.device), canonical)
-        normals = canonical.rotations[gaussians.face_index.to(rig.device), :, 0]
-        self.sampler = MapSampler(self.frame, config.out_size, placed.means.detach(), normals)
+        # Where the triangles have them, without the offsets, which are learned: one lookup for all of the training.
+        face, (u, v) = gaussians.face_index.to(rig.device), gaussians.barycentric.to(rig.device).unbind(-1)
+        weights = torch.stack([u, v, 1.0 - u - v], dim=-1)
+        points = (weights[..., None] * canonical.corners[face]).sum(1)
+        self.sampler = MapSampler(self.frame, config.out_size, points, canonical.rotations[face, :, 0])
         self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)
-        self.register_buffer("canonical_from_local", canonical.rotations[gaussians.face_index], persistent=False)
+        self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
         self.register_buffer("semantics", self.maps.interpolate(rig.semantic_colors)[None], persistent=False)
         self.to(rig.device)
 

@@ -1,0 +1,96 @@
+"""The three trainings as functions: a task, the loop, the trained avatar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avatar.gaussians.binding import BoundGaussians
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.models.blend_shapes import BlendShapeConfig
+from avatar.models.student import Student, StudentConfig
+from avatar.models.teacher import TeacherConfig
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.bake import BakeConfig, BakeTask
+from avatar.training.compensate import CompensateConfig, CompensateTask
+from avatar.training.distributed import Distributed
+from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
+from avatar.training.loop import LoopConfig, Progress, run_training
+from avatar.training.sequence import AvatarSequence
+from avatar.training.view_task import Preview, ViewConfig, ViewTask
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Where and how a training runs; nothing in it changes what comes out.
+
+    Attributes:
+        folder: for metrics and the checkpoint. key: names configuration and inputs.
+        perceptual: for the perceptual term, None leaves it out.
+        distributed: the processes that train together.
+        max_seconds: stop with a checkpoint after as much work.
+        report: called after logged steps and evaluations. preview: with rendered images at evaluations.
+    """
+
+    folder: Path
+    key: str = ""
+    perceptual: PerceptualDistance | None = None
+    distributed: Distributed | None = None
+    max_seconds: float = float("inf")
+    report: Callable[[Progress], None] = lambda progress: None
+    preview: Preview = lambda images: None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of a `ViewTask`."""
+        return {"perceptual": self.perceptual, "distributed": self.distributed, "preview": self.preview}
+
+    def run(self, make: Callable[[], ViewTask], config: ViewConfig) -> Progress:
+        """Train what `make` gives."""
+        loop = LoopConfig(
+            iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds
+        )
+        return run_training(make(), loop, self.folder, key=self.key, report=self.report)
+
+
+def fit_teacher(
+    sequence: AvatarSequence,
+    gaussians: BoundGaussians,
+    networks: TeacherConfig,
+    config: FitTeacherConfig,
+    session: Session,
+) -> tuple[TeacherAvatar, Progress]:
+    """Train a teacher on Gaussians of the template."""
+    teacher = TeacherAvatar(networks, sequence.rig, gaussians)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, **session.options), config)
+    return teacher.eval(), progress
+
+
+def bake(
+    sequence: AvatarSequence,
+    gaussians: BoundGaussians,
+    student: StudentConfig,
+    config: BakeConfig,
+    session: Session,
+    *,
+    teacher: TeacherAvatar | None,
+) -> tuple[Student, Progress]:
+    """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
+    made = Student(student, sequence.rig, gaussians, sequence.train_frames)
+    progress = session.run(lambda: BakeTask(sequence, made, config, teacher=teacher, **session.options), config)
+    return made.eval(), progress
+
+
+def compensate(
+    sequence: AvatarSequence,
+    student: Student,
+    shapes: BlendShapeConfig,
+    config: CompensateConfig,
+    session: Session,
+) -> tuple[Student, Progress]:
+    """Give a baked student blend shapes and train them."""
+    made = student.with_blend_shapes(shapes)
+    progress = session.run(lambda: CompensateTask(sequence, made, config, **session.options), config)
+    return made.eval(), progress
