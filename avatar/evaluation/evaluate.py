@@ -1,0 +1,253 @@
+"""Every model measured on the same views, surfaces and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.evaluation import geometry, speed
+from avatar.evaluation.geometry import SurfaceQuality, mean_surface, surface_quality
+from avatar.evaluation.image import load_metric
+from avatar.evaluation.posing import at_rest
+from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.report import EvalReport, ModelFigures, Surfaces, view_key
+from avatar.evaluation.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.models.posed import AvatarModel, PosedAvatar
+from avatar.models.rig import Motion, Rig
+from avatar.render.avatar_view import render_view
+from avatar.training.quality import (
+    CONVENTION,
+    PERCEPTUAL_CONVENTION,
+    Box,
+    ViewQuality,
+    eight_bit,
+    head_box,
+    head_vertices,
+    view_quality,
+)
+from avatar.training.sequence import AvatarSequence, eyes_of
+from avatar.training.views import View
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """What is measured.
+
+    Attributes:
+        protocol: which views.
+        metric: perceptual distance: "st-lpips", "lpips" or "none".
+        samples, seed: of the surfaces; 0 samples: no surface is measured.
+        speed_size: width and height of the pictures that are timed. speed_pictures: how many; 0: no speed.
+        shown: views of each set whose pictures are kept.
+        eps2d: the rasteriser's blur, pixels squared, as in training.
+    """
+
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    metric: str = "st-lpips"
+    samples: int = geometry.SAMPLES
+    seed: int = 0
+    speed_size: tuple[int, int] = (512, 512)
+    speed_pictures: int = 20
+    shown: int = 2
+    eps2d: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "seed", "speed_pictures", "shown"):
+            if getattr(self, name) < 0:
+                raise InputError(f"evaluation: {name}", expected="at least 0", received=str(getattr(self, name)))
+
+
+@dataclass(frozen=True, eq=False)
+class ShownView:
+    """Pictures of one view, (H, W, 3) uint8 on the capture's background.
+
+    Attributes:
+        set: of views, among `protocol.SETS`.
+        truth: the photograph. rendered: by model. head: box of the head, None where it is not in the image.
+    """
+
+    set: str
+    camera: str
+    frame: int
+    truth: np.ndarray
+    rendered: dict[str, np.ndarray]
+    head: Box | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Figures, and the pictures of some views in the order of sets."""
+
+    report: EvalReport
+    shown: tuple[ShownView, ...]
+
+
+def evaluate_models(
+    models: Mapping[str, AvatarModel],
+    sequence: AvatarSequence,
+    config: EvaluationConfig | None = None,
+    *,
+    files: Mapping[str, Path] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Evaluation:
+    """Measure models on a capture: images, surface, speed and size, each by the same rules.
+
+    Every frame is posed once a model, for all cameras of all sets and for the surface. A frame that was trained on
+    takes its own code where a model has codes; any other takes the null code. The head's boxes are those of the
+    sequence's template, whatever a model's own is.
+
+    Args:
+        models: modules that are `AvatarModel`s, by the name that tables give them, on the sequence's device.
+        sequence: the capture and the template of the person.
+        files: of the models, for their bytes on disk.
+        progress: called with frames done and all frames.
+
+    Raises:
+        InputError: no model, a model on another device, no view to measure on, frames without parameters.
+    """
+    config = config or EvaluationConfig()
+    _check_models(models, sequence)
+    sets = with_people(sequence.capture, view_sets(sequence.capture, config.protocol))
+    truths = truth_frames(sequence.capture, config.protocol, sets) if config.samples else {}
+    run = _Run(models, sequence, config, sets, truths, load_metric(config.metric, device=sequence.device))
+    frames = sorted({frame for one in sets.values() for frame in one.frames} | set(chain(*truths.values())))
+    for done, frame in enumerate(frames):
+        progress(done, len(frames))
+        run.measure(frame)
+    progress(len(frames), len(frames))
+    return run.result(files or {})
+
+
+class _Run:
+    """An evaluation under way: what was found so far."""
+
+    def __init__(
+        self,
+        models: Mapping[str, AvatarModel],
+        sequence: AvatarSequence,
+        config: EvaluationConfig,
+        sets: Mapping[str, ViewSet],
+        truths: Mapping[str, tuple[int, ...]],
+        metric: PerceptualDistance | None,
+    ) -> None:
+        self.models, self.sequence, self.config = models, sequence, config
+        self.sets, self.truths, self.metric = sets, truths, metric
+        self.views: dict[str, dict[str, dict[str, ViewQuality]]] = {name: {s: {} for s in sets} for name in models}
+        self.surfaces: dict[str, dict[int, SurfaceQuality]] = {name: {} for name in models}
+        self.skinning_alone: dict[int, SurfaceQuality] = {}
+        self.shown: dict[tuple[str, str, int], ShownView] = {}
+        self._kept = {(name, *pair) for name, one in sets.items() for pair in one.spread(config.shown)}
+        self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
+
+    def measure(self, frame: int) -> None:
+        """All sets' views and the surface of one frame."""
+        sequence = self.sequence
+        cameras = list(dict.fromkeys(c for one in self.sets.values() for c, f in one.views if f == frame))
+        views = [sequence.whole_view(camera, frame) for camera in cameras]
+        skinned = sequence.rig.pose(sequence.motion(frame))
+        corners = skinned[self._head].double().cpu().numpy()
+        heads = [head_box(corners, view.camera) for view in views]
+        truth = alone = None
+        if any(frame in frames for frames in self.truths.values()):
+            truth = sequence.capture.truth_mesh(frame)
+            alone = self.skinning_alone[frame] = self._surface(skinned, sequence.rig, truth)
+        # A frame that only its surface is measured of is posed for any eye: the mesh does not depend on it.
+        eyes = eyes_of(views) if views else skinned.new_zeros(1, 3)
+        for name, model in self.models.items():
+            with at_rest(model):
+                posed = model(_motion(model, sequence, frame), eyes)
+                for index, (view, head) in enumerate(zip(views, heads, strict=True)):
+                    self._see(name, posed, index, view=view, frame=frame, head=head)
+            if truth is not None:
+                unmoved = model.rig is sequence.rig and torch.equal(posed.vertices, skinned)
+                self.surfaces[name][frame] = alone if unmoved else self._surface(posed.vertices, model.rig, truth)
+
+    def result(self, files: Mapping[str, Path]) -> Evaluation:
+        """The report of all frames, with speed and size."""
+        models = {
+            name: ModelFigures(
+                views=self.views[name],
+                surfaces=self._by_set(self.surfaces[name]),
+                speed=self._speed(model),
+                parameters=parameter_counts(model),
+                bytes=bytes_on_disk(files[name]) if name in files else None,
+            )
+            for name, model in self.models.items()
+        }
+        metric = None if self.metric is None else self.metric.name
+        conventions = {
+            "images": CONVENTION,
+            **({} if metric is None else {metric: PERCEPTUAL_CONVENTION}),
+            **({"surface": geometry.CONVENTION} if self.truths else {}),
+            **({"speed": speed.CONVENTION} if self.config.speed_pictures else {}),
+        }
+        report = EvalReport(
+            self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions
+        )  # fmt: skip
+        order = list(self.sets)
+        shown = sorted(self.shown.values(), key=lambda one: (order.index(one.set), one.frame, one.camera))
+        return Evaluation(report, tuple(shown))
+
+    def _see(self, name: str, posed: PosedAvatar, index: int, *, view: View, frame: int, head: Box | None) -> None:
+        """Draw one view of a model and compare it, for every set that has the view."""
+        background = self.sequence.background
+        drawn = render_view(posed, index, view, background, eps2d=self.config.eps2d)
+        quality = view_quality(view, drawn.image, drawn.alpha, background, head=head, metric=self.metric)
+        pair = (view.name, frame)
+        for part in (part for part, one in self.sets.items() if pair in one.views):
+            self.views[name][part][view_key(*pair)] = quality
+            key = (part, *pair)
+            if key in self._kept:
+                if key not in self.shown:
+                    truth = eight_bit(view.composited(background)).numpy()
+                    self.shown[key] = ShownView(*key, truth=truth, rendered={}, head=head)
+                self.shown[key].rendered[name] = eight_bit(drawn.image).numpy()
+
+    def _surface(self, vertices: Tensor, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
+        template = rig.template
+        return surface_quality(
+            vertices.double().cpu().numpy(), template.faces, template.vertex_labels, truth,
+            samples=self.config.samples, seed=self.config.seed,
+        )  # fmt: skip
+
+    def _by_set(self, frames: Mapping[int, SurfaceQuality]) -> dict[str, Surfaces]:
+        parts = {name: {f: frames[f] for f in chosen} for name, chosen in self.truths.items()}
+        return {name: Surfaces(mean_surface(list(part.values())), part) for name, part in parts.items()}
+
+    def _speed(self, model: AvatarModel) -> Speed | None:
+        """Pictures of the first set's first camera, through the poses of that set."""
+        if not self.config.speed_pictures:
+            return None
+        capture, first = self.sequence.capture, next(iter(self.sets.values()))
+        return measure_speed(
+            model, [capture.params(frame) for frame in first.frames], capture.cameras[first.views[0][0]],
+            size=self.config.speed_size, pictures=self.config.speed_pictures, eps2d=self.config.eps2d,
+        )  # fmt: skip
+
+
+def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
+    """The pose of a frame for a model's own template."""
+    motion = sequence.motion(frame)
+    if model.rig is sequence.rig:
+        return motion
+    return model.rig.motion(sequence.capture.params(frame), frame=motion.frame)
+
+
+def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -> None:
+    if not models:
+        raise InputError(
+            "models to evaluate", expected="at least one", received="none",
+            remedy="train one with `smplxpp train --run RUN --capture DIR`",
+        )  # fmt: skip
+    for name, model in models.items():
+        if model.rig.device != torch.device(sequence.device):
+            raise InputError(f"model {name}", expected=f"on {sequence.device}", received=f"on {model.rig.device}")

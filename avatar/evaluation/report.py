@@ -1,0 +1,145 @@
+"""What an evaluation found, as data that goes to JSON and back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from avatar.evaluation.geometry import SurfaceQuality
+from avatar.evaluation.speed import Speed
+from avatar.training.quality import ViewQuality, mean_quality
+from smplxpp.core.artifact import jsonable
+from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.errors import InputError
+
+SCHEMA = 1
+SKINNING_ALONE = "skinning alone"
+"""Row of the template that follows its joints, beside the models' meshes."""
+SURFACE_SETS: Mapping[str, str] = {"training": "training frames", "held_out": "held-out frames"}
+
+
+def view_key(camera: str, frame: int) -> str:
+    """Name of a view in reports and files."""
+    return f"{camera}_{frame:06d}"
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Distances to the true surfaces of some frames: each frame's, and their mean."""
+
+    mean: SurfaceQuality
+    frames: dict[int, SurfaceQuality]
+
+
+@dataclass(frozen=True)
+class ModelFigures:
+    """Everything measured on one model.
+
+    Attributes:
+        views: set -> view -> its figures.
+        surfaces: "training" and "held_out" -> distances; without those that have no true surface.
+        speed: None where it was not measured.
+        parameters: by part of the model, and "total". bytes: of its file, None without one.
+    """
+
+    views: dict[str, dict[str, ViewQuality]] = field(default_factory=dict)
+    surfaces: dict[str, Surfaces] = field(default_factory=dict)
+    speed: Speed | None = None
+    parameters: dict[str, int] = field(default_factory=dict)
+    bytes: int | None = None
+
+    def mean(self, name: str) -> dict[str, float]:
+        """Means of a set's figures over the views that have them; empty for a set that was not measured."""
+        return mean_quality(self.views.get(name, {}))
+
+
+@dataclass(frozen=True)
+class EvalReport:
+    """An evaluation of models on a capture.
+
+    Attributes:
+        capture: its name. metric: name of the perceptual distance, None without one.
+        models: by name, in the order of tables.
+        skinning_alone: distances of the template that follows its joints, as `ModelFigures.surfaces`.
+        conventions: what the figures mean, in words.
+    """
+
+    capture: str
+    metric: str | None
+    models: dict[str, ModelFigures]
+    skinning_alone: dict[str, Surfaces] = field(default_factory=dict)
+    conventions: dict[str, str] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON, with the means; infinite figures are null, as JSON has none."""
+        out = jsonable(self)
+        for name, model in self.models.items():
+            out["models"][name]["mean"] = jsonable({part: model.mean(part) for part in model.views})
+        return {"schema": SCHEMA, **out}
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> EvalReport:
+        """What `as_dict` gave.
+
+        Raises:
+            InputError: something else.
+        """
+        if values.get("schema") != SCHEMA:
+            raise InputError(
+                "evaluation report", expected=f"schema {SCHEMA}", received=str(values.get("schema")),
+                remedy="evaluate again with this version",
+            )  # fmt: skip
+        return EvalReport(
+            capture=values["capture"],
+            metric=values["metric"],
+            models={name: _model(model) for name, model in values["models"].items()},
+            skinning_alone=_surfaces(values["skinning_alone"]),
+            conventions=dict(values["conventions"]),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+        atomic_write_text(path, json.dumps(self.as_dict(), indent=1))
+
+    @staticmethod
+    def load(path: Path) -> EvalReport:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: missing, damaged or foreign file.
+        """
+        try:
+            values = json.loads(Path(path).read_text())
+        except (OSError, ValueError) as error:
+            raise InputError(f"file {path}", expected="an evaluation report", received=str(error)) from None
+        return EvalReport.from_dict(values if isinstance(values, dict) else {})
+
+
+def _model(values: Mapping[str, Any]) -> ModelFigures:
+    return ModelFigures(
+        views={part: {key: _quality(view) for key, view in views.items()} for part, views in values["views"].items()},
+        surfaces=_surfaces(values["surfaces"]),
+        speed=None if values["speed"] is None else Speed(**values["speed"]),
+        parameters=dict(values["parameters"]),
+        bytes=values["bytes"],
+    )
+
+
+def _quality(values: Mapping[str, Any]) -> ViewQuality:
+    # The figures that every view has are null only where they were infinite.
+    return ViewQuality(**{**values, **{k: float("inf") for k in ("psnr", "psnr_image") if values[k] is None}})
+
+
+def _surfaces(values: Mapping[str, Any]) -> dict[str, Surfaces]:
+    return {
+        name: Surfaces(_surface(one["mean"]), {int(frame): _surface(q) for frame, q in one["frames"].items()})
+        for name, one in values.items()
+    }
+
+
+def _surface(values: Mapping[str, Any]) -> SurfaceQuality:
+    quality = SurfaceQuality(**values)
+    return replace(quality, labels={name: _surface(part) for name, part in quality.labels.items()})

@@ -1,0 +1,137 @@
+"""One table of figures as text, CSV or LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+from smplxpp.core.errors import InputError
+
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+          **{char: f"\\{char}" for char in "&%$#_{}"}}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of every row.
+
+    Attributes:
+        key: in the rows' figures. title: over the column, unit included. group: over the titles of its neighbours.
+        digits: after the point. better: which of two values wins; "" where neither does.
+    """
+
+    key: str
+    title: str
+    group: str = ""
+    digits: int = 2
+    better: Literal["higher", "lower", ""] = ""
+
+    def shown(self, value: float | None) -> str:
+        """The value for readers; "-" where there is none."""
+        if value is None or math.isnan(value):
+            return "-"
+        return f"{value:,.{self.digits}f}" if math.isfinite(value) else ("inf" if value > 0 else "-inf")
+
+
+@dataclass(frozen=True)
+class FigureTable:
+    """Rows of figures under titled columns; columns that no row has a figure for are left out.
+
+    Attributes:
+        rows: name -> key -> figure. caption: in words. row_title: over the names.
+
+    Example:
+        >>> table = FigureTable((Column("psnr", "PSNR, dB", better="higher"),), {"Full": {"psnr": 27.1}})
+        >>> Path("table.tex").write_text(table.latex(label="tab:ablation"))
+    """
+
+    columns: tuple[Column, ...]
+    rows: Mapping[str, Mapping[str, float | None]]
+    caption: str = ""
+    row_title: str = "model"
+
+    def __post_init__(self) -> None:
+        keys = [column.key for column in self.columns]
+        if len(set(keys)) < len(keys):
+            raise InputError("table columns", expected="distinct keys", received=", ".join(keys))
+        known = tuple(c for c in self.columns if any(row.get(c.key) is not None for row in self.rows.values()))
+        object.__setattr__(self, "columns", known)
+
+    def cells(self) -> list[list[str]]:
+        """Names and figures as shown, a list a row."""
+        return [[name, *(c.shown(row.get(c.key)) for c in self.columns)] for name, row in self.rows.items()]
+
+    def best(self, column: Column) -> set[str]:
+        """Names of the rows that show the best value of a column; none where all or no rows do."""
+        values = {name: row.get(column.key) for name, row in self.rows.items()}
+        known = {name: value for name, value in values.items() if value is not None and not math.isnan(value)}
+        if not column.better or len(known) < 2:
+            return set()
+        best = column.shown((max if column.better == "higher" else min)(known.values()))
+        winners = {name for name, value in known.items() if column.shown(value) == best}
+        return winners if len(winners) < len(known) else set()
+
+    def text(self) -> str:
+        """Aligned by spaces, groups over their columns, the caption above."""
+        body = [[self.row_title, *(c.title for c in self.columns)], *self.cells()]
+        widths = [max(map(len, column)) for column in zip(*body, strict=True)]
+        groups = [(title, list(members)) for title, members in groupby(range(len(self.columns)), self._group)]
+        for title, members in groups:
+            missing = len(title) - sum(widths[k + 1] for k in members) - 2 * (len(members) - 1)
+            widths[members[-1] + 1] += max(missing, 0)
+        aligned = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in body]
+        lines = ["  ".join(cells) for cells in aligned]
+        if any(title for title, _ in groups):
+            spans = [title.rjust(sum(widths[k + 1] for k in m) + 2 * (len(m) - 1)) for title, m in groups]
+            lines.insert(0, "  ".join([" " * widths[0], *spans]))
+        return "\n".join([*([self.caption] if self.caption else []), *(line.rstrip() for line in lines)]) + "\n"
+
+    def csv(self) -> str:
+        """Keys as header, every digit of the figures, nothing where there is none."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow([self.row_title, *(c.key for c in self.columns)])
+        for name, row in self.rows.items():
+            values = [row.get(c.key) for c in self.columns]
+            writer.writerow([name, *("" if value is None else repr(value) for value in values)])
+        return out.getvalue()
+
+    def latex(self, *, label: str = "") -> str:
+        r"""A `table` for the package booktabs; the best value of a column is bold.
+
+        Args:
+            label: of the table, for `\ref`.
+        """
+        arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
+        groups = [(title, list(members)) for title, members in groupby(range(len(self.columns)), self._group)]
+        lines = [r"\begin{table}", r"\centering"]
+        if self.caption:
+            lines.append(rf"\caption{{{escape_latex(self.caption)}}}")
+        if label:
+            lines.append(rf"\label{{{label}}}")
+        lines += [rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule"]
+        if any(title for title, _ in groups):
+            spans = [rf"\multicolumn{{{len(m)}}}{{c}}{{{escape_latex(title)}}}" for title, m in groups]
+            rules = [rf"\cmidrule(lr){{{m[0] + 2}-{m[-1] + 2}}}" for title, m in groups if title]
+            lines += [" & ".join(["", *spans]) + r" \\", "".join(rules)]
+        titles = [escape_latex(self.row_title), *(escape_latex(c.title) + arrows[c.better] for c in self.columns)]
+        lines += [" & ".join(titles) + r" \\", r"\midrule"]
+        best = [self.best(column) for column in self.columns]
+        for name, *figures in self.cells():
+            cells = [rf"\textbf{{{f}}}" if name in b else ("--" if f == "-" else f)
+                     for f, b in zip(figures, best, strict=True)]  # fmt: skip
+            lines.append(" & ".join([escape_latex(name), *cells]) + r" \\")
+        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"]) + "\n"
+
+    def _group(self, k: int) -> str:
+        return self.columns[k].group
+
+
+def escape_latex(text: str) -> str:
+    """Text with what LaTeX reads as commands written as characters."""
+    return "".join(_LATEX.get(char, char) for char in text)
