@@ -188,6 +188,20 @@ class Template:
         """A part alone, its vertices in order, those without a face dropped."""
         return self.mesh.submesh(self.part_faces(name))[0]
 
+    def naked(self) -> Template:
+        """The body without its parts: the same person undressed, as a template of its own."""
+        count = self.body_vertex_count
+        own = ("vertices", "vertex_labels", "vertex_part", "vertex_colors", "body_index", "scan_index")
+        per_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
+        weights = replace(self.weights, **{name: getattr(self.weights, name)[:count] for name in per_vertex})
+        return replace(
+            self,
+            **{name: getattr(self, name)[:count] for name in own},
+            faces=self.faces[self.part_faces(BODY_PART)],
+            part_names=(BODY_PART,),
+            weights=weights,
+        )
+
     @cached_property
     def body_model(self) -> BodyModel:
         """The naked body of this identity: its mean shape is the template's, so betas given to it are changes."""
