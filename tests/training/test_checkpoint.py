@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save
 
 from avatar.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from smplxpp.core.errors import InputError
 
 
 def some(key: str = "this", iteration: int = 7) -> Checkpoint:
@@ -23,15 +26,33 @@ def test_round_trip_is_exact(tmp_path):
     assert all(torch.equal(value, some().tensors[name]) for name, value in back.tensors.items())
 
 
-def test_other_trainings_damage_and_absence_mean_a_new_start(tmp_path):
+def test_damage_and_absence_mean_a_new_start_and_damage_is_told(tmp_path, caplog):
     path = tmp_path / "state"
     assert load_checkpoint(path, key="this") is None
+    assert not caplog.records
     save_checkpoint(path, some())
-    assert load_checkpoint(path, key="that") is None
-    path.write_bytes(path.read_bytes()[:-20])
-    assert load_checkpoint(path, key="this") is None
-    path.write_bytes(b"nonsense")
-    assert load_checkpoint(path, key="this") is None
+    for content in (path.read_bytes()[:-20], b"nonsense", b"", save({"a": torch.zeros(1)})):
+        caplog.clear()
+        path.write_bytes(content)
+        assert load_checkpoint(path, key="this") is None
+        assert "cannot be read" in caplog.text
+
+
+def test_one_of_another_training_is_refused_and_stays(tmp_path):
+    path = tmp_path / "state"
+    save_checkpoint(path, some())
+    content = path.read_bytes()
+    with pytest.raises(InputError, match="7 steps into its training") as caught:
+        load_checkpoint(path, key="that")
+    assert str(path) in caught.value.subject and "--force" in caught.value.remedy
+    assert path.read_bytes() == content
+
+
+def test_one_of_a_newer_version_is_refused_by_its_number(tmp_path):
+    path = tmp_path / "state"
+    path.write_bytes(save({"later": torch.zeros(1)}, metadata={"training": json.dumps({"schema": 4, "steps": "many"})}))
+    with pytest.raises(InputError, match=r"expected version 1 of the format, received version 4\. Go on with"):
+        load_checkpoint(path, key="this")
 
 
 def test_a_kill_while_writing_leaves_the_one_before(tmp_path, monkeypatch):

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import math
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from avatar.training import loop as module
-from avatar.training.loop import DivergedError, LoopConfig, require_finite, run_training
+from avatar.training.distributed import Distributed
+from avatar.training.gradient_task import DivergedError, OptimiserConfig
+from avatar.training.loop import LoopConfig, run_training
 from avatar.training.metrics_log import append_metrics, read_metrics, truncate_metrics
+from smplxpp.core.errors import InputError, MissingExtraError
+from tests.training.toy import Toy
 
 
 class Walk:
-    """A random walk with momentum: where it ends tells every step that was made."""
+    """A random walk with momentum: where it ends tells every step that was made.
 
-    def __init__(self, stop_at: int | None = None) -> None:
+    Args:
+        stop_at: step that is not made: `error` is raised.
+    """
+
+    distributed = Distributed()
+
+    def __init__(self, stop_at: int | None = None, error: BaseException | None = None) -> None:
         self.place, self.speed, self.stop_at = torch.zeros(4), torch.zeros(4), stop_at
+        self.error = error or KeyboardInterrupt()
 
     def step(self, iteration: int) -> dict:
         if iteration == self.stop_at:
-            raise KeyboardInterrupt
+            raise self.error
         push = torch.randn(4, generator=torch.Generator().manual_seed(iteration))
         self.speed = 0.9 * self.speed + push
         self.place = self.place + self.speed
@@ -92,31 +107,98 @@ def test_a_limit_of_time_stops_with_a_checkpoint_and_the_next_call_goes_on(tmp_p
     assert torch.equal(walk.place, whole.place)
 
 
-def test_a_checkpoint_of_another_key_is_not_taken_up(tmp_path):
+def test_a_checkpoint_of_another_key_stops_before_anything_is_lost(tmp_path):
     run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="old")
-    end = run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="new")
-    assert end.iteration == 1
-    assert [e["iteration"] for e in read_metrics(tmp_path / "metrics.jsonl")] == [0]
-
-
-def test_a_number_that_is_not_finite_stops_and_names_the_view():
-    fine = torch.ones(3)
-    require_finite([fine, fine], iteration=4, view="Cam7")
-    for bad in (math.nan, math.inf, -math.inf):
-        with pytest.raises(DivergedError, match=r"step 4, view Cam7") as caught:
-            require_finite([fine, torch.tensor([0.0, bad])], iteration=4, view="Cam7")
-        assert "learning rates" in caught.value.remedy
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match=r"state\.safetensors: .* 1 steps .*--force"):
+        run_training(Walk(), config(), tmp_path, key="new")
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="old").iteration == 2
 
 
 def test_diverging_keeps_the_last_checkpoint(tmp_path):
-    class Diverging(Walk):
-        def step(self, iteration: int) -> dict:
-            require_finite([torch.tensor(math.nan if iteration == 6 else 1.0)], iteration=iteration, view="x")
-            return super().step(iteration)
-
-    with pytest.raises(DivergedError):
-        run_training(Diverging(), config(), tmp_path, key="k")
+    optimiser = OptimiserConfig(iterations=25)
+    with pytest.raises(DivergedError, match="step 6, batch 20"):
+        run_training(Toy(optimiser, poison=20), config(), tmp_path, key="k")
     assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 6
+
+
+def too_much_memory(empty) -> Exception:
+    """What a library raises that is asked for an exabyte."""
+    with pytest.raises((RuntimeError, MemoryError)) as caught:
+        empty((1 << 56, 4))
+    return caught.value
+
+
+@pytest.mark.parametrize("kind", ["cpu", "cuda", "numpy", "python"])
+def test_running_out_of_memory_says_what_to_do_and_keeps_the_last_checkpoint(tmp_path, kind):
+    errors = {
+        "cpu": too_much_memory(torch.empty),
+        "cuda": torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nmore"),
+        "numpy": too_much_memory(np.empty),
+        "python": MemoryError(),
+    }
+    with pytest.raises(InputError, match="memory: expected room") as caught:
+        run_training(Walk(9, errors[kind]), config(), tmp_path, key="k")
+    assert "smaller preset" in caught.value.remedy and caught.value.received and "\n" not in caught.value.received
+    whole, second = Walk(), Walk()
+    assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 9
+    run_training(second, config(), tmp_path, key="k")
+    run_training(whole, config(), tmp_path / "whole", key="k")
+    assert torch.equal(whole.place, second.place)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("shapes differ"), PermissionError(errno.EACCES, "not allowed")])
+def test_other_errors_pass_as_they_are(tmp_path, error):
+    with pytest.raises(type(error)) as caught:
+        run_training(Walk(3, error), config(), tmp_path, key="k")
+    assert caught.value is error
+
+
+def test_a_full_disk_says_so_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
+    write, written = Path.write_bytes, []
+
+    def full(path, data):
+        written.append(path)
+        if len(written) == 8:
+            write(path, data[:50])
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, data)
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="No space left on device") as caught:
+        patch.setattr(Path, "write_bytes", full)
+        run_training(Walk(), config(), tmp_path, key="k")
+    assert str(tmp_path) in caught.value.subject and "free some space" in caught.value.remedy
+    assert sorted(path.name for path in tmp_path.iterdir()) == [module.METRICS_FILE, module.STATE_FILE]
+    assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 7
+    whole, second = Walk(), Walk()
+    run_training(second, config(), tmp_path, key="k")
+    run_training(whole, config(), tmp_path / "whole", key="k")
+    assert torch.equal(whole.place, second.place)
+
+
+def test_tensorboard_is_named_where_it_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MissingExtraError, match=r"smplxpp\[tensorboard\]"):
+        run_training(Walk(), config(tensorboard=True), tmp_path, key="k")
+
+
+def test_tensorboard_gets_every_number_of_the_log_once(tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(Walk(stop_at=18), config(tensorboard=True, checkpoint_seconds=math.inf), tmp_path, key="k")
+    run_training(Walk(), config(tensorboard=True), tmp_path, key="k")
+    events = EventAccumulator(str(tmp_path / module.TENSORBOARD_FOLDER))
+    events.Reload()
+    logged = {"step/loss": ("step", "loss"), "evaluation/mean/psnr": ("evaluation", "mean")}
+    assert {*logged, "step/seconds"} <= set(events.Tags()["scalars"])
+    entries = read_metrics(tmp_path / "metrics.jsonl")
+    for tag, (kind, name) in logged.items():
+        told = [(e["iteration"], e[name]["psnr"] if name == "mean" else e[name]) for e in entries if e["kind"] == kind]
+        assert [e.step for e in events.Scalars(tag)] == [step for step, _ in told]
+        assert [e.value for e in events.Scalars(tag)] == pytest.approx([value for _, value in told], rel=1e-6)
 
 
 def test_metrics_survive_a_line_that_was_cut_short(tmp_path):
