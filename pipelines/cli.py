@@ -34,6 +34,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "FitReference",
         "a built template and one frame's photographs in; textured Gaussians on it and their figures out",
     ),
+    "evaluate": (
+        "pipelines.commands.evaluate",
+        "Evaluate",
+        "a run's models on held-out views and poses: image and surface figures, speed, size, tables, pictures",
+    ),
     "animate": (
         "pipelines.commands.animate",
         "Animate",

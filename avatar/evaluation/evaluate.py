@@ -16,7 +16,7 @@ from avatar.evaluation.geometry import SurfaceQuality, mean_surface, surface_qua
 from avatar.evaluation.image import load_metric
 from avatar.evaluation.posing import at_rest
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
-from avatar.evaluation.report import EvalReport, ModelFigures, Surfaces, view_key
+from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
 from avatar.evaluation.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.posed import AvatarModel, PosedAvatar
@@ -84,11 +84,27 @@ class ShownView:
 
 
 @dataclass(frozen=True, eq=False)
+class ShownSurface:
+    """Meshes of one frame.
+
+    Attributes:
+        set: "training" or "held_out". truth: the true surface.
+        posed: by model, "skinning alone" first; without the models whose mesh follows its joints alone.
+    """
+
+    set: str
+    frame: int
+    truth: TriangleMesh
+    posed: dict[str, TriangleMesh]
+
+
+@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures, and the pictures of some views in the order of sets."""
+    """Figures, the pictures of some views in the order of sets, and the meshes of a frame of either kind."""
 
     report: EvalReport
-    shown: tuple[ShownView, ...]
+    views: tuple[ShownView, ...]
+    surfaces: tuple[ShownSurface, ...]
 
 
 def evaluate_models(
@@ -99,7 +115,7 @@ def evaluate_models(
     files: Mapping[str, Path] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Evaluation:
-    """Measure models on a capture: images, surface, speed and size, each by the same rules.
+    """Measure models on a capture: images, surface, speed and size, all by the same rules.
 
     Every frame is posed once a model, for all cameras of all sets and for the surface. A frame that was trained on
     takes its own code where a model has codes; any other takes the null code. The head's boxes are those of the
@@ -145,6 +161,8 @@ class _Run:
         self.surfaces: dict[str, dict[int, SurfaceQuality]] = {name: {} for name in models}
         self.skinning_alone: dict[int, SurfaceQuality] = {}
         self.shown: dict[tuple[str, str, int], ShownView] = {}
+        self.meshes: dict[str, ShownSurface] = {}
+        self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
         self._kept = {(name, *pair) for name, one in sets.items() for pair in one.spread(config.shown)}
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
 
@@ -159,7 +177,11 @@ class _Run:
         truth = alone = None
         if any(frame in frames for frames in self.truths.values()):
             truth = sequence.capture.truth_mesh(frame)
-            alone = self.skinning_alone[frame] = self._surface(skinned, sequence.rig, truth)
+            mesh = _mesh(skinned, sequence.rig)
+            alone = self.skinning_alone[frame] = self._surface(mesh, sequence.rig, truth)
+            if frame in self._middle:
+                part = self._middle[frame]
+                self.meshes[part] = ShownSurface(part, frame, truth, {SKINNING_ALONE: mesh})
         # A frame that only its surface is measured of is posed for any eye: the mesh does not depend on it.
         eyes = eyes_of(views) if views else skinned.new_zeros(1, 3)
         for name, model in self.models.items():
@@ -168,8 +190,13 @@ class _Run:
                 for index, (view, head) in enumerate(zip(views, heads, strict=True)):
                     self._see(name, posed, index, view=view, frame=frame, head=head)
             if truth is not None:
-                unmoved = model.rig is sequence.rig and torch.equal(posed.vertices, skinned)
-                self.surfaces[name][frame] = alone if unmoved else self._surface(posed.vertices, model.rig, truth)
+                if model.rig is sequence.rig and torch.equal(posed.vertices, skinned):
+                    self.surfaces[name][frame] = alone
+                    continue
+                mesh = _mesh(posed.vertices, model.rig)
+                self.surfaces[name][frame] = self._surface(mesh, model.rig, truth)
+                if frame in self._middle:
+                    self.meshes[self._middle[frame]].posed[name] = mesh
 
     def result(self, files: Mapping[str, Path]) -> Evaluation:
         """The report of all frames, with speed and size."""
@@ -195,7 +222,7 @@ class _Run:
         )  # fmt: skip
         order = list(self.sets)
         shown = sorted(self.shown.values(), key=lambda one: (order.index(one.set), one.frame, one.camera))
-        return Evaluation(report, tuple(shown))
+        return Evaluation(report, tuple(shown), tuple(self.meshes[name] for name in self.truths))
 
     def _see(self, name: str, posed: PosedAvatar, index: int, *, view: View, frame: int, head: Box | None) -> None:
         """Draw one view of a model and compare it, for every set that has the view."""
@@ -212,12 +239,10 @@ class _Run:
                     self.shown[key] = ShownView(*key, truth=truth, rendered={}, head=head)
                 self.shown[key].rendered[name] = eight_bit(drawn.image).numpy()
 
-    def _surface(self, vertices: Tensor, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
-        template = rig.template
+    def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
         return surface_quality(
-            vertices.double().cpu().numpy(), template.faces, template.vertex_labels, truth,
-            samples=self.config.samples, seed=self.config.seed,
-        )  # fmt: skip
+            mesh, rig.template.vertex_labels, truth, samples=self.config.samples, seed=self.config.seed
+        )
 
     def _by_set(self, frames: Mapping[int, SurfaceQuality]) -> dict[str, Surfaces]:
         parts = {name: {f: frames[f] for f in chosen} for name, chosen in self.truths.items()}
@@ -232,6 +257,10 @@ class _Run:
             model, [capture.params(frame) for frame in first.frames], capture.cameras[first.views[0][0]],
             size=self.config.speed_size, pictures=self.config.speed_pictures, eps2d=self.config.eps2d,
         )  # fmt: skip
+
+
+def _mesh(vertices: Tensor, rig: Rig) -> TriangleMesh:
+    return TriangleMesh(vertices.double().cpu().numpy(), rig.template.faces)
 
 
 def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:

@@ -39,8 +39,7 @@ class SurfaceQuality:
 
 
 def surface_quality(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriangleMesh,
     vertex_labels: np.ndarray,
     truth: TriangleMesh,
     *,
@@ -50,13 +49,12 @@ def surface_quality(
     """Compare a posed mesh with the truth over the surfaces that can be seen; see `CONVENTION`.
 
     Args:
-        vertices: (V, 3) posed, metres. faces: (F, 3). vertex_labels: (V,) ids of `smplxpp.core.labels`.
+        mesh: posed. vertex_labels: (V,) ids of `smplxpp.core.labels` on it.
         truth: the surface that the images show.
 
     Raises:
-        InputError: NaN in the vertices, a mesh without area.
+        InputError: a mesh without area, or none of it to be seen.
     """
-    mesh = TriangleMesh(vertices, faces)
     found = compare(
         mesh, truth, samples=samples, seed=seed, pred_labels=vertex_labels,
         config=CompareConfig(visible_only=True),

@@ -1,0 +1,288 @@
+"""The ablation: variants of the system trained on one capture, measured by one protocol, in one table.
+
+    rows = ablation_rows(("paper",))
+    ablation = Ablation(Workshop(capture, template), ablation_pieces(preset, frame=0), Path("work"), inputs={})
+    result = ablation.run(rows, EvaluationConfig())
+    print(ablation_table(result).text())
+
+Every piece and every row is made once and kept; the same call goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from avatar.evaluation.ablation_pieces import CLOTHED, Piece, Workshop
+from avatar.evaluation.ablation_plan import Row
+from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
+from avatar.evaluation.protocol import SETS
+from avatar.evaluation.report import SURFACE_SETS, EvalReport
+from avatar.evaluation.summary import summary_figures
+from avatar.evaluation.tables import Column, FigureTable
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion
+from avatar.training.loop import STATE_FILE, Progress
+from avatar.training.train import Session
+from smplxpp.core.artifact import jsonable, stage_key
+from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.labels import CLOTH_LABELS
+
+PIECE_FILE, RECORD_FILE = "avatar.safetensors", "piece.json"
+PLAYER_FILE, REPORT_FILE, ROW_FILE = "player.safetensors", "report.json", "row.json"
+ROWS_FOLDER = "rows"
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A row that was trained and measured.
+
+    Attributes:
+        row: what it is. report: of its one model, named by the row's title.
+        seconds: of training steps, over all pieces that it took. iterations: likewise.
+    """
+
+    row: Row
+    report: EvalReport
+    seconds: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class AblationResult:
+    """Rows in their order.
+
+    Attributes:
+        rows: by name, those that are finished. waiting: names of those that are not: time ran out.
+    """
+
+    rows: dict[str, RowResult]
+    waiting: tuple[str, ...]
+
+    @property
+    def report(self) -> EvalReport:
+        """All rows' models in one."""
+        reports = [one.report for one in self.rows.values()]
+        models = {title: model for report in reports for title, model in report.models.items()}
+        alone = next((report.skinning_alone for report in reports if report.skinning_alone), {})
+        conventions = {name: text for report in reports for name, text in report.conventions.items()}
+        return EvalReport(reports[0].capture, reports[0].metric, models, alone, conventions)
+
+
+@dataclass(frozen=True, eq=False)
+class Observer:
+    """Who is told what an ablation does.
+
+    Attributes:
+        training: called with the name of a piece and its progress. measuring: with a row, frames done and all frames.
+        measured: with a row and its evaluation, pictures included, once.
+    """
+
+    training: Callable[[str, Progress], None] = lambda name, progress: None
+    measuring: Callable[[str, int, int], None] = lambda name, done, total: None
+    measured: Callable[[str, Evaluation], None] = lambda name, evaluation: None
+
+
+class Ablation:
+    """Pieces and rows of an ablation in a folder: `FOLDER/PIECE/` and `FOLDER/rows/ROW/`.
+
+    Args:
+        shop: capture and person. pieces: by name, a piece after those that it needs.
+        folder: of everything.
+        inputs: digests of what the shop was read from; with the pieces' configurations they decide what still stands.
+        perceptual: for the losses' perceptual term, None leaves it out.
+    """
+
+    def __init__(
+        self,
+        shop: Workshop,
+        pieces: Mapping[str, Piece],
+        folder: Path,
+        *,
+        inputs: Mapping[str, str],
+        perceptual: PerceptualDistance | None = None,
+    ) -> None:
+        self.shop, self.pieces, self.folder, self.inputs = shop, pieces, Path(folder), inputs
+        self.perceptual = perceptual
+
+    def run(
+        self,
+        rows: Mapping[str, Row],
+        config: EvaluationConfig,
+        *,
+        max_seconds: float = float("inf"),
+        observer: Observer | None = None,
+    ) -> AblationResult:
+        """Train and measure rows, as far as time allows; what stands is not done again.
+
+        The full system comes first, whatever its place: most rows share its pieces.
+
+        Args:
+            max_seconds: of this call; training then stops with a checkpoint and nothing new is begun.
+        """
+        observer = observer or Observer()
+        end = time.monotonic() + max_seconds
+        results: dict[str, RowResult] = {}
+        for name in sorted(rows, key=lambda name: name != "full"):
+            finished = all(self._make(piece, end, observer) for piece in self.closure(rows[name].piece))
+            if finished and (self._row_stands(name, rows[name], config) or time.monotonic() < end):
+                results[name] = self._measure(name, rows[name], config, observer)
+        ordered = {name: results[name] for name in rows if name in results}
+        return AblationResult(ordered, tuple(name for name in rows if name not in results))
+
+    def closure(self, name: str) -> list[str]:
+        """A piece after all that it is made from, each once."""
+        names: list[str] = []
+        for needed in (*self.pieces[name].needs, None):
+            for piece in [name] if needed is None else self.closure(needed):
+                if piece not in names:
+                    names.append(piece)
+        return names
+
+    def key(self, name: str) -> str:
+        """What decides a piece: its configuration, those of all that it is made from, the inputs."""
+        chain = [
+            {"kind": type(piece).__name__, **jsonable(piece)} for piece in map(self.pieces.get, self.closure(name))
+        ]
+        return stage_key(config={"pieces": chain, "device": self.shop.device}, inputs=self.inputs)
+
+    def record(self, name: str) -> dict[str, Any] | None:
+        """Key, seconds and iterations of a piece that stands, else None."""
+        record = _read_json(self.folder / name / RECORD_FILE)
+        stands = record.get("key") == self.key(name) and (self.folder / name / PIECE_FILE).is_file()
+        return record if stands else None
+
+    def piece(self, name: str) -> Any:
+        """A finished piece, read from its file."""
+        return self.pieces[name].read(self.folder / name / PIECE_FILE, self.shop, self.piece)
+
+    def forget(self, rows: Mapping[str, Row]) -> None:
+        """Remove rows and all pieces that they are made from, checkpoints included."""
+        for name, row in rows.items():
+            shutil.rmtree(self.folder / ROWS_FOLDER / name, ignore_errors=True)
+            for piece in self.closure(row.piece):
+                shutil.rmtree(self.folder / piece, ignore_errors=True)
+
+    def _make(self, name: str, end: float, observer: Observer) -> bool:
+        """Train a piece unless it stands; whether it does then."""
+        if self.record(name) is not None:
+            return True
+        if time.monotonic() >= end:
+            return False
+        log.info("ablation: training %s", name)
+        piece, folder = self.pieces[name], self.folder / name
+        session = Session(
+            folder, key=self.key(name), perceptual=self.perceptual, max_seconds=end - time.monotonic(),
+            report=lambda progress: observer.training(name, progress),
+        )  # fmt: skip
+        begin = time.perf_counter()
+        with torch.random.fork_rng():
+            torch.manual_seed(piece.seed)
+            product, progress = piece.make(self.shop, self.piece, session)
+        if progress is not None and not progress.finished:
+            return False
+        piece.write(product, folder / PIECE_FILE)
+        done = {
+            "key": self.key(name),
+            "seconds": time.perf_counter() - begin if progress is None else progress.seconds,
+            "iterations": 0 if progress is None else progress.iterations,
+        }
+        atomic_write_text(folder / RECORD_FILE, json.dumps(done, indent=1))
+        (folder / STATE_FILE).unlink(missing_ok=True)
+        return True
+
+    def _row_key(self, row: Row, config: EvaluationConfig) -> str:
+        return stage_key(config={"row": row, "evaluation": config}, inputs={"piece": self.key(row.piece)})
+
+    def _row_stands(self, name: str, row: Row, config: EvaluationConfig) -> bool:
+        found = _read_json(self.folder / ROWS_FOLDER / name / ROW_FILE)
+        return found.get("key") == self._row_key(row, config)
+
+    def _measure(self, name: str, row: Row, config: EvaluationConfig, observer: Observer) -> RowResult:
+        """Figures of a row, from its report if that stands; the model is measured as its player's file holds it."""
+        folder = self.folder / ROWS_FOLDER / name
+        if not self._row_stands(name, row, config):
+            log.info("ablation: measuring %s", row.title)
+            folder.mkdir(parents=True, exist_ok=True)
+            piece, player = self.pieces[row.piece], folder / PLAYER_FILE
+            piece.write(self.piece(row.piece), player, compact=True)
+            model = piece.read(player, self.shop, self.piece)
+            evaluation = evaluate_models(
+                {row.title: WithoutCode(model) if row.null_code else model},
+                self.shop.sequence(CLOTHED),
+                config,
+                files={row.title: player},
+                progress=lambda done, total: observer.measuring(name, done, total),
+            )
+            observer.measured(name, evaluation)
+            evaluation.report.save(folder / REPORT_FILE)
+            atomic_write_text(folder / ROW_FILE, json.dumps({"key": self._row_key(row, config)}))
+        records = [self.record(piece) for piece in self.closure(row.piece)]
+        seconds, iterations = (sum(record[key] for record in records) for key in ("seconds", "iterations"))
+        return RowResult(row, EvalReport.load(folder / REPORT_FILE), seconds, iterations)
+
+
+class WithoutCode(nn.Module):
+    """An avatar that is driven by the null code in every frame, as it is online."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model, self.rig = model, model.rig
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        return self.model(motion.without_code(), eyes)
+
+
+def ablation_table(result: AblationResult) -> FigureTable:
+    """One line a row: novel views, novel poses, distances to the true surface, bytes and time of training."""
+    metric, capture = (result.report.metric or "", result.report.capture) if result.rows else ("", "")
+    columns = []
+    for name in ("novel_view", "novel_pose"):
+        columns += [
+            Column(f"{name}.psnr", "PSNR", SETS[name], 2, "higher"),
+            Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),
+            Column(f"{name}.perceptual", metric, SETS[name], 4, "lower"),
+        ]
+    for name, title in SURFACE_SETS.items():
+        group = f"{title}, mm"
+        columns += [
+            Column(f"surface.{name}.p2s", "P2S", group, 2, "lower"),
+            Column(f"surface.{name}.chamfer", "Chamfer", group, 2, "lower"),
+        ]
+        columns += [
+            Column(f"surface.{name}.{label.name}.p2s", f"P2S {label.name}", group, 2, "lower") for label in CLOTH_LABELS
+        ]
+    columns += [Column("megabytes", "MB", "", 1, "lower"), Column("minutes", "min", "training", 1)]
+    rows = {one.row.title: row_figures(one) for one in result.rows.values()}
+    return FigureTable(tuple(columns), rows, f"Ablation on {capture}", row_title="")
+
+
+def row_figures(result: RowResult) -> dict[str, float | None]:
+    """Every mean figure of a row, see `summary_figures`; `minutes` and `iterations` of training."""
+    figures = summary_figures(result.report.models[result.row.title])
+    return {**figures, "minutes": result.seconds / 60.0, "iterations": float(result.iterations)}
+
+
+def unfinished(ablation: Ablation, rows: Mapping[str, Row], names: Sequence[str]) -> list[str]:
+    """Pieces that rows still need, in the order in which they are made."""
+    pieces = [piece for name in names for piece in ablation.closure(rows[name].piece)]
+    return [piece for piece in dict.fromkeys(pieces) if ablation.record(piece) is None]
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

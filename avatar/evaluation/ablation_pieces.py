@@ -1,0 +1,269 @@
+"""What an ablation trains: pieces that its rows share, each made once, saved and read again by itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.models.blend_shapes import BlendShapeConfig
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.models.rig import Rig
+from avatar.models.student import Student, StudentConfig
+from avatar.models.teacher import TeacherConfig
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.bake import BakeConfig
+from avatar.training.compensate import CompensateConfig
+from avatar.training.fit_config import FitConfig
+from avatar.training.fit_reference import FitScene, fit_reference
+from avatar.training.fit_teacher import FitTeacherConfig
+from avatar.training.loop import Progress
+from avatar.training.sequence import AvatarSequence
+from avatar.training.train import Session, bake, compensate, fit_teacher
+from avatar.training.views import read_views
+from smplxpp.capture import Capture
+from smplxpp.core.errors import InputError
+from smplxpp.core.template import Template
+
+CLOTHED, NAKED = "clothed", "naked"
+GROUNDS: Mapping[str, Callable[[Template], Template]] = {CLOTHED: lambda template: template, NAKED: Template.naked}
+"""Templates that pieces are trained on, made from the person's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workshop:
+    """The capture and the person that all pieces are trained on.
+
+    Attributes:
+        capture: with cameras, images, masks and parameters. template: of the person.
+        device: of all tensors.
+    """
+
+    capture: Capture
+    template: Template
+    device: str = "cpu"
+    _sequences: dict[str, AvatarSequence] = field(default_factory=dict, init=False, repr=False)
+
+    def sequence(self, ground: str) -> AvatarSequence:
+        """The capture seen with one of the templates of `GROUNDS`; they share its images."""
+        if ground not in self._sequences:
+            template = GROUNDS[ground](self.template)
+            self._sequences[ground] = AvatarSequence(self.capture, template, device=self.device)
+        return self._sequences[ground]
+
+
+Get = Callable[[str], Any]
+"""A finished piece by its name, read from its file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece(ABC):
+    """Something trained once. Its fields and those of the pieces it needs decide what comes out.
+
+    Attributes:
+        ground: template that it is trained on.
+    """
+
+    ground: str = CLOTHED
+
+    @property
+    @abstractmethod
+    def needs(self) -> tuple[str, ...]:
+        """Names of the pieces that it is made from."""
+
+    @property
+    @abstractmethod
+    def seed(self) -> int:
+        """Of networks that start at random."""
+
+    @abstractmethod
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Any, Progress | None]:
+        """Train it, from the session's checkpoint if there is one; None for the progress of what needs no steps."""
+
+    def write(self, product: Any, path: Path, *, compact: bool = False) -> None:
+        """Save what `make` gave; `compact`: in half precision, as a player needs it."""
+        save_avatar(path, product, compact=compact)
+
+    def read(self, path: Path, shop: Workshop, get: Get) -> Any:
+        """What `write` saved."""
+        return load_avatar(path, shop.sequence(self.ground).rig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitPiece(Piece):
+    """Gaussians fitted to one frame's photographs."""
+
+    config: FitConfig
+    frame: int
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[BoundGaussians, Progress]:
+        sequence = shop.sequence(self.ground)
+        params = shop.capture.params(self.frame)
+        if params is None:
+            raise InputError(
+                f"capture {shop.capture.name}", expected=f"body parameters of frame {self.frame}", received="none",
+                remedy="choose another reference frame with --frame",
+            )  # fmt: skip
+        template = sequence.rig.template
+        views = read_views(shop.capture, self.frame, sequence.train_cameras)
+        scene = FitScene(template, template.pose(params)[0], views, (), tuple(sequence.background.tolist()))
+        result = fit_reference(
+            scene, self.config, session.folder, key=session.key, device=shop.device, max_seconds=session.max_seconds,
+            report=session.report,
+        )  # fmt: skip
+        return result.gaussians, result.progress
+
+    def write(self, product: BoundGaussians, path: Path, *, compact: bool = False) -> None:
+        save_bound(product, path)
+
+    def read(self, path: Path, shop: Workshop, get: Get) -> BoundGaussians:
+        rig = shop.sequence(self.ground).rig
+        return load_bound(path, faces=rig.template.faces).to(device=rig.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeacherPiece(Piece):
+    """A teacher on fitted Gaussians."""
+
+    gaussians: str
+    networks: TeacherConfig
+    config: FitTeacherConfig
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.gaussians,)
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[TeacherAvatar, Progress]:
+        return fit_teacher(shop.sequence(self.ground), get(self.gaussians), self.networks, self.config, session)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakePiece(Piece):
+    """A student before its blend shapes: field and attributes from a teacher, or from photographs.
+
+    Attributes:
+        teacher: name of the piece, None: photographs.
+    """
+
+    gaussians: str
+    teacher: str | None
+    student: StudentConfig
+    config: BakeConfig
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.gaussians,) if self.teacher is None else (self.gaussians, self.teacher)
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
+        teacher = None if self.teacher is None else get(self.teacher)
+        sequence = shop.sequence(self.ground)
+        return bake(sequence, get(self.gaussians), self.student, self.config, session, teacher=teacher)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompensatePiece(Piece):
+    """A baked student with trained blend shapes."""
+
+    student: str
+    shapes: BlendShapeConfig
+    config: CompensateConfig
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.student,)
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
+        sequence = shop.sequence(self.ground)
+        return compensate(sequence, get(self.student), fitting(self.shapes, sequence.rig), self.config, session)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrunedPiece(Piece):
+    """A student whose least important Gaussians lost their blend shapes.
+
+    Attributes:
+        keep: share of the Gaussians that keep theirs.
+    """
+
+    student: str
+    keep: float
+    seed = 0  # nothing is random
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.student,)
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, None]:
+        student, sequence = get(self.student), shop.sequence(self.ground)
+        shapes = student.blend_shapes
+        with torch.no_grad():
+            motions = [sequence.motion(frame) for frame in sequence.train_frames]
+            jaw = torch.stack([m.jaw for m in motions]) if shapes.config.jaw else None
+            z = shapes.coefficients(
+                torch.stack([m.expression for m in motions]), torch.stack([m.pose for m in motions]), jaw
+            )
+        pruned = shapes.pruned(z.std(dim=0, correction=0), keep=self.keep)
+        return student.with_blend_shapes(pruned).eval(), None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamePiece(Piece):
+    """A student that another piece has already made."""
+
+    student: str
+    seed = 0  # nothing is random
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.student,)
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, None]:
+        return get(self.student), None
+
+
+def fitting(shapes: BlendShapeConfig, rig: Rig) -> BlendShapeConfig:
+    """Blend shapes driven by as many expressions as the body has."""
+    return replace(shapes, expression_size=rig.expression_size)
+
+
+def reference_frame(capture: Capture, frame: int | None) -> int:
+    """The frame that Gaussians are fitted to: the first training frame, or another that has images.
+
+    Raises:
+        InputError: no image of it.
+    """
+    seen = np.array(capture.frames)[capture.presence().any(axis=0)].tolist()
+    chosen = capture.splits.train_frames[0] if frame is None else frame
+    if chosen not in seen:
+        raise InputError(
+            f"capture {capture.name}", expected=f"images of frame {chosen}", received=f"images of {len(seen)} others",
+            remedy="choose another reference frame with --frame",
+        )  # fmt: skip
+    return int(chosen)

@@ -1,0 +1,134 @@
+"""What the ablation's rows are, and the pieces that they are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from avatar.evaluation.ablation_pieces import (
+    CLOTHED,
+    NAKED,
+    BakePiece,
+    CompensatePiece,
+    FitPiece,
+    Piece,
+    PrunedPiece,
+    SamePiece,
+    TeacherPiece,
+)
+from avatar.models.student import StudentConfig
+from avatar.training.presets import TrainingPreset
+from smplxpp.core.errors import InputError
+
+LOCAL_PARTS = 64
+PRUNED_SHARE = 0.3
+CONTROL_POINTS = 400
+NULL_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        title: as tables have it. piece: that is measured. note: what is different, in words.
+        null_code: the avatar is driven by the null code in every frame.
+    """
+
+    title: str
+    piece: str
+    note: str
+    null_code: bool = False
+
+
+PAPER_ROWS: Mapping[str, Row] = {
+    "naked": Row("w SMPLX", "naked", "the whole pipeline on the naked body"),
+    "no-mesh": Row(
+        "w/o Mesh Non.",
+        "no_field",
+        "no field: Gaussians learn from the teacher on a mesh that follows its joints alone",
+    ),
+    "no-gaussians": Row("w/o Gau Non.", "bake", "the baked student without blend shapes"),
+    "no-teacher": Row("w/o Teacher", "no_teacher", "field and attributes learn from photographs by L_rec alone"),
+    "full": Row("Full", "full", "teacher, bake, blend shapes"),
+}
+OPTION_ROWS: Mapping[str, Row] = {
+    "local": Row("local blend shapes", "local", f"coefficients of their own for {LOCAL_PARTS} parts of the Gaussians"),
+    "pruned": Row(
+        "pruned", "pruned", f"Full; the most important {PRUNED_SHARE:.0%} of the Gaussians keep blend shapes"
+    ),
+    "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
+    "gated": Row("gated", "gated", "head shapes act on the head alone, body shapes on the rest"),
+    "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),
+}
+ROW_GROUPS: Mapping[str, Mapping[str, Row]] = {"paper": PAPER_ROWS, "options": OPTION_ROWS}
+ROWS: Mapping[str, Row] = {name: row for group in ROW_GROUPS.values() for name, row in group.items()}
+
+
+def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
+    """Rows by their names and those of groups ("paper", "options", "all"), in the table's order.
+
+    Raises:
+        InputError: an unknown name, or none.
+    """
+    chosen: set[str] = set()
+    for name in names:
+        if name in ROWS:
+            chosen.add(name)
+        elif name in ROW_GROUPS or name == "all":
+            chosen |= set(ROWS if name == "all" else ROW_GROUPS[name])
+        else:
+            raise InputError("ablation rows", expected=f"among {', '.join([*ROW_GROUPS, 'all', *ROWS])}", received=name)
+    if not chosen:
+        raise InputError("ablation rows", expected="at least one", received="none")
+    return {name: row for name, row in ROWS.items() if name in chosen}
+
+
+def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
+    """Every piece that rows may need, by name; a preset decides all sizes and iterations.
+
+    Args:
+        frame: that Gaussians are fitted to.
+    """
+    pieces: dict[str, Piece] = {}
+    student = preset.student()
+
+    def bake(name: str, *, student: StudentConfig = student, teacher: str | None = "teacher", **changes: float) -> None:
+        config = replace(preset.bake, **changes)
+        pieces[name] = BakePiece(gaussians="gaussians", teacher=teacher, student=student, config=config)
+
+    def compensate(name: str, baked: str, *, ground: str = CLOTHED, null: float = 0.0, **shapes: int) -> None:
+        pieces[name] = CompensatePiece(
+            ground=ground,
+            student=baked,
+            shapes=replace(preset.blend_shapes, **shapes),
+            config=replace(preset.compensate, null_share=max(preset.compensate.null_share, null)),
+        )
+
+    for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
+        fit = f"{prefix}gaussians"
+        pieces[fit] = FitPiece(ground=ground, config=replace(preset.fit, evaluations=1), frame=frame)
+        pieces[f"{prefix}teacher"] = TeacherPiece(
+            ground=ground, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher
+        )
+        pieces[f"{prefix}bake"] = BakePiece(
+            ground=ground, gaussians=fit, teacher=f"{prefix}teacher", student=student, config=preset.bake
+        )
+    compensate("full", "bake")
+    compensate("naked", "naked_bake", ground=NAKED)
+    bake("no_field_bake", student=replace(student, field=None, control_points=0))
+    compensate("no_field", "no_field_bake")
+    bake("no_teacher_bake", teacher=None)
+    compensate("no_teacher", "no_teacher_bake")
+
+    compensate("local", "bake", parts=LOCAL_PARTS)
+    compensate("gated", "bake", gated=True)
+    pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE)
+    bake("control_bake", student=replace(student, control_points=CONTROL_POINTS))
+    compensate("control", "control_bake")
+    if preset.bake.null_share and preset.compensate.null_share:
+        pieces["null_code"] = SamePiece(student="full")
+    else:
+        bake("null_code_bake", null_share=max(preset.bake.null_share, NULL_SHARE))
+        compensate("null_code", "null_code_bake", null=NULL_SHARE)
+    return pieces

@@ -1,0 +1,108 @@
+"""`smplxpp evaluate`: the models of a run measured on a capture; figures, tables, pictures and a report out."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from pipelines.commands.options import OptionalPath
+from pipelines.progress import counted_progress
+from smplxpp.core.errors import InputError, MissingExtraError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Options of `smplxpp evaluate`."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder with a template and trained models; the evaluation goes into it as 95_evaluate."""
+    capture: Path
+    """Folder of the capture: cameras, images, masks, body parameters; true meshes where it has them."""
+    models: tuple[Literal["reference-fit", "teacher", "baked", "student"], ...] = ()
+    """Which to measure; by default reference fit, teacher and student, as far as the run has them. baked: the student
+    before its blend shapes."""
+    sets: tuple[Literal["training", "novel_view", "novel_pose", "novel_pose_training_view"], ...] = ()
+    """Which views; by default all that the capture holds out something for, and training views."""
+    every: int = 4
+    """Every n-th frame of the training frames and of the held-out ones."""
+    hold_out: tuple[str, ...] = ()
+    """Cameras that count as held out, in the place of the capture's."""
+    hold_out_frames: tuple[int, ...] = ()
+    """Frames that count as held out, in the place of the capture's."""
+    params: OptionalPath = None
+    """Stacked body parameters to take instead of the capture's own, the same as for the training."""
+    body: OptionalPath = None
+    """SMPL-X-layout body file that the parameters are for; the open body by default."""
+    scale: float = 1.0
+    """Size of the images to compare, 1 for every pixel."""
+    metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
+    """Perceptual distance; lpips needs the package lpips."""
+    samples: int = 100_000
+    """Points of a mesh for its distance to the truth; 0 leaves the surface out."""
+    speed_size: tuple[int, int] = (512, 512)
+    """Width and height of the pictures that are timed."""
+    speed_pictures: int = 20
+    """Pictures that are timed; 0 leaves the speed out."""
+    shown: int = 2
+    """Views of each set to keep pictures of."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where it is."""
+    seed: int = 0
+    """Of the points on the surfaces."""
+    force: bool = False
+    """Measure anew even if the evaluation stands."""
+    no_report: bool = False
+    """Leave report.html as it is."""
+    json: bool = False
+    """Print the figures as JSON."""
+
+    def run(self) -> dict:
+        """Measure, write the report, print the tables."""
+        for package in ("torch", "safetensors"):
+            if find_spec(package) is None:
+                raise MissingExtraError(package, extra="avatar", purpose="evaluating avatars")
+        from avatar.evaluation.evaluate import EvaluationConfig
+        from avatar.evaluation.protocol import ProtocolConfig
+        from avatar.evaluation.report import EvalReport
+        from avatar.evaluation.summary import evaluation_tables
+        from avatar.training import choose_device
+        from pipelines.build_report import rewrite_report
+        from pipelines.evaluate_stage import REPORT_FILE, EvaluateInputs, evaluate
+
+        protocol = ProtocolConfig(
+            sets=self.sets, every=self.every, held_out_cameras=self.hold_out, held_out_frames=self.hold_out_frames
+        )
+        if min(self.speed_size) < 1:
+            raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
+        config = EvaluationConfig(
+            protocol=protocol, metric=self.metric, samples=self.samples, seed=self.seed, speed_size=self.speed_size,
+            speed_pictures=self.speed_pictures, shown=self.shown,
+        )  # fmt: skip
+        inputs = EvaluateInputs(self.capture, self.params, self.body, self.scale)
+        with counted_progress("frames", enabled=not self.json) as progress:
+            record = evaluate(
+                self.run_folder, inputs, config, models=self.models, device=choose_device(self.device),
+                force=self.force, progress=progress,
+            )  # fmt: skip
+        page = self.run_folder / "report.html"
+        if not self.no_report and (record.ran or not page.is_file()) and rewrite_report(self.run_folder) is None:
+            log.warning("the run does not say what it was built from: `smplxpp build` writes the report with it")
+        report = EvalReport.load(record.folder / REPORT_FILE)
+        if not self.json:
+            console = Console()
+            for table in evaluation_tables(report).values():
+                console.print(table.text(), highlight=False, soft_wrap=True)
+            console.print(f"{'' if record.ran else 'stands, not run again; '}tables  {record.folder / 'tables'}\n"
+                          f"views   {record.folder / 'pictures'}", soft_wrap=True, highlight=False)  # fmt: skip
+            if page.is_file():
+                console.print(f"report  {page}", soft_wrap=True, highlight=False)
+        return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran,
+                "checks": record.manifest["checks"]}  # fmt: skip

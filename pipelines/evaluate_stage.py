@@ -1,0 +1,273 @@
+"""Stage 95: reference fit, teacher and student measured on a capture; figures, tables and pictures."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
+from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
+from avatar.evaluation.summary import evaluation_tables, summary_figures
+from avatar.gaussians.bound_file import load_bound
+from avatar.models.model_file import load_avatar
+from avatar.models.posed import AvatarModel
+from avatar.models.rig import Rig
+from avatar.models.student import Student, StudentConfig
+from avatar.training import read_views
+from avatar.training.sequence import AvatarSequence
+from pipelines.build_config import FIT_STAGE, TEMPLATE
+from pipelines.evaluate_pictures import surface_picture, write_tiles
+from pipelines.fit_stage import silhouette_overlap
+from pipelines.pictures import encode_png
+from pipelines.run_folder import own_run_folder
+from smplxpp.body import load_body
+from smplxpp.capture import Capture, open_capture
+from smplxpp.core.artifact import Check, StageOutput, StageRecord, code_digest, run_stage, sha256_file
+from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.template import Template
+
+EVALUATE_STAGE = "95_evaluate"
+REPORT_FILE = "metrics.json"
+REFERENCE_FIT, TEACHER, BAKED, STUDENT = "reference-fit", "teacher", "baked", "student"
+MODEL_FILES: Mapping[str, str] = {
+    REFERENCE_FIT: f"{FIT_STAGE}/gaussians.safetensors",
+    TEACHER: "80_teacher/teacher.safetensors",
+    BAKED: "85_bake/student.safetensors",
+    STUDENT: "90_compensate/student.safetensors",
+}
+"""Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
+MEASURED = (REFERENCE_FIT, TEACHER, STUDENT)
+"""Those that are measured where nothing else is asked for, as far as a run has them."""
+CHECKED_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class EvaluateInputs:
+    """What an evaluation looks at.
+
+    Attributes:
+        capture: folder of any known layout.
+        params: other parameters than the capture's own. body: what they are for, None for the open body.
+        scale: of the images, 1 for all pixels.
+    """
+
+    capture: Path
+    params: Path | None = None
+    body: Path | None = None
+    scale: float = 1.0
+
+
+def evaluate(
+    run: Path,
+    inputs: EvaluateInputs,
+    config: EvaluationConfig,
+    *,
+    models: tuple[str, ...] = (),
+    device: str = "cpu",
+    force: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StageRecord:
+    """Measure the models of a run on a capture; skipped while models, capture, code and configuration stand.
+
+    Args:
+        models: names among `MODEL_FILES`; empty: `MEASURED`, as far as there are files.
+        force: measure anew even if the stage stands.
+        progress: called with frames done and all frames.
+
+    Raises:
+        InputError: no template, no trained model, a model of another template; a capture that lacks views, masks or
+            parameters, or in whose images the template does not stand.
+    """
+    if not (run / TEMPLATE).is_file():
+        raise InputError(
+            f"run {run}", expected=f"a template, {TEMPLATE}", received="none",
+            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+        )  # fmt: skip
+    files = model_files(run, models)
+    template = Template.load(run / TEMPLATE)
+    capture = _open(inputs)
+    sets = with_people(capture, view_sets(capture, config.protocol))
+    overlap = _overlap(template, capture, sets)
+    sequence = AvatarSequence(capture, template, device=device)
+    loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
+    digests = {
+        TEMPLATE: sha256_file(run / TEMPLATE),
+        **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
+        **_capture_digests(capture, config.protocol, sets),
+        "code": code_digest("smplxpp", "avatar"),
+        "torch": version("torch"),
+    }
+    with own_run_folder(run, (EVALUATE_STAGE, "report")):
+        return run_stage(
+            run,
+            EVALUATE_STAGE,
+            lambda folder: _write(
+                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), overlap
+            ),
+            config={"evaluation": config, "scale": inputs.scale, "device": device},
+            inputs=digests,
+            seed=config.seed,
+            force=force,
+        )
+
+
+def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
+    """Files of the models of a run, in the order of `MODEL_FILES`.
+
+    Args:
+        names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
+
+    Raises:
+        InputError: an unknown name, a model that is asked for and not trained, no teacher and no student.
+    """
+    there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
+    asked = list(names)
+    unknown = [name for name in asked if name not in MODEL_FILES]
+    if unknown:
+        raise InputError("models", expected=f"among {', '.join(MODEL_FILES)}", received=", ".join(unknown))
+    missing = [name for name in asked if name not in there]
+    untrained = not asked and not there.keys() & {TEACHER, BAKED, STUDENT}
+    if missing or untrained:
+        fit_alone = missing == [REFERENCE_FIT]
+        raise InputError(
+            f"run {run}",
+            expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
+            received=f"only {', '.join(there)}" if there else "no model",
+            remedy=f"`smplxpp {'fit-reference' if fit_alone else 'train'}` makes it; a training under way is measured "
+            "when its stage is finished",
+        )  # fmt: skip
+    wanted = asked or (*MEASURED, *(() if STUDENT in there else (BAKED,)))
+    return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
+
+
+def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
+    """A model of a run; the reference fit is a student without field and blend shapes.
+
+    Raises:
+        InputError: a damaged file, one of another template or of a newer version.
+    """
+    if name != REFERENCE_FIT:
+        return load_avatar(path, rig)
+    return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
+
+
+def _open(inputs: EvaluateInputs) -> Capture:
+    if not 0.0 < inputs.scale <= 1.0:
+        raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
+    body = None if inputs.body is None else load_body(inputs.body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)
+
+
+def _overlap(template: Template, capture: Capture, sets: Mapping[str, ViewSet]) -> float:
+    """Mean overlap of the skinned template's silhouette and masks over a few views of the first set.
+
+    Raises:
+        InputError: so little that template and capture do not belong together.
+    """
+    values = []
+    for camera, frame in next(iter(sets.values())).spread(CHECKED_VIEWS):
+        posed = template.mesh.with_vertices(template.pose(capture.params(frame))[0])
+        values.append(silhouette_overlap(posed, read_views(capture, frame, [camera])))
+    return float(np.mean(values))
+
+
+def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
+    """Figures, tables and pictures of an evaluation as files; what the manifest says of it."""
+    found.report.save(folder / REPORT_FILE)
+    for name, table in evaluation_tables(found.report).items():
+        for ending, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label=f"tab:{name}"))):
+            atomic_write_text(folder / "tables" / f"{name}.{ending}", text)
+    shown = []
+    for view in found.views:
+        file = f"pictures/{view.set}_{view_key(view.camera, view.frame)}.png"
+        write_tiles(folder / file, view.truth, list(view.rendered.values()))
+        shown.append({"file": file, "set": view.set, "camera": view.camera, "frame": view.frame, "head": view.head,
+                      "models": list(view.rendered)})  # fmt: skip
+    surfaces = []
+    for surface in found.surfaces:
+        file = f"pictures/surface_{surface.set}_{surface.frame:06d}.png"
+        atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
+        surfaces.append({"file": file, "set": surface.set, "frame": surface.frame, "meshes": list(surface.posed)})
+    numbers = {
+        "metric": found.report.metric,
+        "models": {name: summary_figures(model) for name, model in found.report.models.items()},
+        "shown": shown,
+        "surfaces": surfaces,
+    }
+    return StageOutput(_checks(found.report, overlap), numbers)
+
+
+def _checks(report: EvalReport, overlap: float) -> list[Check]:
+    checks = [
+        Check("template's silhouette on the masks", overlap, "IoU", 0.95, 0.8, higher_is_better=True,
+              explanation="skinning alone; low: another person, another pose, or other cameras")
+    ]  # fmt: skip
+    name = next((name for name in (STUDENT, BAKED, TEACHER) if name in report.models), None)
+    if name is None:
+        return checks
+    best = report.models[name]
+    for part, title, warn, fail in (
+        ("novel_view", "novel views", 22.0, 16.0),
+        ("novel_pose", "novel poses", 20.0, 15.0),
+    ):
+        if part in best.views:
+            checks.append(
+                Check(f"{name}, {title}: PSNR of the person", best.mean(part)["psnr"], "dB", warn, fail,
+                      higher_is_better=True)
+            )  # fmt: skip
+            if name != TEACHER and TEACHER in report.models:
+                gain = best.mean(part)["psnr"] - report.models[TEACHER].mean(part)["psnr"]
+                checks.append(
+                    Check(f"{name} against its teacher, {title}", gain, "dB", -0.3, -2.0, higher_is_better=True)
+                )
+    for part, title in SURFACE_SETS.items():
+        if part not in best.surfaces or name == TEACHER:
+            continue
+        own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
+        for label in CLOTH_LABELS:
+            if label.name in own and label.name in alone and own[label.name].p2s and alone[label.name].p2s:
+                share = own[label.name].p2s / alone[label.name].p2s
+                checks.append(
+                    Check(f"P2S of {label.name} against skinning alone, {title}", share, "x", 1.0, 1.5,
+                          explanation="below 1: the mesh that the field moves is nearer to the truth")
+                )  # fmt: skip
+    return checks
+
+
+def _capture_digests(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> dict[str, str]:
+    """SHA-256 of all that is read of the capture, by kind."""
+    pairs = sorted({pair for one in sets.values() for pair in one.views})
+    truths = truth_frames(capture, protocol, sets)
+    frames = sorted({frame for _, frame in pairs} | {frame for found in truths.values() for frame in found})
+    parts: dict[str, list[Any]] = {"images": [], "masks": [], "cameras": [], "params": [], "surfaces": []}
+    for camera, frame in pairs:
+        for kind in ("image", "mask"):
+            path = capture.file(camera, frame, kind)
+            parts[f"{kind}s"].append((camera, frame, None if path is None else sha256_file(path)))
+    for name in sorted({camera for camera, _ in pairs}):
+        parts["cameras"] += [capture.cameras[name].K, capture.cameras[name].cam_from_world]
+    for frame in frames:
+        params = capture.params(frame)
+        parts["params"] += [] if params is None else list(params.as_dict().values())
+    for found in truths.values():
+        for frame in found:
+            mesh = capture.truth_mesh(frame)
+            parts["surfaces"] += [mesh.vertices, mesh.faces]
+    return {f"capture/{name}": _sha256(values) for name, values in parts.items()}
+
+
+def _sha256(values: Iterable[Any]) -> str:
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return digest.hexdigest()
