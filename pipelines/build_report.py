@@ -8,6 +8,8 @@ import numpy as np
 
 from pipelines.arrays import load_arrays
 from pipelines.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs, load_build
+from pipelines.evaluate_config import EVALUATE_STAGE
+from pipelines.evaluate_report import evaluation_key_numbers, evaluation_sections, standing_evaluation
 from pipelines.fit_report import fit_key_numbers, fit_section, standing_fit
 from pipelines.pictures import (
     blend_joint_colors,
@@ -37,10 +39,11 @@ ERROR_LIMIT_MM = 6.0
 
 
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
-    """Write `run/report.html` from the files of a finished run, with the fit of its template where there is one."""
-    fit = standing_fit(run, records["60_assemble"].manifest["files"]["smplxpp.npz"])
-    if fit is not None:
-        records = {**records, FIT_STAGE: fit}
+    """Write `run/report.html` from a finished run, with the fit and the evaluation of its template, if any."""
+    template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
+    fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
+    later = {FIT_STAGE: fit, EVALUATE_STAGE: evaluation}
+    records = {**records, **{name: record for name, record in later.items() if record is not None}}
     template = Template.load(run / "60_assemble" / "smplxpp.npz")
     reference = load_params_of_run(run)
     checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
@@ -57,6 +60,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
         _poses_section(template, reference, inputs),
         *(() if fit is None else (fit_section(fit),)),
+        *(() if evaluation is None else evaluation_sections(evaluation)),
     )  # fmt: skip
     clothes = records["65_validate"].manifest["numbers"]["template_vs_scan"]["labels"]
     key_numbers = [
@@ -73,6 +77,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
             "scan to template", f"{sum(seconds[name] for name in STAGES):.1f} s", "all stages, validation included"
         ),
         *(() if fit is None else fit_key_numbers(fit)),
+        *(() if evaluation is None else evaluation_key_numbers(evaluation)),
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
     front = body_cameras(posed, views=("front",), height=HEIGHT)[0]

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pipelines.evaluate_config import SURFACE_LIMIT_MM
 from pipelines.fit_pictures import error_colors
 from pipelines.pictures import body_cameras, caption, encode_png, render_heat, row
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.metrics import point_to_surface
 
-SURFACE_LIMIT_MM = 40.0
-"""Distance that the colours of posed meshes end at."""
 SURFACE_HEIGHT = 480
 
 

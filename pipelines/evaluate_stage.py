@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
-from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.protocol import SETS, ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.gaussians.bound_file import load_bound
@@ -22,7 +22,18 @@ from avatar.models.rig import Rig
 from avatar.models.student import Student, StudentConfig
 from avatar.training import read_views
 from avatar.training.sequence import AvatarSequence
-from pipelines.build_config import FIT_STAGE, TEMPLATE
+from pipelines.build_config import TEMPLATE
+from pipelines.evaluate_config import (
+    BAKED,
+    BEST_FIRST,
+    EVALUATE_STAGE,
+    MEASURED,
+    MODEL_FILES,
+    REFERENCE_FIT,
+    REPORT_FILE,
+    STUDENT,
+    TEACHER,
+)
 from pipelines.evaluate_pictures import surface_picture, write_tiles
 from pipelines.fit_stage import silhouette_overlap
 from pipelines.pictures import encode_png
@@ -35,18 +46,6 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.template import Template
 
-EVALUATE_STAGE = "95_evaluate"
-REPORT_FILE = "metrics.json"
-REFERENCE_FIT, TEACHER, BAKED, STUDENT = "reference-fit", "teacher", "baked", "student"
-MODEL_FILES: Mapping[str, str] = {
-    REFERENCE_FIT: f"{FIT_STAGE}/gaussians.safetensors",
-    TEACHER: "80_teacher/teacher.safetensors",
-    BAKED: "85_bake/student.safetensors",
-    STUDENT: "90_compensate/student.safetensors",
-}
-"""Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
-MEASURED = (REFERENCE_FIT, TEACHER, STUDENT)
-"""Those that are measured where nothing else is asked for, as far as a run has them."""
 CHECKED_VIEWS = 3
 
 
@@ -182,29 +181,32 @@ def _overlap(template: Template, capture: Capture, sets: Mapping[str, ViewSet]) 
 
 
 def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
-    """Figures, tables and pictures of an evaluation as files; what the manifest says of it."""
-    found.report.save(folder / REPORT_FILE)
-    for name, table in evaluation_tables(found.report).items():
+    """Figures, tables and pictures of an evaluation as files; what the manifest and the report say of it."""
+    report = found.report
+    report.save(folder / REPORT_FILE)
+    tables = evaluation_tables(report)
+    for name, table in tables.items():
         for ending, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label=f"tab:{name}"))):
             atomic_write_text(folder / "tables" / f"{name}.{ending}", text)
-    shown = []
+    views, surfaces = [], []
     for view in found.views:
         file = f"pictures/{view.set}_{view_key(view.camera, view.frame)}.png"
         write_tiles(folder / file, view.truth, list(view.rendered.values()))
-        shown.append({"file": file, "set": view.set, "camera": view.camera, "frame": view.frame, "head": view.head,
-                      "models": list(view.rendered)})  # fmt: skip
-    surfaces = []
+        views.append({"file": file, "set": view.set, "title": f"{SETS[view.set]}, {view.camera}, frame {view.frame}",
+                      "head": view.head})  # fmt: skip
     for surface in found.surfaces:
         file = f"pictures/surface_{surface.set}_{surface.frame:06d}.png"
         atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
-        surfaces.append({"file": file, "set": surface.set, "frame": surface.frame, "meshes": list(surface.posed)})
+        title = f"{SURFACE_SETS[surface.set]}, frame {surface.frame}: distance to the true surface"
+        surfaces.append({"file": file, "title": title})
     numbers = {
-        "metric": found.report.metric,
-        "models": {name: summary_figures(model) for name, model in found.report.models.items()},
-        "shown": shown,
+        "models": {name: summary_figures(model) for name, model in report.models.items()},
+        "conventions": report.conventions,
+        "tables": [{"caption": t.caption, "header": t.header(), "rows": t.cells()} for t in tables.values()],
+        "views": views,
         "surfaces": surfaces,
     }
-    return StageOutput(_checks(found.report, overlap), numbers)
+    return StageOutput(_checks(report, overlap), numbers)
 
 
 def _checks(report: EvalReport, overlap: float) -> list[Check]:
@@ -212,7 +214,7 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
         Check("template's silhouette on the masks", overlap, "IoU", 0.95, 0.8, higher_is_better=True,
               explanation="skinning alone; low: another person, another pose, or other cameras")
     ]  # fmt: skip
-    name = next((name for name in (STUDENT, BAKED, TEACHER) if name in report.models), None)
+    name = next((name for name in BEST_FIRST if name in report.models), None)
     if name is None:
         return checks
     best = report.models[name]

@@ -62,6 +62,10 @@ class FigureTable:
         known = tuple(c for c in self.columns if any(row.get(c.key) is not None for row in self.rows.values()))
         object.__setattr__(self, "columns", known)
 
+    def header(self) -> list[str]:
+        """Titles, each with its group, for a table without groups."""
+        return [self.row_title, *(f"{c.group}: {c.title}" if c.group else c.title for c in self.columns)]
+
     def cells(self) -> list[list[str]]:
         """Names and figures as shown, a list a row."""
         return [[name, *(c.shown(row.get(c.key)) for c in self.columns)] for name, row in self.rows.items()]

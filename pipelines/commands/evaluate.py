@@ -75,7 +75,8 @@ class Evaluate:
         from avatar.evaluation.summary import evaluation_tables
         from avatar.training import choose_device
         from pipelines.build_report import rewrite_report
-        from pipelines.evaluate_stage import REPORT_FILE, EvaluateInputs, evaluate
+        from pipelines.evaluate_config import REPORT_FILE
+        from pipelines.evaluate_stage import EvaluateInputs, evaluate
 
         protocol = ProtocolConfig(
             sets=self.sets, every=self.every, held_out_cameras=self.hold_out, held_out_frames=self.hold_out_frames
