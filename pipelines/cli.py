@@ -34,10 +34,20 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "FitReference",
         "a built template and one frame's photographs in; textured Gaussians on it and their figures out",
     ),
+    "train": (
+        "pipelines.commands.train",
+        "Train",
+        "a capture and a built template in; a teacher and the compact student that runs anywhere out",
+    ),
     "evaluate": (
         "pipelines.commands.evaluate",
         "Evaluate",
         "a run's models on held-out views and poses: image and surface figures, speed, size, tables, pictures",
+    ),
+    "ablate": (
+        "pipelines.commands.ablate",
+        "Ablate",
+        "variants of the avatar trained on one capture, measured by one protocol, in one table",
     ),
     "animate": (
         "pipelines.commands.animate",
@@ -108,7 +118,7 @@ def _run(name: str, args: list[str]) -> int:
         config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
     result = command.run()
-    if getattr(command, "json", False):
+    if getattr(command, "json", False) and result is not None:
         sys.stdout.write(json.dumps(jsonable(result), indent=1) + "\n")
     return int(result.get("exit_status", 0)) if isinstance(result, dict) else 0
 

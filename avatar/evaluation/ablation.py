@@ -247,8 +247,13 @@ class WithoutCode(nn.Module):
 def ablation_table(result: AblationResult) -> FigureTable:
     """One line a row: novel views, novel poses, distances to the true surface, bytes and time of training."""
     metric, capture = (result.report.metric or "", result.report.capture) if result.rows else ("", "")
+    shown = [
+        name
+        for name in SETS
+        if any(name in one.views for r in result.rows.values() for one in r.report.models.values())
+    ]
     columns = []
-    for name in ("novel_view", "novel_pose"):
+    for name in shown:
         columns += [
             Column(f"{name}.psnr", "PSNR", SETS[name], 2, "higher"),
             Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),

@@ -113,15 +113,11 @@ class FitPiece(Piece):
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[BoundGaussians, Progress]:
         sequence = shop.sequence(self.ground)
-        params = shop.capture.params(self.frame)
-        if params is None:
-            raise InputError(
-                f"capture {shop.capture.name}", expected=f"body parameters of frame {self.frame}", received="none",
-                remedy="choose another reference frame with --frame",
-            )  # fmt: skip
         template = sequence.rig.template
         views = read_views(shop.capture, self.frame, sequence.train_cameras)
-        scene = FitScene(template, template.pose(params)[0], views, (), tuple(sequence.background.tolist()))
+        scene = FitScene(
+            template, template.pose(shop.capture.params(self.frame))[0], views, (), tuple(sequence.background.tolist())
+        )
         result = fit_reference(
             scene, self.config, session.folder, key=session.key, device=shop.device, max_seconds=session.max_seconds,
             report=session.report,

@@ -46,7 +46,7 @@ PAPER_ROWS: Mapping[str, Row] = {
     "no-mesh": Row(
         "w/o Mesh Non.",
         "no_field",
-        "no field: Gaussians learn from the teacher on a mesh that follows its joints alone",
+        "no field: the mesh follows its joints alone, Gaussians learn from the teacher",
     ),
     "no-gaussians": Row("w/o Gau Non.", "bake", "the baked student without blend shapes"),
     "no-teacher": Row("w/o Teacher", "no_teacher", "field and attributes learn from photographs by L_rec alone"),
@@ -54,9 +54,7 @@ PAPER_ROWS: Mapping[str, Row] = {
 }
 OPTION_ROWS: Mapping[str, Row] = {
     "local": Row("local blend shapes", "local", f"coefficients of their own for {LOCAL_PARTS} parts of the Gaussians"),
-    "pruned": Row(
-        "pruned", "pruned", f"Full; the most important {PRUNED_SHARE:.0%} of the Gaussians keep blend shapes"
-    ),
+    "pruned": Row("pruned", "pruned", f"Full, blend shapes left to the most important {PRUNED_SHARE:.0%} of Gaussians"),
     "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
     "gated": Row("gated", "gated", "head shapes act on the head alone, body shapes on the rest"),
     "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),

@@ -1,0 +1,240 @@
+"""The ablation of a run: `RUN/ablation/` with a folder a trained piece, the table, and the rows beside each other."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from avatar.evaluation.ablation import (
+    ROWS_FOLDER,
+    Ablation,
+    AblationResult,
+    Observer,
+    ablation_table,
+    row_figures,
+    unfinished,
+)
+from avatar.evaluation.ablation_pieces import Workshop, reference_frame
+from avatar.evaluation.ablation_plan import Row, ablation_pieces
+from avatar.evaluation.evaluate import Evaluation, EvaluationConfig
+from avatar.evaluation.image import load_metric
+from avatar.evaluation.report import view_key
+from avatar.evaluation.tables import FigureTable
+from avatar.training.loop import Progress
+from avatar.training.presets import TrainingPreset
+from avatar.training.views import read_views
+from pipelines.build_config import TEMPLATE
+from pipelines.fit_stage import silhouette_overlap
+from pipelines.pictures import caption, encode_png, row
+from pipelines.run_folder import own_run_folder
+from smplxpp.body import load_body
+from smplxpp.capture import Capture, open_capture
+from smplxpp.core.artifact import jsonable, sha256_file
+from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.errors import InputError
+from smplxpp.core.template import Template
+
+ABLATION = "ablation"
+PICTURES = "pictures"
+RESULTS_FILE = "results.json"
+
+
+@dataclass(frozen=True)
+class AblationInputs:
+    """What an ablation reads.
+
+    Attributes:
+        capture: folder of any known layout. params: other parameters than its own. body: what they are for.
+        frame: that Gaussians are fitted to, None: the first training frame.
+        scale: of the images, 1 for all pixels.
+    """
+
+    capture: Path
+    params: Path | None = None
+    body: Path | None = None
+    frame: int | None = None
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class AblationRun:
+    """How it runs; nothing in it changes a figure.
+
+    Attributes:
+        device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' pieces anew.
+        training: called with the name of a piece and its progress. measuring: with a row, frames done, all frames.
+    """
+
+    device: str = "cpu"
+    max_seconds: float = math.inf
+    force: bool = False
+    training: Callable[[str, Progress], None] = lambda name, progress: None
+    measuring: Callable[[str, int, int], None] = lambda name, done, total: None
+
+
+@dataclass(frozen=True)
+class AblationOutcome:
+    """What there is after a call.
+
+    Attributes:
+        folder: `RUN/ablation`. table: of the finished rows. results: as in `results.json`.
+        waiting: pieces that are still to be trained; none when all is finished.
+    """
+
+    folder: Path
+    table: FigureTable
+    results: dict[str, Any]
+    waiting: list[str] = field(default_factory=list)
+
+
+def ablate(
+    run: Path,
+    inputs: AblationInputs,
+    rows: Mapping[str, Row],
+    preset: TrainingPreset,
+    config: EvaluationConfig,
+    how: AblationRun | None = None,
+) -> AblationOutcome:
+    """Train and measure rows on a capture with a run's template; what stands is not done again.
+
+    Raises:
+        InputError: no template, or a capture that cannot be trained or measured on.
+    """
+    how = how or AblationRun()
+    template_file = run / TEMPLATE
+    if not template_file.is_file():
+        raise InputError(
+            f"run {run}", expected=f"a template, {TEMPLATE}", received="none",
+            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+        )  # fmt: skip
+    template, capture = Template.load(template_file), _open(inputs)
+    frame, config = reference_frame(capture, inputs.frame), _measured(config, capture)
+    _require_person(template, capture, frame)
+    folder = run / ABLATION
+    weights = (preset.teacher.weights, preset.bake.weights, preset.compensate.weights)
+    perceptual = load_metric(config.metric, device=how.device) if any(w.perceptual for w in weights) else None
+    with own_run_folder(folder, (RESULTS_FILE,)):
+        ablation = Ablation(
+            Workshop(capture, template, how.device),
+            ablation_pieces(preset, frame=frame),
+            folder,
+            inputs={TEMPLATE: sha256_file(template_file), "capture": capture_digest(capture)},
+            perceptual=perceptual,
+        )
+        if how.force:
+            ablation.forget(rows)
+        observer = Observer(how.training, how.measuring, lambda name, found: _keep_pictures(folder, name, found))
+        result = ablation.run(rows, config, max_seconds=how.max_seconds, observer=observer)
+        waiting = unfinished(ablation, rows, result.waiting)
+        return _write(folder, result, {"preset": preset, "scale": inputs.scale}, waiting)
+
+
+def capture_digest(capture: Capture) -> str:
+    """SHA-256 of cameras, splits and parameters, and of the names and sizes of all images and masks.
+
+    Their content is not read: a capture may be of terabytes.
+    """
+    digest = hashlib.sha256()
+    splits = capture.splits
+    digest.update(json.dumps(jsonable(splits), sort_keys=True).encode())
+    for name, camera in capture.cameras.items():
+        digest.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
+    for frame in capture.frames:
+        params = capture.params(frame)
+        if params is not None:
+            digest.update(b"".join(np.ascontiguousarray(v).tobytes() for v in vars(params).values() if v is not None))
+    for camera, frame in capture.views():
+        for kind in ("image", "mask"):
+            path = capture.file(camera, frame, kind)
+            if path is not None:
+                digest.update(f"{camera} {frame} {kind} {path.name} {path.stat().st_size}\n".encode())
+    return digest.hexdigest()
+
+
+def _open(inputs: AblationInputs) -> Capture:
+    if not 0.0 < inputs.scale <= 1.0:
+        raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
+    body = None if inputs.body is None else load_body(inputs.body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)
+
+
+def _require_person(template: Template, capture: Capture, frame: int) -> None:
+    """Raise `InputError` unless the template stands in the images of the reference frame."""
+    params = capture.params(frame)
+    if params is None:
+        raise InputError(
+            f"capture {capture.name}", expected=f"body parameters of frame {frame}", received="none",
+            remedy="choose another reference frame with --frame, or name a file with --params",
+        )  # fmt: skip
+    views = read_views(capture, frame, [camera for camera, _ in capture.views(frames=[frame])])
+    silhouette_overlap(template.mesh.with_vertices(template.pose(params)[0]), views)
+
+
+def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:
+    """Novel views and novel poses where the capture holds any out; all that there is where it does not."""
+    splits = capture.splits
+    if config.protocol.sets or not splits.novel_view_cameras:
+        return config
+    sets = ("novel_view", "novel_pose") if splits.novel_pose_frames else ("novel_view",)
+    return replace(config, protocol=replace(config.protocol, sets=sets))
+
+
+def _keep_pictures(folder: Path, name: str, evaluation: Evaluation) -> None:
+    """Photograph and rendering of every shown view side by side, for the rows' strips."""
+    for view in evaluation.views:
+        (rendered,) = view.rendered.values()
+        path = folder / ROWS_FOLDER / name / PICTURES / f"{view.set}_{view_key(view.camera, view.frame)}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(path, encode_png(np.concatenate([view.truth, rendered], axis=1)))
+
+
+def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiting: list[str]) -> AblationOutcome:
+    """Table, figures and strips of the finished rows."""
+    table = ablation_table(result)
+    rows = {
+        name: {"title": one.row.title, "note": one.row.note, "figures": row_figures(one), "seconds": one.seconds}
+        for name, one in result.rows.items()
+    }
+    results = jsonable({
+        **about,
+        "rows": rows,
+        "waiting": waiting,
+        "evaluation": result.report.as_dict() if result.rows else None,
+    })  # fmt: skip
+    if result.rows:
+        for suffix, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label="tab:ablation"))):
+            atomic_write_text(folder / f"table.{suffix}", text)
+        _write_strips(folder, result)
+    atomic_write_text(folder / RESULTS_FILE, json.dumps(results, indent=1))
+    return AblationOutcome(folder, table, results, waiting)
+
+
+def _write_strips(folder: Path, result: AblationResult) -> None:
+    """A strip a view: the photograph, then what each row shows, under their titles."""
+    first = next(iter(result.rows))
+    for path in sorted((folder / ROWS_FOLDER / first / PICTURES).glob("*.png")):
+        pictures = []
+        for name, one in result.rows.items():
+            pair = folder / ROWS_FOLDER / name / PICTURES / path.name
+            if not pair.is_file():
+                continue
+            photograph, rendered = np.split(_read(pair), 2, axis=1)
+            if not pictures:
+                pictures.append(caption(photograph, "photograph"))
+            pictures.append(caption(rendered, one.row.title))
+        (folder / PICTURES).mkdir(exist_ok=True)
+        atomic_write_bytes(folder / PICTURES / path.name, encode_png(row(pictures, gap=4)))
+
+
+def _read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))

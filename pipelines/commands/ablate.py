@@ -1,0 +1,154 @@
+"""`smplxpp ablate`: variants of the avatar trained on one capture, measured by one protocol, in one table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from pipelines.commands.options import OptionalInt, OptionalPath
+from smplxpp.core.errors import InputError, MissingExtraError
+
+if TYPE_CHECKING:
+    from avatar.training import Progress as TrainingProgress
+    from avatar.training.presets import TrainingPreset
+    from pipelines.ablate_stage import AblationOutcome
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Options of `smplxpp ablate`. The same command goes on with an ablation that was interrupted."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Folder that `smplxpp build` wrote; the ablation goes into RUN/ablation."""
+    capture: Path
+    """Folder of the capture: cameras, images, masks and body parameters."""
+    preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
+    """Sizes and iterations of all rows, as for `smplxpp train`."""
+    rows: tuple[str, ...] = ("paper",)
+    """Rows by name, or groups of them: paper, options, baselines, all. See docs/ablation.md."""
+    iterations_share: float = 1.0
+    """Share of the preset's iterations of every training: 0.25 is a quarter of the time, and less good."""
+    gaussians: OptionalInt = None
+    """Number of Gaussians, in the place of the preset's."""
+    scale: float = 1.0
+    """Size of the images to train and measure on, 1 for every pixel."""
+    every: int = 4
+    """Measure every n-th frame."""
+    metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
+    """Perceptual distance to measure, and to train with where the preset does."""
+    frame: OptionalInt = None
+    """Frame that Gaussians are fitted to; the first training frame by default."""
+    params: OptionalPath = None
+    """Stacked body parameters to take instead of the capture's own, the same as for the build."""
+    body: OptionalPath = None
+    """SMPL-X-layout body file that the parameters are for; the open body by default."""
+    max_minutes: float = math.inf
+    """Stop after as many minutes and print the rows that are finished; the same command then goes on."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where it is."""
+    seed: int = 0
+    """Of everything random."""
+    force: bool = False
+    """Train the rows anew even if they stand."""
+    json: bool = False
+    """Print the results as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Train, measure, write and print the table."""
+        for package in ("torch", "safetensors"):
+            if find_spec(package) is None:
+                raise MissingExtraError(package, extra="avatar", purpose="training avatars")
+        from avatar.evaluation.ablation_plan import ablation_rows
+        from avatar.evaluation.evaluate import EvaluationConfig
+        from avatar.evaluation.protocol import ProtocolConfig
+        from avatar.training import choose_device
+        from pipelines.ablate_stage import AblationInputs, AblationRun, ablate
+
+        for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
+            if not value > 0:
+                raise InputError(f"option {name}", expected="a number above 0", received=f"{value:g}")
+        rows, preset = ablation_rows(self.rows), self.training()
+        config = EvaluationConfig(protocol=ProtocolConfig(every=self.every), metric=self.metric, speed_pictures=0)
+        with _progress(enabled=not self.json) as (training, measuring):
+            outcome = ablate(
+                self.run_folder,
+                AblationInputs(self.capture, self.params, self.body, self.frame, self.scale),
+                rows, preset, config,
+                AblationRun(choose_device(self.device), 60.0 * self.max_minutes, self.force, training, measuring),
+            )  # fmt: skip
+        if not self.json:
+            _print(outcome)
+        return outcome.results
+
+    def training(self) -> TrainingPreset:
+        """The preset with the options' changes.
+
+        Raises:
+            InputError: numbers out of range.
+        """
+        from dataclasses import replace
+
+        from avatar.training.presets import training_preset
+
+        preset = training_preset(self.preset)
+        if self.iterations_share != 1.0:
+            preset = preset.shortened(self.iterations_share)
+        if self.seed < 0:
+            raise InputError("option seed", expected="a number, at least 0", received=str(self.seed))
+        preset = preset.seeded(self.seed)
+        if self.gaussians is not None:
+            sampling = replace(preset.fit.sampling, count=self.gaussians)
+            preset = replace(preset, fit=replace(preset.fit, sampling=sampling))
+        return preset
+
+
+Training = Callable[[str, "TrainingProgress"], None]
+Measuring = Callable[[str, int, int], None]
+
+
+@contextmanager
+def _progress(*, enabled: bool) -> Iterator[tuple[Training, Measuring]]:
+    """A bar a piece with loss, held-out PSNR and speed, and one while a row is measured."""
+    columns = (
+        TextColumn("{task.description:<18}"), BarColumn(bar_width=10), MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    tasks: dict[str, Any] = {}
+    quality: dict[str, str] = {}
+    with Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0) as bar:
+
+        def task(name: str, total: int) -> Any:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name, total=total, figures="")
+            return tasks[name]
+
+        def training(name: str, state: TrainingProgress) -> None:
+            if state.evaluation is not None and "psnr" in state.evaluation["mean"]:
+                quality[name] = f"PSNR {state.evaluation['mean']['psnr']:.2f} dB"
+            figures = [f"loss {state.metrics['loss']:.4f}"] if "loss" in state.metrics else []
+            figures += [f"{state.rate:.1f} it/s"] if state.rate else []
+            figures += [quality[name]] if name in quality else []
+            bar.update(task(name, state.iterations), completed=state.iteration, figures="  ".join(figures))
+
+        def measuring(name: str, done: int, total: int) -> None:
+            bar.update(task(f"measuring {name}", total), completed=done)
+
+        yield training, measuring
+
+
+def _print(outcome: AblationOutcome) -> None:
+    console = Console()
+    if outcome.results["rows"]:
+        console.print(outcome.table.text(), soft_wrap=True, highlight=False)
+    if outcome.waiting:
+        console.print(f"still to train: {', '.join(outcome.waiting)}; the same command goes on", soft_wrap=True)
+    console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False)
