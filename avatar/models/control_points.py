@@ -58,10 +58,10 @@ def choose_control_points(
     chosen: list[np.ndarray] = []
     neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
     weights = np.zeros((len(vertices), neighbour_count))
-    before = 0
+    before, shares = 0, _shares(np.bincount(group), count)
     for k in range(len(names)):
         members = np.flatnonzero(group == k)
-        share = min(len(members), max(1, round(count * len(members) / len(vertices))))
+        share = shares[k]
         controls = members[_farthest_points(vertices[members], share)]
         used = min(neighbour_count, share)
         nearest, w = _local_weights(vertices[members], vertices[controls], used)
@@ -71,6 +71,15 @@ def choose_control_points(
         chosen.append(controls)
         before += share
     return ControlPoints(np.concatenate(chosen), neighbours, weights)
+
+
+def _shares(sizes: np.ndarray, count: int) -> np.ndarray:
+    """`count` split in proportion to `sizes`, exactly: at least one each, the largest remainders rounded up."""
+    exact = 1.0 + (count - len(sizes)) * (sizes - 1) / max(sizes.sum() - len(sizes), 1)
+    shares = np.floor(exact).astype(np.int64)
+    rest = np.argsort(shares - exact, kind="stable")[: count - shares.sum()]
+    shares[rest] += 1
+    return shares
 
 
 def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
