@@ -171,6 +171,8 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float
 
     def start() -> Checkpoint:
         state.parent.mkdir(parents=True, exist_ok=True)
+        for left in (*state.parent.glob(f".{state.stem}.*"), *state.parent.glob(f".{metrics.stem}.*")):
+            left.unlink()  # half a file of a session that was killed while it wrote
         checkpoint = load_checkpoint(state, key=key)
         if checkpoint is not None:
             truncate_metrics(metrics, checkpoint.iteration)

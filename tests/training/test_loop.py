@@ -116,6 +116,14 @@ def test_a_checkpoint_of_another_key_stops_before_anything_is_lost(tmp_path):
     assert run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="old").iteration == 2
 
 
+def test_what_a_kill_left_half_written_is_cleared(tmp_path):
+    run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="k")
+    (tmp_path / f".{module.STATE_FILE.replace('.', '.x7_a.')}").write_bytes(b"half")
+    (tmp_path / ".metrics.12ab.jsonl").write_text("half")
+    run_training(Walk(), config(), tmp_path, key="k")
+    assert {path.name for path in tmp_path.iterdir()} == {module.METRICS_FILE, module.STATE_FILE}
+
+
 def test_diverging_keeps_the_last_checkpoint(tmp_path):
     optimiser = OptimiserConfig(iterations=25)
     with pytest.raises(DivergedError, match="step 6, batch 20"):

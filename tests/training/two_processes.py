@@ -83,6 +83,7 @@ def fork_two(folder: Path) -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    Toy(CONFIG)  # what torch imports late is imported once
     os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), WORLD_SIZE="2")
     children = []
     for rank in (0, 1):
