@@ -101,7 +101,8 @@ def fit_reference(
     photographs. The same seed gives the same bits at one number of threads, interrupted or not.
 
     Args:
-        folder: for `metrics.jsonl` and the checkpoint; a checkpoint with this `key` in it is taken up.
+        folder: for `metrics.jsonl` and the checkpoint; a checkpoint with this `key` in it is taken up, one of
+            another is refused.
         device: "cpu" or "cuda".
         max_seconds: stop with a checkpoint after as much work.
         report: called after every logged step and evaluation.
