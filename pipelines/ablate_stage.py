@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -22,7 +21,7 @@ from avatar.evaluation.ablation import (
     row_figures,
     unfinished,
 )
-from avatar.evaluation.ablation_pieces import Workshop, reference_frame
+from avatar.evaluation.ablation_pieces import Workshop
 from avatar.evaluation.ablation_plan import Row, ablation_pieces
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig
 from avatar.evaluation.image import load_metric
@@ -30,38 +29,16 @@ from avatar.evaluation.report import view_key
 from avatar.evaluation.tables import FigureTable
 from avatar.training.loop import Progress
 from avatar.training.presets import TrainingPreset
-from avatar.training.views import read_views
-from pipelines.build_config import TEMPLATE
-from pipelines.fit_stage import silhouette_overlap
 from pipelines.pictures import caption, encode_png, row
 from pipelines.run_folder import own_run_folder
-from smplxpp.body import load_body
-from smplxpp.capture import Capture, open_capture
-from smplxpp.core.artifact import jsonable, sha256_file
+from pipelines.train_inputs import TrainInputs, open_scene
+from smplxpp.capture import Capture
+from smplxpp.core.artifact import jsonable
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.errors import InputError
-from smplxpp.core.template import Template
 
 ABLATION = "ablation"
 PICTURES = "pictures"
 RESULTS_FILE = "results.json"
-
-
-@dataclass(frozen=True)
-class AblationInputs:
-    """What an ablation reads.
-
-    Attributes:
-        capture: folder of any known layout. params: other parameters than its own. body: what they are for.
-        frame: that Gaussians are fitted to, None: the first training frame.
-        scale: of the images, 1 for all pixels.
-    """
-
-    capture: Path
-    params: Path | None = None
-    body: Path | None = None
-    frame: int | None = None
-    scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +74,7 @@ class AblationOutcome:
 
 def ablate(
     run: Path,
-    inputs: AblationInputs,
+    inputs: TrainInputs,
     rows: Mapping[str, Row],
     preset: TrainingPreset,
     config: EvaluationConfig,
@@ -109,24 +86,17 @@ def ablate(
         InputError: no template, or a capture that cannot be trained or measured on.
     """
     how = how or AblationRun()
-    template_file = run / TEMPLATE
-    if not template_file.is_file():
-        raise InputError(
-            f"run {run}", expected=f"a template, {TEMPLATE}", received="none",
-            remedy="make one with `smplxpp build --capture DIR --out RUN`",
-        )  # fmt: skip
-    template, capture = Template.load(template_file), _open(inputs)
-    frame, config = reference_frame(capture, inputs.frame), _measured(config, capture)
-    _require_person(template, capture, frame)
+    scene = open_scene(run, inputs)
+    config = _measured(config, scene.capture)
     folder = run / ABLATION
     weights = (preset.teacher.weights, preset.bake.weights, preset.compensate.weights)
     perceptual = load_metric(config.metric, device=how.device) if any(w.perceptual for w in weights) else None
     with own_run_folder(folder, (RESULTS_FILE,)):
         ablation = Ablation(
-            Workshop(capture, template, how.device),
-            ablation_pieces(preset, frame=frame),
+            Workshop(scene.capture, scene.template, how.device),
+            ablation_pieces(preset, frame=scene.frame),
             folder,
-            inputs={TEMPLATE: sha256_file(template_file), "capture": capture_digest(capture)},
+            inputs=scene.digests,
             perceptual=perceptual,
         )
         if how.force:
@@ -135,48 +105,6 @@ def ablate(
         result = ablation.run(rows, config, max_seconds=how.max_seconds, observer=observer)
         waiting = unfinished(ablation, rows, result.waiting)
         return _write(folder, result, {"preset": preset, "scale": inputs.scale}, waiting)
-
-
-def capture_digest(capture: Capture) -> str:
-    """SHA-256 of cameras, splits and parameters, and of the names and sizes of all images and masks.
-
-    Their content is not read: a capture may be of terabytes.
-    """
-    digest = hashlib.sha256()
-    splits = capture.splits
-    digest.update(json.dumps(jsonable(splits), sort_keys=True).encode())
-    for name, camera in capture.cameras.items():
-        digest.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
-    for frame in capture.frames:
-        params = capture.params(frame)
-        if params is not None:
-            digest.update(b"".join(np.ascontiguousarray(v).tobytes() for v in vars(params).values() if v is not None))
-    for camera, frame in capture.views():
-        for kind in ("image", "mask"):
-            path = capture.file(camera, frame, kind)
-            if path is not None:
-                digest.update(f"{camera} {frame} {kind} {path.name} {path.stat().st_size}\n".encode())
-    return digest.hexdigest()
-
-
-def _open(inputs: AblationInputs) -> Capture:
-    if not 0.0 < inputs.scale <= 1.0:
-        raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
-    body = None if inputs.body is None else load_body(inputs.body)
-    capture = open_capture(inputs.capture, params=inputs.params, body=body)
-    return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)
-
-
-def _require_person(template: Template, capture: Capture, frame: int) -> None:
-    """Raise `InputError` unless the template stands in the images of the reference frame."""
-    params = capture.params(frame)
-    if params is None:
-        raise InputError(
-            f"capture {capture.name}", expected=f"body parameters of frame {frame}", received="none",
-            remedy="choose another reference frame with --frame, or name a file with --params",
-        )  # fmt: skip
-    views = read_views(capture, frame, [camera for camera, _ in capture.views(frames=[frame])])
-    silhouette_overlap(template.mesh.with_vertices(template.pose(params)[0]), views)
 
 
 def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from avatar.evaluation.ablation_pieces import CLOTHED, Piece, Workshop
@@ -33,6 +32,7 @@ from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion
 from avatar.training.loop import STATE_FILE, Progress
+from avatar.training.machine import seeded
 from avatar.training.train import Session
 from smplxpp.core.artifact import jsonable, stage_key
 from smplxpp.core.atomic import atomic_write_text
@@ -187,8 +187,7 @@ class Ablation:
             report=lambda progress: observer.training(name, progress),
         )  # fmt: skip
         begin = time.perf_counter()
-        with torch.random.fork_rng():
-            torch.manual_seed(piece.seed)
+        with seeded(piece.seed, self.shop.device):
             product, progress = piece.make(self.shop, self.piece, session)
         if progress is not None and not progress.finished:
             return False

@@ -8,9 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.models.blend_shapes import BlendShapeConfig
@@ -20,6 +17,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher import TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.bake import BakeConfig
+from avatar.training.compact import coefficient_std, pruned_to
 from avatar.training.compensate import CompensateConfig
 from avatar.training.fit_config import FitConfig
 from avatar.training.fit_reference import FitScene, fit_reference
@@ -29,7 +27,6 @@ from avatar.training.sequence import AvatarSequence
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from avatar.training.views import read_views
 from smplxpp.capture import Capture
-from smplxpp.core.errors import InputError
 from smplxpp.core.template import Template
 
 CLOTHED, NAKED = "clothed", "naked"
@@ -157,26 +154,26 @@ class BakePiece(Piece):
     """A student before its blend shapes: field and attributes from a teacher, or from photographs.
 
     Attributes:
-        teacher: name of the piece, None: photographs.
+        source: a teacher, whose Gaussians it starts from too; or Gaussians, to learn from photographs.
     """
 
-    gaussians: str
-    teacher: str | None
+    source: str
     student: StudentConfig
     config: BakeConfig
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (self.gaussians,) if self.teacher is None else (self.gaussians, self.teacher)
+        return (self.source,)
 
     @property
     def seed(self) -> int:
         return self.config.seed
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
-        teacher = None if self.teacher is None else get(self.teacher)
-        sequence = shop.sequence(self.ground)
-        return bake(sequence, get(self.gaussians), self.student, self.config, session, teacher=teacher)
+        source, sequence = get(self.source), shop.sequence(self.ground)
+        teacher = source if isinstance(source, TeacherAvatar) else None
+        gaussians = source if teacher is None else teacher.gaussians.snapshot()
+        return bake(sequence, gaussians, self.student, self.config, session, teacher=teacher)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,11 +202,12 @@ class PrunedPiece(Piece):
     """A student whose least important Gaussians lost their blend shapes.
 
     Attributes:
-        keep: share of the Gaussians that keep theirs.
+        keep: share of the Gaussians that keep theirs, or less: the compact file has at most `max_bytes`.
     """
 
     student: str
     keep: float
+    max_bytes: float
     seed = 0  # nothing is random
 
     @property
@@ -218,15 +216,9 @@ class PrunedPiece(Piece):
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, None]:
         student, sequence = get(self.student), shop.sequence(self.ground)
-        shapes = student.blend_shapes
-        with torch.no_grad():
-            motions = [sequence.motion(frame) for frame in sequence.train_frames]
-            jaw = torch.stack([m.jaw for m in motions]) if shapes.config.jaw else None
-            z = shapes.coefficients(
-                torch.stack([m.expression for m in motions]), torch.stack([m.pose for m in motions]), jaw
-            )
-        pruned = shapes.pruned(z.std(dim=0, correction=0), keep=self.keep)
-        return student.with_blend_shapes(pruned).eval(), None
+        shapes = student.blend_shapes.pruned(coefficient_std(student, sequence), keep=self.keep)
+        small, _ = pruned_to(student.with_blend_shapes(shapes), sequence, self.max_bytes)
+        return small.eval(), None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,19 +239,3 @@ class SamePiece(Piece):
 def fitting(shapes: BlendShapeConfig, rig: Rig) -> BlendShapeConfig:
     """Blend shapes driven by as many expressions as the body has."""
     return replace(shapes, expression_size=rig.expression_size)
-
-
-def reference_frame(capture: Capture, frame: int | None) -> int:
-    """The frame that Gaussians are fitted to: the first training frame, or another that has images.
-
-    Raises:
-        InputError: no image of it.
-    """
-    seen = np.array(capture.frames)[capture.presence().any(axis=0)].tolist()
-    chosen = capture.splits.train_frames[0] if frame is None else frame
-    if chosen not in seen:
-        raise InputError(
-            f"capture {capture.name}", expected=f"images of frame {chosen}", received=f"images of {len(seen)} others",
-            remedy="choose another reference frame with --frame",
-        )  # fmt: skip
-    return int(chosen)

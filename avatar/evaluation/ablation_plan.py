@@ -20,8 +20,8 @@ from avatar.models.student import StudentConfig
 from avatar.training.presets import TrainingPreset
 from smplxpp.core.errors import InputError
 
-LOCAL_PARTS = 64
-PRUNED_SHARE = 0.3
+LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
+PRUNED_SHARE, PRUNED_MEGABYTES = 0.3, 20.0
 CONTROL_POINTS = 400
 NULL_SHARE = 0.2
 
@@ -53,8 +53,14 @@ PAPER_ROWS: Mapping[str, Row] = {
     "full": Row("Full", "full", "teacher, bake, blend shapes"),
 }
 OPTION_ROWS: Mapping[str, Row] = {
-    "local": Row("local blend shapes", "local", f"coefficients of their own for {LOCAL_PARTS} parts of the Gaussians"),
-    "pruned": Row("pruned", "pruned", f"Full, blend shapes left to the most important {PRUNED_SHARE:.0%} of Gaussians"),
+    "local": Row(
+        "local blend shapes", "local", f"{LOCAL['parts']} parts of the Gaussians with coefficients of their own"
+    ),
+    "pruned": Row(
+        "pruned",
+        "pruned",
+        f"Full; {PRUNED_SHARE:.0%} of the Gaussians keep blend shapes, in {PRUNED_MEGABYTES:g} MB",
+    ),
     "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
     "gated": Row("gated", "gated", "head shapes act on the head alone, body shapes on the rest"),
     "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),
@@ -91,9 +97,8 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     pieces: dict[str, Piece] = {}
     student = preset.student()
 
-    def bake(name: str, *, student: StudentConfig = student, teacher: str | None = "teacher", **changes: float) -> None:
-        config = replace(preset.bake, **changes)
-        pieces[name] = BakePiece(gaussians="gaussians", teacher=teacher, student=student, config=config)
+    def bake(name: str, *, student: StudentConfig = student, source: str = "teacher", **changes: float) -> None:
+        pieces[name] = BakePiece(source=source, student=student, config=replace(preset.bake, **changes))
 
     def compensate(name: str, baked: str, *, ground: str = CLOTHED, null: float = 0.0, **shapes: int) -> None:
         pieces[name] = CompensatePiece(
@@ -110,18 +115,18 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
             ground=ground, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher
         )
         pieces[f"{prefix}bake"] = BakePiece(
-            ground=ground, gaussians=fit, teacher=f"{prefix}teacher", student=student, config=preset.bake
+            ground=ground, source=f"{prefix}teacher", student=student, config=preset.bake
         )
     compensate("full", "bake")
     compensate("naked", "naked_bake", ground=NAKED)
     bake("no_field_bake", student=replace(student, field=None, control_points=0))
     compensate("no_field", "no_field_bake")
-    bake("no_teacher_bake", teacher=None)
+    bake("no_teacher_bake", source="gaussians")
     compensate("no_teacher", "no_teacher_bake")
 
-    compensate("local", "bake", parts=LOCAL_PARTS)
+    compensate("local", "bake", **LOCAL)
     compensate("gated", "bake", gated=True)
-    pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE)
+    pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE, max_bytes=1e6 * PRUNED_MEGABYTES)
     bake("control_bake", student=replace(student, control_points=CONTROL_POINTS))
     compensate("control", "control_bake")
     if preset.bake.null_share and preset.compensate.null_share:

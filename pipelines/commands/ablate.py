@@ -45,8 +45,8 @@ class Ablate:
     """Measure every n-th frame."""
     metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
     """Perceptual distance to measure, and to train with where the preset does."""
-    frame: OptionalInt = None
-    """Frame that Gaussians are fitted to; the first training frame by default."""
+    hold_out: tuple[str, ...] = ()
+    """Cameras to keep from training and to measure on; by default those that the capture holds out."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -71,7 +71,8 @@ class Ablate:
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig
         from avatar.training import choose_device
-        from pipelines.ablate_stage import AblationInputs, AblationRun, ablate
+        from pipelines.ablate_stage import AblationRun, ablate
+        from pipelines.train_inputs import TrainInputs
 
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:
@@ -81,7 +82,7 @@ class Ablate:
         with _progress(enabled=not self.json) as (training, measuring):
             outcome = ablate(
                 self.run_folder,
-                AblationInputs(self.capture, self.params, self.body, self.frame, self.scale),
+                TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale),
                 rows, preset, config,
                 AblationRun(choose_device(self.device), 60.0 * self.max_minutes, self.force, training, measuring),
             )  # fmt: skip
