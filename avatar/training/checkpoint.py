@@ -71,7 +71,7 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
         )  # fmt: skip
     raise InputError(
         f"checkpoint {path}", expected="one of these options, inputs and code",
-        received=f"one of others, {about.get('iteration')} steps into its training",
+        received=f"one of others, at iteration {about.get('iteration')}",
         remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
         "(--force does)",
     )  # fmt: skip

@@ -42,7 +42,7 @@ def test_one_of_another_training_is_refused_and_stays(tmp_path):
     path = tmp_path / "state"
     save_checkpoint(path, some())
     content = path.read_bytes()
-    with pytest.raises(InputError, match="7 steps into its training") as caught:
+    with pytest.raises(InputError, match="at iteration 7") as caught:
         load_checkpoint(path, key="that")
     assert str(path) in caught.value.subject and "--force" in caught.value.remedy
     assert path.read_bytes() == content

@@ -83,7 +83,7 @@ def test_a_limit_of_time_is_the_first_processes_and_the_rest_is_the_same_to_the_
     [
         ("diverged", "DivergedError: training step 7, batch 22: "),  # item 1 of the step: found by process 1
         ("few", "expected at least one for each of 2 processes, received 1"),
-        ("key", "received one of others, 1 steps into its training"),
+        ("key", "received one of others, at iteration 1"),
     ],
 )
 def test_all_processes_stop_with_the_same_words(both, what, words):
