@@ -23,6 +23,13 @@ STAGES: tuple[str, ...] = (
 
 FIT_STAGE = "70_bind"
 """The stage that `smplxpp fit-reference` adds to a build."""
+TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE = TRAIN_STAGES = ("80_teacher", "85_bake", "90_compensate")
+"""The stages that `smplxpp train` adds."""
+GAUSSIANS = f"{FIT_STAGE}/gaussians.safetensors"
+TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
+BAKED = f"{BAKE_STAGE}/student.safetensors"
+STUDENT, COMPACT_STUDENT = (f"{COMPENSATE_STAGE}/{name}.safetensors" for name in ("student", "student_compact"))
+"""Models in a run."""
 TEMPLATE = "60_assemble/smplxpp.npz"
 """The template in a run."""
 

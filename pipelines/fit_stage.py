@@ -140,7 +140,22 @@ def open_views(inputs: FitInputs) -> tuple[Capture, tuple[str, ...], tuple[str, 
     """The capture, and the names of the cameras to train on and of those held out.
 
     Raises:
-        InputError: no frame of this number, unknown or no cameras.
+        InputError: no frame of this number, or what `open_cameras` refuses.
+    """
+    capture, train, held_out = open_cameras(inputs)
+    if inputs.frame not in capture.frames:
+        raise InputError(
+            f"capture {capture.name}", expected=f"frame {inputs.frame}",
+            received=f"frames {capture.frames[0]} to {capture.frames[-1]}", remedy="choose another with --frame",
+        )  # fmt: skip
+    return capture, train, held_out
+
+
+def open_cameras(inputs: FitInputs) -> tuple[Capture, tuple[str, ...], tuple[str, ...]]:
+    """`open_views` of any frame.
+
+    Raises:
+        InputError: unknown cameras, none, or none to train on.
     """
     body = None if inputs.body is None else load_body(inputs.body)
     capture = open_capture(inputs.capture, params=inputs.params, body=body)
@@ -148,11 +163,6 @@ def open_views(inputs: FitInputs) -> tuple[Capture, tuple[str, ...], tuple[str, 
         raise InputError(
             f"capture {capture.name}", expected="cameras and their images", received="none",
             remedy="a scan alone makes a template; a fit needs the views: see docs/captures.md",
-        )  # fmt: skip
-    if inputs.frame not in capture.frames:
-        raise InputError(
-            f"capture {capture.name}", expected=f"frame {inputs.frame}",
-            received=f"frames {capture.frames[0]} to {capture.frames[-1]}", remedy="choose another with --frame",
         )  # fmt: skip
     unknown = sorted(set(inputs.hold_out) - set(capture.cameras))
     if unknown:

@@ -4,9 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+if TYPE_CHECKING:
+    from avatar.training import Progress as TrainingProgress
 
 
 @contextmanager
@@ -33,3 +45,39 @@ def counted_progress(what: str, *, enabled: bool = True) -> Iterator[Callable[[i
             progress.update(task, completed=done, total=count)
 
         yield show
+
+
+@contextmanager
+def training_progress(
+    name: str, total: int, *, held_out: bool = True, enabled: bool = True
+) -> Iterator[Callable[[TrainingProgress], None]]:
+    """A bar with loss, PSNR, speed and the time that is left; yields what a training reports to.
+
+    Args:
+        held_out: whether views are measured that training does not see, where an evaluation does not say so itself.
+    """
+    columns = (
+        TextColumn("{task.description}"), BarColumn(bar_width=10), MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    quality: dict[str, Any] = {}
+    bar = Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0)
+    task = bar.add_task(name, total=total, figures="")
+
+    def show(state: TrainingProgress) -> None:
+        bar.start()  # not before: a training that stands reports nothing
+        if state.evaluation is not None:
+            quality.update(state.evaluation["mean"], held_out=state.evaluation.get("held_out", held_out))
+        figures = []
+        if "loss" in state.metrics:
+            figures.append(f"loss {state.metrics['loss']:.4f}")
+        if state.rate:
+            figures.append(f"{state.rate:.1f} it/s")
+        if "psnr" in quality:  # a training taken up again has none before its next evaluation
+            figures.append(f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}")
+        bar.update(task, completed=state.iteration, figures="  ".join(figures))
+
+    try:
+        yield show
+    finally:
+        bar.stop()

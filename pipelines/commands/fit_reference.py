@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,16 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath
+from pipelines.progress import training_progress
 from smplxpp.core.artifact import StageRecord
 from smplxpp.core.errors import InputError, MissingExtraError
 
 if TYPE_CHECKING:
     from avatar.training import FitConfig
-    from avatar.training import Progress as FitProgress
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +75,7 @@ class FitReference:
         if not self.max_minutes > 0:
             raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
         config = self.config()
-        with _progress(config.iterations, enabled=not self.json) as progress:
+        with training_progress("fit", config.iterations, enabled=not self.json) as progress:
             record = fit(
                 self.run_folder, inputs, config, device=choose_device(self.device),
                 max_seconds=60.0 * self.max_minutes, force=self.force, progress=progress,
@@ -109,30 +106,6 @@ class FitReference:
                 raise InputError(f"option {name}", expected=f"a number, at least {least}", received=str(value))
         sampling = replace(config.sampling, count=count, seed=self.seed)
         return replace(config, sampling=sampling, iterations=iterations, seed=self.seed)
-
-
-@contextmanager
-def _progress(total: int, *, enabled: bool) -> Iterator[Callable[[FitProgress], None]]:
-    """A bar with loss, the held-out views' PSNR, speed and the time that is left."""
-    columns = (
-        BarColumn(bar_width=10), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    quality: dict[str, Any] = {}
-    with Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0) as bar:
-        task = bar.add_task("fit", total=total, figures="starting")
-
-        def show(state: FitProgress) -> None:
-            if state.evaluation is not None:
-                quality.update(state.evaluation["mean"], held_out=state.evaluation["held_out"])
-            figures = []
-            if state.metrics:
-                figures += [f"loss {state.metrics['loss']:.4f}", f"{state.rate:.1f} it/s"]
-            if quality:  # a fit taken up again has none before its next evaluation
-                figures += [f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}"]
-            bar.update(task, completed=state.iteration, figures="  ".join(figures))
-
-        yield show
 
 
 def _print(record: StageRecord, report: Path) -> None:

@@ -16,6 +16,7 @@ from pipelines.commands import fit_reference as command
 from pipelines.commands import inspect
 from pipelines.commands.inspect import summarise_run
 from pipelines.fit_pictures import read_strip
+from pipelines.progress import training_progress
 from smplxpp.core.artifact import read_manifest
 from smplxpp.core.params import BodyParams
 from tests.training.doll import HELD_OUT, TRAIN, doll, write_capture, write_run
@@ -151,7 +152,7 @@ def _often(init):
 def test_progress_shows_a_fit_that_is_taken_up_again():
     from avatar.training import Progress
 
-    with command._progress(20, enabled=True) as show:
+    with training_progress("fit", 20) as show:
         show(Progress(10, 20, 1.0, 5.0, {"loss": 0.5}))
         show(Progress(20, 20, 2.0, 5.0, {"loss": 0.4}, {"held_out": True, "mean": {"psnr": 20.0}}))
 

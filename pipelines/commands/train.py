@@ -1,0 +1,249 @@
+"""`smplxpp train`: a capture and a template in; a teacher, a student, their figures and a report out."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.build_config import FIT_STAGE
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath
+from pipelines.progress import training_progress
+from smplxpp.core.artifact import StageRecord
+from smplxpp.core.errors import InputError, MissingExtraError
+
+if TYPE_CHECKING:
+    from avatar.training.presets import TrainingPreset
+    from pipelines.train_stage import TrainConfig
+
+log = logging.getLogger(__name__)
+STAGES = ("fit", "teacher", "bake", "compensate")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Options of `smplxpp train`. It trains what a run lacks; the same command goes on with what was interrupted."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
+    """Folder that `smplxpp build` wrote; 70_bind, 80_teacher, 85_bake and 90_compensate go into it. Write --run-folder
+    with torchrun, which takes --run for an option of its own."""
+    capture: Path
+    """Folder of the capture: cameras, images, masks and body parameters of its frames."""
+    preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
+    """paper: every number as published, for a GPU; gpu: smaller and some hours; cpu: two cores and an hour or two;
+    demo: minutes, to see whether all fits together."""
+    stage: Annotated[
+        Literal["teacher", "bake", "compensate"] | None,
+        tyro.conf.arg(metavar="{teacher,bake,compensate}", help_behavior_hint="(optional)"),
+    ] = None
+    """Train this stage alone; those before it must stand."""
+    until: Literal["fit", "teacher", "bake", "compensate"] = "compensate"
+    """The last stage to train."""
+    max_minutes: float = math.inf
+    """Stop after as many minutes and write what there is; the same command then goes on."""
+    iterations_share: OptionalFloat = None
+    """Share of the preset's iterations, of all stages."""
+    fit_iterations: OptionalInt = None
+    """Iterations of the reference fit, in the place of the preset's."""
+    teacher_iterations: OptionalInt = None
+    """Iterations of the teacher."""
+    bake_iterations: OptionalInt = None
+    """Iterations of the bake."""
+    compensate_iterations: OptionalInt = None
+    """Iterations of the compensation."""
+    batch: OptionalInt = None
+    """Poses in a step of every training. With several processes there is at least one for each."""
+    gaussians: OptionalInt = None
+    """Number of Gaussians of the reference fit."""
+    blend_shapes: Literal["full", "local", "pruned"] = "full"
+    """full: as published; local: 256 parts with coefficients of their own and 16 columns; pruned: full, and the compact
+    file keeps those that move and colour most."""
+    max_megabytes: float = 20.0
+    """Size of the compact file with pruned blend shapes."""
+    no_teacher: bool = False
+    """Bake from the photographs alone, without stage 80."""
+    perceptual: Literal["auto", "lpips", "st-lpips", "none"] = "auto"
+    """Metric of the perceptual term. auto: LPIPS or else ST-LPIPS where the preset has the term and the package is
+    installed; a name gives the term to any preset."""
+    hold_out: tuple[str, ...] = ()
+    """Cameras to keep from training and to measure on; by default those that the capture holds out."""
+    params: OptionalPath = None
+    """Body parameters to take instead of the capture's own, the same as for the build."""
+    body: OptionalPath = None
+    """SMPL-X-layout body file that the parameters are for; the open body by default."""
+    scale: float = 1.0
+    """Size of the images to work on, 1 for every pixel."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where it is."""
+    seed: int = 0
+    """Of everything that is drawn."""
+    force: bool = False
+    """Train anew even what stands; checkpoints go. A reference fit that you made stays."""
+    no_report: bool = False
+    """Leave report.html as it is."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict[str, Any] | None:
+        """Train, write the report, print the figures; None on all but the first of several processes."""
+        for package in ("torch", "safetensors"):
+            if find_spec(package) is None:
+                raise MissingExtraError(package, extra="avatar", purpose="training an avatar")
+        if int(os.environ.get("RANK") or 0):
+            logging.disable(logging.WARNING)  # the first process says it
+        from avatar.training import choose_device
+        from avatar.training.distributed import join_processes
+        from pipelines.train_inputs import TrainInputs, open_scene
+        from pipelines.train_stage import TrainOptions, train, with_batch
+
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        if not self.max_minutes > 0:
+            raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
+        config = self.config()
+        with join_processes(choose_device(self.device)) as together:
+            config = replace(config, preset=with_batch(config.preset, least=together.world_size))
+            scene = together.from_first(lambda: open_scene(self.run_folder, inputs))
+            held_out = bool(scene.capture.splits.novel_view_cameras)
+
+            def bar(name: str, total: int) -> AbstractContextManager:
+                return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
+
+            options = TrainOptions(stages=self.stages(), max_seconds=60.0 * self.max_minutes, force=self.force, bar=bar)
+            records = train(self.run_folder, inputs, scene, config, options, together)
+            if not together.first:
+                return None
+        return self._finish(records)
+
+    def stages(self) -> tuple[str, ...]:
+        """Those to train, in order.
+
+        Raises:
+            InputError: options that exclude each other.
+        """
+        if self.no_teacher and "teacher" in (self.stage, self.until):
+            raise InputError("option no-teacher", expected="another last stage than the teacher", received="teacher")
+        if self.stage is not None:
+            return (self.stage,)
+        return STAGES[: STAGES.index(self.until) + 1]
+
+    def config(self) -> TrainConfig:
+        """The preset with the options' changes.
+
+        Raises:
+            InputError: numbers out of range. MissingExtraError: a perceptual metric that is not installed.
+        """
+        from avatar.training.presets import training_preset
+        from pipelines.train_stage import TrainConfig, with_batch, with_perceptual
+
+        given = {stage: getattr(self, f"{stage}_iterations") for stage in STAGES}
+        for name, value, least in (
+            ("gaussians", self.gaussians, 1), ("batch", self.batch, 1),
+            ("seed", self.seed, 0), ("max-megabytes", self.max_megabytes, 0),
+            *((f"{stage}-iterations", value, 1) for stage, value in given.items()),
+        ):  # fmt: skip
+            if value is not None and not value >= least:
+                raise InputError(f"option {name}", expected=f"a number, at least {least}", received=f"{value:g}")
+        share = 1.0 if self.iterations_share is None else self.iterations_share
+        if not 0.0 < share < math.inf:
+            raise InputError("option iterations-share", expected="a number above 0", received=f"{share:g}")
+        preset = _changed(training_preset(self.preset).seeded(self.seed).shortened(share), given, self.gaussians)
+        if self.batch is not None:
+            preset = with_batch(preset, self.batch)
+        if self.perceptual in ("lpips", "st-lpips"):
+            preset = with_perceptual(preset)
+        return TrainConfig(
+            preset=preset,
+            teacher=not self.no_teacher,
+            perceptual=_perceptual(self.perceptual, preset),
+            blend_shapes=self.blend_shapes,
+            max_megabytes=self.max_megabytes,
+        )
+
+    def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:
+        from pipelines.build_report import rewrite_report
+
+        report = self.run_folder / "report.html"
+        ran = any(record.ran for record in records.values())
+        if not self.no_report and (ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
+            log.warning("the run does not say what it was built from: `smplxpp build` writes the report")
+        if not self.json:
+            _print(records, report)
+        stages = {
+            name: {**record.manifest["numbers"], "ran": record.ran, "checks": record.manifest["checks"]}
+            for name, record in records.items()
+        }
+        finished = all(numbers["finished"] for numbers in stages.values()) and self.stages()[-1] in stages
+        return {"run": str(self.run_folder), "finished": finished, "stages": stages}
+
+
+def _changed(preset: TrainingPreset, iterations: dict[str, int | None], gaussians: int | None) -> TrainingPreset:
+    """The preset with other iterations and another number of Gaussians."""
+    changed = {
+        stage: replace(getattr(preset, stage), iterations=count)
+        for stage, count in iterations.items() if count is not None
+    }  # fmt: skip
+    if gaussians is not None:
+        fit = changed.get("fit", preset.fit)
+        changed["fit"] = replace(fit, sampling=replace(fit.sampling, count=gaussians))
+    if "teacher" in changed:
+        teacher = changed["teacher"]
+        changed["teacher"] = replace(teacher, pretrain=min(teacher.pretrain, teacher.iterations // 2))
+    return replace(preset, **changed)
+
+
+def _perceptual(name: str, preset: TrainingPreset) -> str:
+    """The metric's name for "auto"; "none" where the preset has no such term."""
+    from avatar.losses.perceptual import load_lpips, load_st_lpips
+
+    if name != "auto":
+        # The first use of a metric: what is missing is said now.
+        {"lpips": load_lpips, "st-lpips": load_st_lpips, "none": lambda: None}[name]()
+        return name
+    if not any(stage.weights.perceptual for stage in (preset.teacher, preset.bake, preset.compensate)):
+        return "none"
+    for package, metric in (("lpips", "lpips"), ("stlpips_pytorch", "st-lpips")):
+        if find_spec(package) is not None:
+            return metric
+    log.warning(
+        "neither lpips nor stlpips-pytorch is installed: training without the perceptual term "
+        "(pip install lpips torchvision, or pip install --no-deps stlpips-pytorch)"
+    )
+    return "none"
+
+
+def _print(records: dict[str, StageRecord], report: Path) -> None:
+    console = Console()
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("stage", no_wrap=True)
+    for name in ("iterations", "seconds", "PSNR views", "SSIM", "PSNR poses", "MB"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for record in records.values():
+        numbers = record.manifest["numbers"]
+        stage = record.folder.name
+        views = numbers["mean"].get("held_out", numbers["mean"].get("train", {})) if stage == FIT_STAGE else (
+            numbers.get("novel_view", {})
+        )  # fmt: skip
+        poses = numbers.get("novel_pose", {})
+        state = "" if numbers["finished"] else "stopped: the same command goes on"
+        table.add_row(
+            stage,
+            f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",
+            f"{numbers['seconds_of_steps']:.0f}",
+            *(f"{values[key]:.{digits}f}" if key in values else "-"
+              for values, key, digits in ((views, "psnr", 2), (views, "ssim", 4), (poses, "psnr", 2))),
+            ", ".join(f"{size / 1e6:.1f}" for size in numbers.get("bytes", {}).values()) or "-",
+            state if record.ran or state else "stands",
+        )  # fmt: skip
+    console.print(table)
+    if report.is_file():
+        console.print(f"report  {report}", soft_wrap=True, highlight=False)
