@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.protocol import SETS, ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
@@ -20,54 +17,22 @@ from avatar.models.model_file import load_avatar
 from avatar.models.posed import AvatarModel
 from avatar.models.rig import Rig
 from avatar.models.student import Student, StudentConfig
-from avatar.training import read_views
 from avatar.training.sequence import AvatarSequence
-from pipelines.build_config import TEMPLATE
-from pipelines.evaluate_config import (
-    BAKED,
-    BEST_FIRST,
-    EVALUATE_STAGE,
-    MEASURED,
-    MODEL_FILES,
-    REFERENCE_FIT,
-    REPORT_FILE,
-    STUDENT,
-    TEACHER,
-)
+from pipelines.evaluate_config import BEST_FIRST, EVALUATE_STAGE, MEASURED, MODEL_FILES, REPORT_FILE
 from pipelines.evaluate_pictures import surface_picture, write_tiles
-from pipelines.fit_stage import silhouette_overlap
 from pipelines.pictures import encode_png
 from pipelines.run_folder import own_run_folder
-from smplxpp.body import load_body
-from smplxpp.capture import Capture, open_capture
+from pipelines.train_inputs import TrainInputs, open_scene
+from smplxpp.capture import Capture
 from smplxpp.core.artifact import Check, StageOutput, StageRecord, code_digest, run_stage, sha256_file
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.template import Template
-
-CHECKED_VIEWS = 3
-
-
-@dataclass(frozen=True)
-class EvaluateInputs:
-    """What an evaluation looks at.
-
-    Attributes:
-        capture: folder of any known layout.
-        params: other parameters than the capture's own. body: what they are for, None for the open body.
-        scale: of the images, 1 for all pixels.
-    """
-
-    capture: Path
-    params: Path | None = None
-    body: Path | None = None
-    scale: float = 1.0
 
 
 def evaluate(
     run: Path,
-    inputs: EvaluateInputs,
+    inputs: TrainInputs,
     config: EvaluationConfig,
     *,
     models: tuple[str, ...] = (),
@@ -83,25 +48,18 @@ def evaluate(
         progress: called with frames done and all frames.
 
     Raises:
-        InputError: no template, no trained model, a model of another template; a capture that lacks views, masks or
-            parameters, or in whose images the template does not stand.
+        InputError: no template, no trained model, a model of another template; a capture of another body, or one that
+            lacks views, masks or parameters.
     """
-    if not (run / TEMPLATE).is_file():
-        raise InputError(
-            f"run {run}", expected=f"a template, {TEMPLATE}", received="none",
-            remedy="make one with `smplxpp build --capture DIR --out RUN`",
-        )  # fmt: skip
     files = model_files(run, models)
-    template = Template.load(run / TEMPLATE)
-    capture = _open(inputs)
-    sets = with_people(capture, view_sets(capture, config.protocol))
-    overlap = _overlap(template, capture, sets)
-    sequence = AvatarSequence(capture, template, device=device)
+    scene = open_scene(run, inputs)
+    sets = with_people(scene.capture, view_sets(scene.capture, config.protocol))
+    sequence = AvatarSequence(scene.capture, scene.template, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
     digests = {
-        TEMPLATE: sha256_file(run / TEMPLATE),
+        **scene.digests,
         **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
-        **_capture_digests(capture, config.protocol, sets),
+        "capture/surfaces": _surface_digest(scene.capture, config.protocol, sets),
         "code": code_digest("smplxpp", "avatar"),
         "torch": version("torch"),
     }
@@ -110,7 +68,7 @@ def evaluate(
             run,
             EVALUATE_STAGE,
             lambda folder: _write(
-                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), overlap
+                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), scene.overlap
             ),
             config={"evaluation": config, "scale": inputs.scale, "device": device},
             inputs=digests,
@@ -134,9 +92,9 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
     if unknown:
         raise InputError("models", expected=f"among {', '.join(MODEL_FILES)}", received=", ".join(unknown))
     missing = [name for name in asked if name not in there]
-    untrained = not asked and not there.keys() & {TEACHER, BAKED, STUDENT}
+    untrained = not asked and not there.keys() & set(BEST_FIRST)
     if missing or untrained:
-        fit_alone = missing == [REFERENCE_FIT]
+        fit_alone = missing == ["reference-fit"]
         raise InputError(
             f"run {run}",
             expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
@@ -144,7 +102,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
             remedy=f"`smplxpp {'fit-reference' if fit_alone else 'train'}` makes it; a training under way is measured "
             "when its stage is finished",
         )  # fmt: skip
-    wanted = asked or (*MEASURED, *(() if STUDENT in there else (BAKED,)))
+    wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
     return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
 
 
@@ -154,30 +112,9 @@ def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
     Raises:
         InputError: a damaged file, one of another template or of a newer version.
     """
-    if name != REFERENCE_FIT:
+    if name != "reference-fit":
         return load_avatar(path, rig)
     return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
-
-
-def _open(inputs: EvaluateInputs) -> Capture:
-    if not 0.0 < inputs.scale <= 1.0:
-        raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
-    body = None if inputs.body is None else load_body(inputs.body)
-    capture = open_capture(inputs.capture, params=inputs.params, body=body)
-    return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)
-
-
-def _overlap(template: Template, capture: Capture, sets: Mapping[str, ViewSet]) -> float:
-    """Mean overlap of the skinned template's silhouette and masks over a few views of the first set.
-
-    Raises:
-        InputError: so little that template and capture do not belong together.
-    """
-    values = []
-    for camera, frame in next(iter(sets.values())).spread(CHECKED_VIEWS):
-        posed = template.mesh.with_vertices(template.pose(capture.params(frame))[0])
-        values.append(silhouette_overlap(posed, read_views(capture, frame, [camera])))
-    return float(np.mean(values))
 
 
 def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
@@ -227,13 +164,13 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
                 Check(f"{name}, {title}: PSNR of the person", best.mean(part)["psnr"], "dB", warn, fail,
                       higher_is_better=True)
             )  # fmt: skip
-            if name != TEACHER and TEACHER in report.models:
-                gain = best.mean(part)["psnr"] - report.models[TEACHER].mean(part)["psnr"]
+            if name != "teacher" and "teacher" in report.models:
+                gain = best.mean(part)["psnr"] - report.models["teacher"].mean(part)["psnr"]
                 checks.append(
                     Check(f"{name} against its teacher, {title}", gain, "dB", -0.3, -2.0, higher_is_better=True)
                 )
     for part, title in SURFACE_SETS.items():
-        if part not in best.surfaces or name == TEACHER:
+        if part not in best.surfaces or name == "teacher":
             continue
         own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
         for label in CLOTH_LABELS:
@@ -246,30 +183,10 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
     return checks
 
 
-def _capture_digests(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> dict[str, str]:
-    """SHA-256 of all that is read of the capture, by kind."""
-    pairs = sorted({pair for one in sets.values() for pair in one.views})
-    truths = truth_frames(capture, protocol, sets)
-    frames = sorted({frame for _, frame in pairs} | {frame for found in truths.values() for frame in found})
-    parts: dict[str, list[Any]] = {"images": [], "masks": [], "cameras": [], "params": [], "surfaces": []}
-    for camera, frame in pairs:
-        for kind in ("image", "mask"):
-            path = capture.file(camera, frame, kind)
-            parts[f"{kind}s"].append((camera, frame, None if path is None else sha256_file(path)))
-    for name in sorted({camera for camera, _ in pairs}):
-        parts["cameras"] += [capture.cameras[name].K, capture.cameras[name].cam_from_world]
-    for frame in frames:
-        params = capture.params(frame)
-        parts["params"] += [] if params is None else list(params.as_dict().values())
-    for found in truths.values():
-        for frame in found:
-            mesh = capture.truth_mesh(frame)
-            parts["surfaces"] += [mesh.vertices, mesh.faces]
-    return {f"capture/{name}": _sha256(values) for name, values in parts.items()}
-
-
-def _sha256(values: Iterable[Any]) -> str:
+def _surface_digest(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> str:
+    """SHA-256 of the true surfaces that are measured."""
     digest = hashlib.sha256()
-    for value in values:
-        digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    for frame in chain(*truth_frames(capture, protocol, sets).values()):
+        mesh = capture.truth_mesh(frame)
+        digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
     return digest.hexdigest()

@@ -26,9 +26,9 @@ class Evaluate:
     """Folder with a template and trained models; the evaluation goes into it as 95_evaluate."""
     capture: Path
     """Folder of the capture: cameras, images, masks, body parameters; true meshes where it has them."""
-    models: tuple[Literal["reference-fit", "teacher", "baked", "student"], ...] = ()
+    models: tuple[Literal["reference-fit", "teacher", "baked", "student", "compact"], ...] = ()
     """Which to measure; by default reference fit, teacher and student, as far as the run has them. baked: the student
-    before its blend shapes."""
+    before its blend shapes. compact: its file for players."""
     sets: tuple[Literal["training", "novel_view", "novel_pose", "novel_pose_training_view"], ...] = ()
     """Which views; by default all that the capture holds out something for, and training views."""
     every: int = 4
@@ -76,18 +76,17 @@ class Evaluate:
         from avatar.training import choose_device
         from pipelines.build_report import rewrite_report
         from pipelines.evaluate_config import REPORT_FILE
-        from pipelines.evaluate_stage import EvaluateInputs, evaluate
+        from pipelines.evaluate_stage import evaluate
+        from pipelines.train_inputs import TrainInputs
 
-        protocol = ProtocolConfig(
-            sets=self.sets, every=self.every, held_out_cameras=self.hold_out, held_out_frames=self.hold_out_frames
-        )
+        protocol = ProtocolConfig(sets=self.sets, every=self.every, held_out_frames=self.hold_out_frames)
         if min(self.speed_size) < 1:
             raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
         config = EvaluationConfig(
             protocol=protocol, metric=self.metric, samples=self.samples, seed=self.seed, speed_size=self.speed_size,
             speed_pictures=self.speed_pictures, shown=self.shown,
         )  # fmt: skip
-        inputs = EvaluateInputs(self.capture, self.params, self.body, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
         with counted_progress("frames", enabled=not self.json) as progress:
             record = evaluate(
                 self.run_folder, inputs, config, models=self.models, device=choose_device(self.device),

@@ -1,0 +1,243 @@
+"""`smplxpp evaluate` on a doll: files, figures, skipping, the report's sections, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from avatar.evaluation.report import EvalReport
+from avatar.gaussians.bound_file import save_bound
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.deformation_field import FieldConfig
+from avatar.models.model_file import save_avatar
+from avatar.models.rig import Rig
+from avatar.models.student import Student, StudentConfig
+from pipelines.cli import main
+from pipelines.commands import evaluate as command
+from pipelines.evaluate_config import MODEL_FILES
+from pipelines.evaluate_pictures import read_tiles, surface_picture, write_tiles
+from pipelines.evaluate_report import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.report import Report, write_report
+from smplxpp.core.artifact import read_manifest, sha256_file
+from smplxpp.core.params import BodyParams
+from smplxpp.core.template import Template
+from tests.evaluation.standing_doll import FRAMES, dressed, write_frames
+from tests.training.doll import HELD_OUT, doll
+
+FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+QUICK = ("--every", "4", "--samples", "1000", "--metric", "none", "--speed-pictures", "1", "--speed-size", "24", "32")
+
+
+def evaluate(run, capture, *options: str) -> int:
+    return main(["evaluate", str(run), "--capture", str(capture), "--device", "cpu", *QUICK, *options, "--json"])
+
+
+def write_dressed(run: Path) -> Path:
+    """A run with nothing but the template of the doll in its dress."""
+    (run / "60_assemble").mkdir(parents=True)
+    dressed().save(run / "60_assemble" / "smplxpp.npz")
+    return run
+
+
+def write_models(run: Path, template: Template, *, count: int = 600) -> Path:
+    """A reference fit and a student whose field moves the mesh a little, as the training leaves them."""
+    torch.manual_seed(0)
+    bound = sample_on_mesh(template, SamplingConfig(count=count))
+    student = Student(StudentConfig(FieldConfig(width=8, hidden_layers=1)), Rig(template), bound, (0, 1, 2, 3))
+    with torch.no_grad():
+        for value in student.field.parameters():
+            value.add_(0.01 * torch.randn_like(value))
+    for name in ("reference-fit", "student"):
+        (run / MODEL_FILES[name]).parent.mkdir(parents=True)
+    save_bound(bound, run / MODEL_FILES["reference-fit"])
+    save_avatar(run / MODEL_FILES["student"], student)
+    return run
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_frames(tmp_path_factory.mktemp("captures") / "doll")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return write_models(write_dressed(tmp_path_factory.mktemp("runs") / "doll"), dressed())
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained, capture, tmp_path_factory):
+    run = shutil.copytree(trained, tmp_path_factory.mktemp("evaluated") / "doll")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "log", _Quiet())
+        assert evaluate(run, capture) == 0
+    return run
+
+
+class _Quiet:
+    def warning(self, *_):
+        """A run without a build has no report to write."""
+
+
+def refused(capsys, run, capture, *options: str) -> str:
+    """The message of an evaluation that must be refused before anything is written."""
+    before = sorted(run.rglob("*"))
+    assert evaluate(run, capture, *options) == 2
+    message = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert sorted(run.rglob("*")) == before
+    return message
+
+
+def test_files_of_the_stage(evaluated):
+    folder = evaluated / "95_evaluate"
+    report = EvalReport.load(folder / "metrics.json")
+    assert list(report.models) == ["reference-fit", "student"]
+    assert report.models["student"].bytes == (evaluated / MODEL_FILES["student"]).stat().st_size
+    for name in ("summary", "training", "novel_view", "novel_pose", "novel_pose_training_view", "surface", "cost"):
+        for ending in ("txt", "csv", "tex"):
+            assert (folder / "tables" / f"{name}.{ending}").stat().st_size > 0
+    manifest = read_manifest(folder)
+    shown = {Path(view["file"]).name for view in manifest["numbers"]["views"]}
+    assert {"novel_view_Held0_000000.png", "novel_pose_Held1_000004.png"} <= shown
+    assert {path.name for path in (folder / "pictures").iterdir()} == shown | {
+        "surface_training_000001.png", "surface_held_out_000005.png"
+    }  # fmt: skip
+    truth, rendered = read_tiles(folder / "pictures" / "novel_view_Held0_000000.png", 2)
+    np.testing.assert_array_equal(truth, doll().images["Held0"])
+    assert not np.array_equal(rendered[0], rendered[1])
+    names = [check["name"] for check in manifest["checks"]]
+    assert "student, novel views: PSNR of the person" in names and "template's silhouette on the masks" in names
+    assert "P2S of lower against skinning alone, training frames" in names
+
+
+def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path, capsys):
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    assert evaluate(run, capture) == 0
+    assert json.loads(capsys.readouterr().out)["ran"] is False
+    assert evaluate(run, capture, "--sets", "novel_pose", "--models", "student", "--samples", "0", "--no-report") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["ran"] is True and list(answer["models"]) == ["student"]
+    assert list(answer["models"]["student"]["views"]) == ["novel_pose"]
+
+
+def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
+    record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
+    figures, pictures = evaluation_sections(record)
+    assert [table.caption for table in figures.tables][:2] == ["Evaluation on doll", "training views"]
+    assert figures.tables[0].header[1] == "novel views: PSNR" and len(figures.tables[0].rows) == 2
+    assert len(figures.pictures) == 2 and "skinning alone" in str(figures.tables[-2].rows)
+    captions = [picture.caption for picture in pictures.pictures]
+    assert "novel views, Held0, frame 0" in captions
+    assert any(caption.startswith("novel poses, Held1, frame 4, head, ") for caption in captions)
+    assert len(pictures.comparisons) == 2
+    assert [number.label for number in evaluation_key_numbers(record)] == [
+        "novel views", "novel poses", "pictures a second"
+    ]  # fmt: skip
+    html = write_report(tmp_path / "report.html", Report("doll", sections=(figures, pictures))).read_text()
+    assert "Avatar: figures" in html and "http" not in html.replace("http://www.w3.org", "")
+
+
+def test_an_evaluation_of_other_models_does_not_stand(evaluated, tmp_path):
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    digest = sha256_file(run / "60_assemble" / "smplxpp.npz")
+    assert standing_evaluation(run, digest) is not None and standing_evaluation(run, "other") is None
+    with (run / MODEL_FILES["student"]).open("ab") as file:
+        file.write(b" ")
+    assert standing_evaluation(run, digest) is None
+    (run / MODEL_FILES["student"]).unlink()
+    assert standing_evaluation(run, digest) is None
+    assert standing_evaluation(run.parent, digest) is None
+
+
+def test_untrained_runs_are_told_to_train(tmp_path, capture, trained, capsys):
+    run = write_dressed(tmp_path / "run")
+    message = refused(capsys, run, capture)
+    assert "a trained teacher or student" in message and "smplxpp train" in message
+    (run / "70_bind").mkdir()
+    shutil.copy(trained / MODEL_FILES["reference-fit"], run / "70_bind")
+    assert "only reference-fit" in refused(capsys, run, capture)
+    assert "80_teacher/teacher.safetensors" in refused(capsys, run, capture, "--models", "teacher")
+
+
+def test_models_of_another_template_and_damaged_ones_are_refused(trained, tmp_path, capture, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / MODEL_FILES["student"]).write_bytes(b"nonsense")
+    assert "student.safetensors" in refused(capsys, run, capture)
+    shutil.copy(trained / MODEL_FILES["student"], run / MODEL_FILES["student"])
+    anew = replace(dressed(), faces=dressed().faces[:, [1, 2, 0]])
+    anew.save(run / "60_assemble" / "smplxpp.npz")
+    assert "other faces" in refused(capsys, run, capture, "--models", "student")
+
+
+def test_captures_that_cannot_be_measured_on(trained, tmp_path, capsys):
+    run, root = shutil.copytree(trained, tmp_path / "run"), write_frames(tmp_path / "capture")
+    assert "scale" in refused(capsys, run, root, "--scale", "0")
+    assert "every" in refused(capsys, run, root, "--every", "0")
+    assert "speed-size" in refused(capsys, run, root, "--speed-size", "0", "10")
+    assert "Nowhere" in refused(capsys, run, root, "--hold-out", "Nowhere")
+    image = root / "rgbs" / "Held0" / "Held0_rgb000000.png"
+    kept = image.read_bytes()
+    Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(image)
+    assert "Held0" in refused(capsys, run, root)
+    image.write_bytes(kept)
+    for frame in range(FRAMES):
+        away = BodyParams.rest(betas=2, expressions=0)
+        BodyParams(**{**away.as_dict(), "transl": np.array([[0.6, 0.0, 0.0]])}).save(
+            root / "params" / f"{frame:06d}.npz"
+        )
+    assert "template in the images" in refused(capsys, run, root)
+
+
+@pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")  # that views are left out is what is tested
+def test_masks_without_anybody_are_an_error(trained, tmp_path, capsys):
+    run, root = shutil.copytree(trained, tmp_path / "run"), write_frames(tmp_path / "capture")
+    for name in HELD_OUT:
+        for path in [*(root / "masks" / name).iterdir(), *(root / "rgbs" / name).iterdir()]:
+            Image.fromarray(np.zeros_like(np.asarray(Image.open(path)))).save(path)
+    assert "some for novel views, novel poses" in refused(capsys, run, root)
+
+
+def test_the_terminal_shows_the_tables(evaluated, capture, capsys):
+    arguments = ["evaluate", str(evaluated), "--capture", str(capture), "--device", "cpu", *QUICK, "--no-report"]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "Evaluation on doll" in out and "skinning alone" in out and "stands, not run again" in out
+
+
+def test_tiles_keep_every_pixel(tmp_path):
+    truth, one, two = np.random.default_rng(0).integers(0, 256, (3, 6, 5, 3)).astype(np.uint8)
+    write_tiles(tmp_path / "tiles.png", truth, [one, two])
+    read, rendered = read_tiles(tmp_path / "tiles.png", 2)
+    assert np.array_equal(read, truth) and np.array_equal(rendered, [one, two])
+
+
+def test_a_mesh_on_the_truth_is_pale_and_one_off_it_dark():
+    mesh = doll().template.mesh
+    pale = surface_picture(mesh, {"same": mesh})
+    dark = surface_picture(mesh, {"off": mesh.with_vertices(mesh.vertices * 1.2)})
+    assert pale.mean() > dark.mean() + 5
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")  # coarse parts; not what is tested
+def test_the_fixture_from_its_build_to_the_page(tmp_path, capsys):
+    run = tmp_path / "run"
+    budgets = ("--budgets", "upper", "1500", "lower", "1500")
+    assert main(["build", "--capture", str(FIXTURE), "--out", str(run), *budgets, "--json"]) == 0
+    write_models(run, Template.load(run / "60_assemble" / "smplxpp.npz"), count=8000)
+    capsys.readouterr()
+    assert evaluate(run, FIXTURE) == 0
+    figures = json.loads(capsys.readouterr().out)
+    alone = figures["skinning_alone"]["training"]["mean"]
+    assert 1.0 < alone["p2s"] < 12.0 and alone["labels"]["lower"]["p2s"] > alone["labels"]["upper"]["p2s"]
+    assert figures["models"]["reference-fit"]["surfaces"]["training"]["mean"] == alone
+    fit, student = (figures["models"][name]["mean"]["novel_view"] for name in ("reference-fit", "student"))
+    assert fit["psnr"] > 12.0 and fit["psnr"] > student["psnr"]
+    html = (run / "report.html").read_text()
+    assert "Avatar: figures" in html and "Avatar: side by side" in html
