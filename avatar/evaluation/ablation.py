@@ -187,7 +187,7 @@ class Ablation:
             report=lambda progress: observer.training(name, progress),
         )  # fmt: skip
         begin = time.perf_counter()
-        with seeded(piece.seed, self.shop.device):
+        with seeded(piece.seed):
             product, progress = piece.make(self.shop, self.piece, session)
         if progress is not None and not progress.finished:
             return False
