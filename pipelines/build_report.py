@@ -23,6 +23,7 @@ from pipelines.pictures import (
 from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.scan_stages import MM, load_params_of_run, load_scan
 from pipelines.template_stages import load_parts, load_weights
+from pipelines.train_report import standing_trainings, training_key_numbers, training_section
 from smplxpp.body import load_body, load_params
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
 from smplxpp.core.artifact import StageRecord, jsonable, require_stage, versions
@@ -39,11 +40,12 @@ ERROR_LIMIT_MM = 6.0
 
 
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
-    """Write `run/report.html` from a finished run, with the fit and the evaluation of its template, if any."""
+    """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
     template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
-    later = {FIT_STAGE: fit, EVALUATE_STAGE: evaluation}
-    records = {**records, **{name: record for name, record in later.items() if record is not None}}
+    records = {**records, **({} if fit is None else {FIT_STAGE: fit})}
+    trainings = standing_trainings(run, records.values())
+    records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
     template = Template.load(run / "60_assemble" / "smplxpp.npz")
     reference = load_params_of_run(run)
     checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
@@ -60,6 +62,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
         _poses_section(template, reference, inputs),
         *(() if fit is None else (fit_section(fit),)),
+        *(training_section(record) for record in trainings.values()),
         *(() if evaluation is None else evaluation_sections(evaluation)),
     )  # fmt: skip
     clothes = records["65_validate"].manifest["numbers"]["template_vs_scan"]["labels"]
@@ -77,6 +80,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
             "scan to template", f"{sum(seconds[name] for name in STAGES):.1f} s", "all stages, validation included"
         ),
         *(() if fit is None else fit_key_numbers(fit)),
+        *training_key_numbers(trainings),
         *(() if evaluation is None else evaluation_key_numbers(evaluation)),
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}

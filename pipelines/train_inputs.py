@@ -13,6 +13,7 @@ import numpy as np
 from avatar.training.views import read_views
 from pipelines.build_config import TEMPLATE, load_build
 from pipelines.fit_stage import FitInputs, open_cameras, silhouette_overlap
+from pipelines.train_names import spread
 from smplxpp.capture import Capture
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
@@ -201,13 +202,6 @@ def _overlap(template: Template, capture: Capture, params: Mapping[int, BodyPara
             remedy="look at them with `smplxpp capture check`",
         )  # fmt: skip
     return float(np.mean(values))
-
-
-def spread(values: Sequence, count: int) -> list:
-    """At most `count` of the values, evenly from first to last."""
-    if not len(values):
-        return []
-    return [values[k] for k in np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
 
 
 def _digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:

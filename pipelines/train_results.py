@@ -22,10 +22,9 @@ from avatar.training.sequence import AvatarSequence
 from avatar.training.views import read_view
 from pipelines.build_config import COMPACT_STUDENT, STUDENT
 from pipelines.fit_pictures import write_strip
+from pipelines.train_names import KINDS, kind_name
 from smplxpp.capture import Capture
 from smplxpp.core.artifact import Check, StageOutput
-
-KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
 
 
 def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
@@ -68,7 +67,8 @@ def write_student(
     stored = load_avatar(folder / compact, sequence.rig)
     quiet = {**options, "preview": lambda images: None}
     figures = CompensateTask(sequence, stored, config, **quiet).evaluate(config.iterations)
-    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **figures}}
+    measured = {kind: figures[kind] for kind in KINDS if kind in figures}
+    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
 
 
 def stage_output(
@@ -110,11 +110,6 @@ def stage_output(
         **found,
     }
     return StageOutput(_checks(everything, overlap), everything)
-
-
-def kind_name(kind: str, *, held_out: bool) -> str:
-    """What the views of a kind are to a reader: without held-out cameras they are views that were trained on."""
-    return KINDS[kind] if held_out or kind == "novel_pose" else "training views"
 
 
 def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:

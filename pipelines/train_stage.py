@@ -20,8 +20,7 @@ from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.model_file import load_avatar
 from avatar.models.posed import AvatarModel
 from avatar.training.distributed import Distributed
-from avatar.training.loop import METRICS_FILE, Progress
-from avatar.training.machine import seeded
+from avatar.training.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
 from avatar.training.presets import TrainingPreset
 from avatar.training.sequence import AvatarSequence
 from avatar.training.shortage import explain_shortage
@@ -94,12 +93,14 @@ class TrainOptions:
         stages: of "fit", "teacher", "bake" and "compensate" in this order; those before the first must stand.
         max_seconds: stop after as long with a checkpoint and what there is.
         force: train anew even what stands.
+        tensorboard: log for TensorBoard into the folders of the stages.
         bar: called with a stage's name and iterations; shows its progress.
     """
 
     stages: tuple[str, ...] = ("fit", "teacher", "bake", "compensate")
     max_seconds: float = float("inf")
     force: bool = False
+    tensorboard: bool = False
     bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
 
 
@@ -278,13 +279,12 @@ def _stage(
     folder = run / f"{name}_work"
     session = Session(
         folder, stage_key(config=key_config, inputs=digests), metric, together, training.seconds_left(),
-        preview=preview_writer(scene.capture, folder),
+        tensorboard=training.options.tensorboard, preview=preview_writer(scene.capture, folder),
     )  # fmt: skip
 
     def trained(session: Session) -> tuple[AvatarModel, Progress, AvatarSequence]:
-        with seeded(config.seed, together.device):
-            sequence = AvatarSequence(scene.capture, scene.template, device=together.device)
-            return (*work(sequence, session), sequence)
+        sequence = AvatarSequence(scene.capture, scene.template, device=together.device)
+        return (*work(sequence, session), sequence)
 
     def first(temporary: Path) -> StageOutput:
         together.from_first(lambda: True)
@@ -293,6 +293,8 @@ def _stage(
         with explain_shortage(run):
             shutil.copytree(folder / "previews", temporary / "previews")
             shutil.copyfile(folder / METRICS_FILE, temporary / METRICS_FILE)
+            if training.options.tensorboard:
+                shutil.copytree(folder / TENSORBOARD_FOLDER, temporary / TENSORBOARD_FOLDER)
             numbers = {**write(temporary, model, sequence, session), "processes": together.world_size}
             return stage_output(temporary, model, done, sequence, numbers, overlap=scene.overlap)
 

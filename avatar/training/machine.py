@@ -11,10 +11,9 @@ import torch
 
 
 @contextmanager
-def seeded(seed: int, device: str = "cpu") -> Iterator[None]:
-    """torch's random numbers within the block follow from `seed`; those after it are as if it had not been."""
-    devices = [torch.device(device)] if device.startswith("cuda") else []
-    with torch.random.fork_rng(devices=devices):
+def seeded(seed: int) -> Iterator[None]:
+    """Random numbers of the CPU within the block follow from `seed`; those after it are as if it had not been."""
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
 

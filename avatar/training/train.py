@@ -18,6 +18,7 @@ from avatar.training.compensate import CompensateConfig, CompensateTask
 from avatar.training.distributed import Distributed
 from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.loop import LoopConfig, Progress, run_training
+from avatar.training.machine import seeded
 from avatar.training.sequence import AvatarSequence
 from avatar.training.view_task import Preview, ViewConfig, ViewTask
 
@@ -31,6 +32,7 @@ class Session:
         perceptual: for the perceptual term, None leaves it out.
         distributed: the processes that train together.
         max_seconds: stop with a checkpoint after as much work.
+        tensorboard: log for TensorBoard too.
         report: called after logged steps and evaluations. preview: with rendered images at evaluations.
     """
 
@@ -39,6 +41,7 @@ class Session:
     perceptual: PerceptualDistance | None = None
     distributed: Distributed | None = None
     max_seconds: float = float("inf")
+    tensorboard: bool = False
     report: Callable[[Progress], None] = lambda progress: None
     preview: Preview = lambda images: None
 
@@ -50,8 +53,9 @@ class Session:
     def run(self, make: Callable[[], ViewTask], config: ViewConfig) -> Progress:
         """Train what `make` gives."""
         loop = LoopConfig(
-            iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds
-        )
+            iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds,
+            tensorboard=self.tensorboard,
+        )  # fmt: skip
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
 
@@ -63,7 +67,8 @@ def fit_teacher(
     session: Session,
 ) -> tuple[TeacherAvatar, Progress]:
     """Train a teacher on Gaussians of the template."""
-    teacher = TeacherAvatar(networks, sequence.rig, gaussians)
+    with seeded(config.seed):
+        teacher = TeacherAvatar(networks, sequence.rig, gaussians)
     progress = session.run(lambda: TeacherTask(sequence, teacher, config, **session.options), config)
     return teacher.eval(), progress
 
@@ -78,7 +83,8 @@ def bake(
     teacher: TeacherAvatar | None,
 ) -> tuple[Student, Progress]:
     """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
-    made = Student(student, sequence.rig, gaussians, sequence.train_frames)
+    with seeded(config.seed):
+        made = Student(student, sequence.rig, gaussians, sequence.train_frames)
     progress = session.run(lambda: BakeTask(sequence, made, config, teacher=teacher, **session.options), config)
     return made.eval(), progress
 
@@ -91,6 +97,7 @@ def compensate(
     session: Session,
 ) -> tuple[Student, Progress]:
     """Give a baked student blend shapes and train them."""
-    made = student.with_blend_shapes(shapes)
+    with seeded(config.seed):
+        made = student.with_blend_shapes(shapes)
     progress = session.run(lambda: CompensateTask(sequence, made, config, **session.options), config)
     return made.eval(), progress

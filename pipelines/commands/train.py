@@ -88,6 +88,8 @@ class Train:
     """Of everything that is drawn."""
     force: bool = False
     """Train anew even what stands; checkpoints go. A reference fit that you made stays."""
+    tensorboard: bool = False
+    """Log for TensorBoard too, into the folders of the stages."""
     no_report: bool = False
     """Leave report.html as it is."""
     json: bool = False
