@@ -8,6 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from safetensors.torch import load, save
+from torch import Tensor
+
+from avatar.baselines.avatar_base import Baseline
+from avatar.baselines.build import BaselineConfig, make_baseline
+from avatar.baselines.outer_template import outer_template
+from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.models.blend_shapes import BlendShapeConfig
@@ -27,10 +34,15 @@ from avatar.training.sequence import AvatarSequence
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from avatar.training.views import read_views
 from smplxpp.capture import Capture
+from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.template import Template
 
-CLOTHED, NAKED = "clothed", "naked"
-GROUNDS: Mapping[str, Callable[[Template], Template]] = {CLOTHED: lambda template: template, NAKED: Template.naked}
+CLOTHED, NAKED, OUTER = "clothed", "naked", "outer"
+GROUNDS: Mapping[str, Callable[[Template], Template]] = {
+    CLOTHED: lambda template: template,
+    NAKED: Template.naked,
+    OUTER: outer_template,
+}
 """Templates that pieces are trained on, made from the person's."""
 
 
@@ -222,6 +234,43 @@ class PrunedPiece(Piece):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BaselinePiece(Piece):
+    """An avatar of another kind, trained on photographs."""
+
+    gaussians: str
+    model: BaselineConfig
+    config: PhotographConfig
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.gaussians,)
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Baseline, Progress]:
+        sequence, model = shop.sequence(self.ground), self._untrained(shop, get)
+        progress = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
+        return model.eval(), progress
+
+    def write(self, product: Baseline, path: Path, *, compact: bool = False) -> None:
+        tensors = {name: value.detach().cpu().contiguous() for name, value in product.state_dict().items()}
+        if compact:
+            tensors = {name: _halved(value) for name, value in tensors.items()}
+        atomic_write_bytes(path, save(tensors))
+
+    def read(self, path: Path, shop: Workshop, get: Get) -> Baseline:
+        model = self._untrained(shop, get)
+        model.load_state_dict(load(path.read_bytes()))  # casts what is in half precision
+        return model.eval()
+
+    def _untrained(self, shop: Workshop, get: Get) -> Baseline:
+        sequence = shop.sequence(self.ground)
+        return make_baseline(self.model, sequence.rig, get(self.gaussians), sequence.train_frames)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SamePiece(Piece):
     """A student that another piece has already made."""
 
@@ -239,3 +288,8 @@ class SamePiece(Piece):
 def fitting(shapes: BlendShapeConfig, rig: Rig) -> BlendShapeConfig:
     """Blend shapes driven by as many expressions as the body has."""
     return replace(shapes, expression_size=rig.expression_size)
+
+
+def _halved(value: Tensor) -> Tensor:
+    """As a player's file has it."""
+    return value.half() if value.is_floating_point() else value.int()

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
+from avatar.baselines.photograph_task import PhotographConfig
+from avatar.baselines.point_mlp import PointMLPConfig
+from avatar.baselines.textured_mesh import TexturedMeshConfig
+from avatar.baselines.uv_unet import UVUNetConfig
 from avatar.evaluation.ablation_pieces import (
     CLOTHED,
     NAKED,
+    OUTER,
     BakePiece,
+    BaselinePiece,
     CompensatePiece,
     FitPiece,
     Piece,
@@ -65,7 +71,19 @@ OPTION_ROWS: Mapping[str, Row] = {
     "gated": Row("gated", "gated", "head shapes act on the head alone, body shapes on the rest"),
     "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),
 }
-ROW_GROUPS: Mapping[str, Mapping[str, Row]] = {"paper": PAPER_ROWS, "options": OPTION_ROWS}
+BASELINE_ROWS: Mapping[str, Row] = {
+    "lbs": Row("LBS Gaussians", "lbs", "Gaussians on the template, which follows its joints alone; photographs"),
+    "lbs-naked": Row("LBS Gaussians, naked", "lbs_naked", "the same on the naked body"),
+    "mlp": Row("position MLP", "mlp", "residuals from a network on canonical positions (3DGS-Avatar's kind)"),
+    "uv": Row("UV U-Net, naked", "uv", "residuals from a U-Net on the naked body's UV map (GaussianAvatar's kind)"),
+    "outer": Row("teacher, outer surface", "outer_teacher", "one surface, no labels (Animatable Gaussians' kind)"),
+    "mesh": Row("textured mesh", "mesh", "field and texture, no Gaussian leaves the surface (MeshAvatar's kind)"),
+}
+ROW_GROUPS: Mapping[str, Mapping[str, Row]] = {
+    "paper": PAPER_ROWS,
+    "options": OPTION_ROWS,
+    "baselines": BASELINE_ROWS,
+}
 ROWS: Mapping[str, Row] = {name: row for group in ROW_GROUPS.values() for name, row in group.items()}
 
 
@@ -134,4 +152,27 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     else:
         bake("null_code_bake", null_share=max(preset.bake.null_share, NULL_SHARE))
         compensate("null_code", "null_code_bake", null=NULL_SHARE)
-    return pieces
+    return pieces | _baseline_pieces(preset, pieces["gaussians"])
+
+
+def _baseline_pieces(preset: TrainingPreset, fit: FitPiece) -> dict[str, Piece]:
+    """Avatars of other kinds: as many steps on photographs as the student's bake and compensation have together."""
+    steps = preset.bake.iterations + preset.compensate.iterations
+    own = {f.name: getattr(preset.bake, f.name) for f in fields(PhotographConfig)}
+    photographs = replace(PhotographConfig(**own), iterations=steps)
+    still = StudentConfig(field=None)
+    skinned = replace(preset.bake, iterations=steps)
+    # As fine as half the teacher's maps: charts of an atlas waste less of them than two views of a body.
+    unet = UVUNetConfig(size=preset.networks.teacher.out_size // 2)
+    mesh = TexturedMeshConfig(preset.networks.field, preset.fit.sampling)
+    return {
+        "lbs": BakePiece(source="gaussians", student=still, config=skinned),
+        "lbs_naked": BakePiece(ground=NAKED, source="naked_gaussians", student=still, config=skinned),
+        "mlp": BaselinePiece(gaussians="gaussians", model=PointMLPConfig(), config=photographs),
+        "uv": BaselinePiece(ground=NAKED, gaussians="naked_gaussians", model=unet, config=photographs),
+        "mesh": BaselinePiece(gaussians="gaussians", model=mesh, config=replace(photographs, attributes=0.0)),
+        "outer_gaussians": replace(fit, ground=OUTER),
+        "outer_teacher": TeacherPiece(
+            ground=OUTER, gaussians="outer_gaussians", networks=preset.networks.teacher, config=preset.teacher
+        ),
+    }

@@ -1,0 +1,98 @@
+"""What the baselines share: Gaussians on a mesh that follows its joints alone, with residuals from a network."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.deformation_field import FrameCodes
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion, Rig
+from avatar.models.teacher import local_offsets
+from avatar.training.gradient_task import ParameterGroup
+
+POSITION_SCALE = 0.05
+"""Metres of displacement for an output of 1, as the teacher's."""
+RESIDUALS = 12
+"""Outputs a Gaussian: position 3, log scales 2, quaternion 4, colour 3."""
+
+
+class Baseline(nn.Module, ABC):
+    """An avatar that learns from photographs alone (an `AvatarModel`).
+
+    Attributes:
+        rig: of the template. gaussians: on it.
+    """
+
+    rig: Rig
+    gaussians: LearnedGaussians
+
+    @abstractmethod
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The avatar in a pose, as C cameras at `eyes` (C, 3) see it."""
+
+    @abstractmethod
+    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
+        """What is learned beside the attributes of the Gaussians; `rate` is that of networks."""
+
+
+class ResidualBaseline(Baseline):
+    """`x = LBS(R (u + du) + ...)`: residuals of position, scale, rotation and colour on a skinned template.
+
+    Args:
+        frames: that have a code. code_size: of each.
+    """
+
+    def __init__(self, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int], *, code_size: int) -> None:
+        super().__init__()
+        gaussians.check_topology(rig.faces, "template of the baseline")
+        self.rig = rig
+        self.gaussians = LearnedGaussians(gaussians)
+        self.gaussians.normalise_quats()
+        self.codes = FrameCodes(frames, code_size)
+        canonical = triangle_frames(rig.vertices, rig.faces)
+        face = gaussians.face_index.to(rig.device)
+        self.register_buffer("corner_weights", corner_weights(gaussians).to(rig.device), persistent=False)
+        self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
+        points = (self.corner_weights[..., None] * canonical.corners[face]).sum(1)
+        self.register_buffer("points", points, persistent=False)
+
+    @abstractmethod
+    def residuals(self, motion: Motion, code: Tensor) -> Tensor:
+        """(N, 12) outputs in the order of `RESIDUALS`; `code` (code_size,) of the frame."""
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The avatar in a pose, as C cameras at `eyes` (C, 3) see it."""
+        code = self.codes([motion.frame if motion.frame in self.codes.row else None])[0]
+        position, log_scales, quats, colour = self.residuals(motion, code).split((3, 2, 4, 3), dim=-1)
+        bound = self.gaussians()
+        bound = replace(
+            bound,
+            offset=bound.offset + local_offsets(POSITION_SCALE * position, self.canonical_from_local),
+            log_scales=bound.log_scales + log_scales,
+            quats=bound.quats + quats,
+            dc=bound.dc + colour,
+        )
+        vertices = self.rig.pose(motion)
+        frames = triangle_frames(vertices, self.rig.faces)
+        world = world_from_frames(bound, frames)
+        return PosedAvatar(vertices, world, view_colors(bound, frames, world.means.detach(), eyes), bound)
+
+    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
+        """Networks and codes."""
+        own = {name: p for name, p in self.named_parameters() if not name.startswith("gaussians.")}
+        return [ParameterGroup("networks", own, rate, final)]
+
+
+def corner_weights(gaussians: BoundGaussians) -> Tensor:
+    """(N, 3) weights of the corners of each Gaussian's triangle."""
+    u, v = gaussians.barycentric.unbind(-1)
+    return torch.stack([u, v, 1.0 - u - v], dim=-1)

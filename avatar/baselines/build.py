@@ -1,0 +1,24 @@
+"""A baseline from its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from avatar.baselines.avatar_base import Baseline
+from avatar.baselines.point_mlp import PointMLPAvatar, PointMLPConfig
+from avatar.baselines.textured_mesh import TexturedMeshAvatar, TexturedMeshConfig
+from avatar.baselines.uv_unet import UVUNetAvatar, UVUNetConfig
+from avatar.gaussians.binding import BoundGaussians
+from avatar.models.rig import Rig
+
+BaselineConfig = PointMLPConfig | UVUNetConfig | TexturedMeshConfig
+_KINDS = {PointMLPConfig: PointMLPAvatar, UVUNetConfig: UVUNetAvatar, TexturedMeshConfig: TexturedMeshAvatar}
+
+
+def make_baseline(config: BaselineConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> Baseline:
+    """An untrained baseline of the configuration's kind.
+
+    Args:
+        rig: of any template. gaussians: fitted on it. frames: that have a code.
+    """
+    return _KINDS[type(config)](config, rig, gaussians, frames)

@@ -1,0 +1,52 @@
+"""The training of every baseline: photographs, the shared loss, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from avatar.baselines.avatar_base import Baseline
+from avatar.training.sequence import AvatarSequence, Item, eyes_of
+from avatar.training.view_task import ViewConfig, ViewTask
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotographConfig(ViewConfig):
+    """Choices of a baseline's training.
+
+    Attributes:
+        null_share: of the poses that are shown with the null code.
+    """
+
+    null_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.null_share <= 1.0:
+            raise InputError("baseline: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+
+
+class PhotographTask(ViewTask):
+    """`L_rec` of a baseline's renderings against photographs."""
+
+    def __init__(self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, **options: Any) -> None:
+        groups = model.groups(config.rate, config.final)
+        super().__init__(sequence, model, config, groups, **options)
+        for group in groups:
+            # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
+            for value in group.parameters.values():
+                value.requires_grad_(True)
+        self.config = config
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """Of one frame."""
+        views = self.views(item)
+        motion = self.sequence.motion(item.frame)
+        if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
+            motion = motion.without_code()
+        total, terms, _ = self.compared(self.model(motion, eyes_of(views)), views)
+        return total, {"loss": float(total.detach()), **terms}

@@ -1,0 +1,89 @@
+"""Textured mesh: the template with a learned texture and a learned deformation; no Gaussian leaves the surface.
+
+The kind of MeshAvatar (Chen et al. 2024): an animatable mesh with a texture that photographs teach. Theirs extracts
+the mesh from a signed distance field, has physical materials, and is drawn by nvdiffrast; here the mesh is the
+template, the texture is plain colour, and a texel is one flat opaque splat fixed to its triangle, so that all rows
+share one rasteriser. Splats overlap their neighbours by a little more than half: the surface is closed, its silhouette
+smooth, and gradients reach the mesh through silhouettes too, which a z-buffer's (`avatar.render.mesh_maps`) do not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avatar.baselines.avatar_base import Baseline, corner_weights
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.deformation_field import FieldConfig
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion, Rig
+from avatar.models.student import Student, StudentConfig
+from avatar.training.fit_config import LearningRates
+from avatar.training.gradient_task import ParameterGroup
+
+OPACITY = 0.99
+
+
+@dataclass(frozen=True)
+class TexturedMeshConfig:
+    """What it is made of.
+
+    Attributes:
+        field: of the mesh's motion. sampling: of the texels; opacity and view dependence are not taken from it.
+    """
+
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    sampling: SamplingConfig = dataclasses.field(default_factory=SamplingConfig)
+
+
+class TexturedMeshAvatar(Baseline):
+    """A student without blend shapes whose Gaussians are texels: only their colours learn.
+
+    Args:
+        config: sizes. rig: of the template. frames: that have a code.
+        gaussians: texels near one of these start with its colour.
+    """
+
+    def __init__(self, config: TexturedMeshConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:
+        super().__init__()
+        self.config, self.rig = config, rig
+        texels = sample_on_mesh(rig.template, replace(config.sampling, opacity=OPACITY, sh_degree=0))
+        texels = replace(texels.to(device=rig.device), dc=_nearest_colors(rig, texels, gaussians))
+        self.student = Student(StudentConfig(field=config.field), rig, texels, tuple(frames))
+
+    @property
+    def gaussians(self) -> LearnedGaussians:
+        """The texels."""
+        return self.student.gaussians
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The mesh in a pose, as C cameras at `eyes` (C, 3) see it."""
+        return self.student(motion, eyes)
+
+    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
+        """Field, codes and texture."""
+        return [
+            ParameterGroup("field", dict(self.student.field.named_parameters()), rate, final),
+            ParameterGroup("codes", {"codes": self.student.codes.codes}, rate, final),
+            ParameterGroup("texture", {"dc": self.gaussians.dc}, LearningRates().dc, final),
+        ]
+
+
+def _nearest_colors(rig: Rig, texels: BoundGaussians, gaussians: BoundGaussians) -> Tensor:
+    """(N, 3) colours of the nearest Gaussians in the T-pose."""
+    triangles = rig.template.mesh.triangles
+
+    def places(bound: BoundGaussians) -> np.ndarray:
+        weights = corner_weights(bound).double().cpu().numpy()
+        return (weights[..., None] * triangles[bound.face_index.cpu().numpy()]).sum(axis=1)
+
+    nearest = cKDTree(places(gaussians)).query(places(texels))[1]
+    return gaussians.dc[torch.tensor(nearest, device=gaussians.dc.device)].to(rig.device)

@@ -1,0 +1,117 @@
+"""A UV atlas made from the template alone: one cylindrical chart a limb, packed by their size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from smplxpp.core.template import Template
+
+BODY_JOINTS = 22
+"""Joints of SMPL-X's layout before face and hands: those hang on the nearest of these above them."""
+GUTTER = 2
+"""Texels kept free round a chart."""
+REACH = 2.5
+"""Texels from a texel to the point that stands for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """N points of a template in a square of `size` texels.
+
+    Attributes:
+        size: texels a side.
+        pixels: (N, 2) column and row of each point, texel centres at +0.5.
+        anchor: (size, size) the point that stands for a texel, -1 where there is none near.
+        chart: (N,) chart of each point.
+    """
+
+    size: int
+    pixels: np.ndarray
+    anchor: np.ndarray
+    chart: np.ndarray
+
+
+def cylinder_atlas(template: Template, points: np.ndarray, faces: np.ndarray, *, size: int) -> Atlas:
+    """Unwrap points on the template's faces in the T-pose.
+
+    A chart is what follows one body joint most, part by part. Its axis is the direction of its largest extent; u is the
+    angle round it, times the mean radius, v the height along it. Charts of one texel density are packed in rows. Points
+    inside one another (a tongue in a mouth) have charts of their own as far as the body labels them.
+
+    Args:
+        points: (N, 3) in the T-pose, metres. faces: (N,) each on one of these.
+        size: texels a side.
+    """
+    chart = _charts(template)[template.faces[faces, 0]]
+    chart = np.unique(chart, return_inverse=True)[1]
+    flat = np.zeros((len(points), 2))
+    for k in range(chart.max() + 1):
+        flat[chart == k] = _unrolled(points[chart == k])
+    low = np.stack([_by_chart(np.minimum, flat[:, axis], chart) for axis in (0, 1)], axis=1)
+    extent = np.stack([_by_chart(np.maximum, flat[:, axis], chart) for axis in (0, 1)], axis=1) - low
+    corners, density = _packed(extent, size)
+    pixels = corners[chart] + GUTTER + (flat - low[chart]) * density
+    centres = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2) + 0.5
+    distance, nearest = cKDTree(pixels).query(centres)
+    anchor = np.where(distance <= REACH, nearest, -1).reshape(size, size)
+    return Atlas(size, pixels, anchor, chart)
+
+
+def _charts(template: Template) -> np.ndarray:
+    """(V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
+    joint = np.argmax(template.weights.dense(), axis=1)
+    while (beyond := joint >= BODY_JOINTS).any():
+        joint = np.where(beyond, template.parents[joint], joint)
+    label = template.body_labels[template.body_index]
+    return (template.vertex_part * len(template.body_label_names) + label) * BODY_JOINTS + joint
+
+
+def _unrolled(points: np.ndarray) -> np.ndarray:
+    """(n, 2) metres along the circumference and along the axis of (n, 3) points; the seam lies at the back."""
+    centred = points - points.mean(axis=0)
+    axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    towards = np.eye(3)[1] if abs(axis[2]) > 0.7 else np.eye(3)[2]
+    front = towards - (towards @ axis) * axis
+    front /= np.linalg.norm(front)
+    side = np.cross(axis, front)
+    x, z = centred @ side, centred @ front
+    return np.stack([np.arctan2(x, z) * np.hypot(x, z).mean(), centred @ axis], axis=1)
+
+
+def _by_chart(reduce: np.ufunc, values: np.ndarray, chart: np.ndarray) -> np.ndarray:
+    start = np.inf if reduce is np.minimum else -np.inf
+    out = np.full(chart.max() + 1, start)
+    reduce.at(out, chart, values)
+    return out
+
+
+def _packed(extent: np.ndarray, size: int) -> tuple[np.ndarray, float]:
+    """(K, 2) corners of K charts in texels, and the largest density, texels a metre, at which they all fit."""
+    low, high = 0.0, size / max(extent.max(), 1e-6)
+    corners = _rows(np.ceil(low * extent) + 2 * GUTTER, size)
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        placed = _rows(np.ceil(middle * extent) + 2 * GUTTER, size)
+        if placed is None:
+            high = middle
+        else:
+            low, corners = middle, placed
+    return corners, low
+
+
+def _rows(boxes: np.ndarray, size: int) -> np.ndarray | None:
+    """(K, 2) corners of (K, 2) boxes put in rows, the highest first; None if they do not fit."""
+    corners = np.zeros_like(boxes)
+    left = top = height = 0.0
+    # Each box goes beside the one before it: a loop over charts, not over vertices.
+    for k in np.argsort(-boxes[:, 1], kind="stable"):
+        if left + boxes[k, 0] > size:
+            left, top, height = 0.0, top + height, 0.0
+        corners[k] = left, top
+        left, height = left + boxes[k, 0], max(height, boxes[k, 1])
+        if left > size or top + height > size:
+            return None
+    return corners

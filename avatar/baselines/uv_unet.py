@@ -1,0 +1,111 @@
+"""UV U-Net: the posed naked body as a position map in UV space, and the Gaussians' residuals out of a small U-Net.
+
+The kind of GaussianAvatar (Hu et al. 2024): a pose encoder turns the UV position map of the posed body into a feature
+map, to which one learned feature map of the person is added, and a decoder gives Gaussians their parameters. Theirs has
+SMPL's artist-made atlas, one Gaussian a texel and refines the poses too; here the atlas is made from the template
+(`cylinder_atlas`), Gaussians are those of all rows and look their residuals up, and poses stay as given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
+from avatar.baselines.uv_atlas import cylinder_atlas
+from avatar.gaussians.binding import BoundGaussians
+from avatar.models.config import require_at_least
+from avatar.models.layers import ConvLayer
+from avatar.models.rig import Motion, Rig
+
+
+@dataclass(frozen=True)
+class UVUNetConfig:
+    """Sizes.
+
+    Attributes:
+        size: texels of the maps, a side. features: channels of the person's learned map.
+        channels: of the U-Net's scales, the finest first; each next one has half the side.
+        code_size: of a frame's code, which joins every texel.
+    """
+
+    size: int = 128
+    features: int = 16
+    channels: tuple[int, ...] = (24, 32, 48, 64)
+    code_size: int = 16
+
+    def __post_init__(self) -> None:
+        for name in ("features", "code_size"):
+            require_at_least(f"UV U-Net {name}", getattr(self, name), 1)
+        require_at_least("UV U-Net scales", len(self.channels), 1)
+        require_at_least("UV U-Net size", self.size, 2 ** (len(self.channels) + 1))
+
+
+class UNet(nn.Module):
+    """(1, inputs, S, S) -> (1, outputs, S, S), zero at first; S is divisible by 2 for every scale but the first."""
+
+    def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
+        super().__init__()
+        self.first = ConvLayer(inputs, channels[0])
+        pairs = list(pairwise(channels))
+        self.down = nn.ModuleList(ConvLayer(fine, coarse, down=True) for fine, coarse in pairs)
+        self.up = nn.ModuleList(ConvLayer(fine + coarse, fine) for fine, coarse in reversed(pairs))
+        self.last = nn.Conv2d(channels[0], outputs, 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        scales = [self.first(x)]
+        for layer in self.down:
+            scales.append(layer(scales[-1]))
+        x = scales.pop()
+        for layer in self.up:
+            x = layer(torch.cat([scales.pop(), F.interpolate(x, scale_factor=2, mode="bilinear")], dim=1))
+        return self.last(x)
+
+
+class UVUNetAvatar(ResidualBaseline):
+    """`residual map = UNet(position map + learned features + z_t)`, looked up bilinearly at each Gaussian.
+
+    Args:
+        config: sizes. rig: of the template, the naked one in the published form. gaussians: on it.
+        frames: that have a code.
+    """
+
+    def __init__(self, config: UVUNetConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:
+        super().__init__(rig, gaussians, frames, code_size=config.code_size)
+        self.config = config
+        size = config.size
+        atlas = cylinder_atlas(
+            rig.template, self.points.double().cpu().numpy(), gaussians.face_index.cpu().numpy(), size=size
+        )
+        anchor = torch.tensor(atlas.anchor.reshape(-1), device=rig.device)
+        texels = torch.nonzero(anchor >= 0)[:, 0]
+        grid = torch.tensor(2.0 * atlas.pixels / size - 1.0, dtype=torch.float32, device=rig.device)
+        self.register_buffer("texels", texels, persistent=False)
+        self.register_buffer("texel_corners", rig.faces[self.gaussians.face_index[anchor[texels]]], persistent=False)
+        self.register_buffer("texel_weights", self.corner_weights[anchor[texels]], persistent=False)
+        self.register_buffer("grid", grid[None, None], persistent=False)
+        self.person = nn.Parameter(torch.zeros(1, config.features, size, size))
+        self.network = UNet(3 + config.features + config.code_size, config.channels, RESIDUALS)
+        self.to(rig.device)
+
+    def position_map(self, motion: Motion) -> Tensor:
+        """(1, 3, S, S) posed points without the root's motion, metres; 0 between the charts. A constant."""
+        with torch.no_grad():
+            to_root = motion.root_from_world
+            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
+            seen = (self.texel_weights[..., None] * vertices[self.texel_corners]).sum(1)
+            out = vertices.new_zeros(self.config.size**2, 3).index_copy(0, self.texels, seen)
+            return out.T.reshape(1, 3, self.config.size, self.config.size)
+
+    def residuals(self, motion: Motion, code: Tensor) -> Tensor:
+        """(N, 12)."""
+        of_frame = code[None, :, None, None].expand(-1, -1, self.config.size, self.config.size)
+        maps = self.network(torch.cat([self.position_map(motion), self.person, of_frame], dim=1))
+        return F.grid_sample(maps, self.grid, align_corners=False)[0, :, 0].T
