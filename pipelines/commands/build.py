@@ -11,8 +11,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pipelines.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs
+from pipelines.build_config import FIT_STAGE, STAGES, TRAIN_STAGES, BuildConfig, BuildInputs
 from pipelines.commands.options import OptionalPath
+from pipelines.evaluate_config import EVALUATE_STAGE
 from pipelines.progress import stage_progress
 from smplxpp.capture import find_reference
 from smplxpp.core.artifact import StageRecord
@@ -93,12 +94,11 @@ class Build:
         return {**metrics, "failed": failed, "exit_status": 0}
 
     def _report_stands(self, records: dict[str, StageRecord]) -> bool:
-        """Whether the report was written after every stage, a fit's among them."""
+        """Whether the report was written after every stage, those of other commands among them."""
         report = self.out / "report.html"
         manifests = [record.folder / "manifest.json" for record in records.values()]
-        made = [
-            path.stat().st_mtime_ns for path in (*manifests, self.out / FIT_STAGE / "manifest.json") if path.exists()
-        ]
+        manifests += [self.out / name / "manifest.json" for name in (FIT_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)]
+        made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
         return report.is_file() and report.stat().st_mtime_ns > max(made)
 
     def inputs(self) -> BuildInputs:

@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.build_config import FIT_STAGE, STAGES
+from pipelines.build_config import FIT_STAGE, STAGES, TRAIN_STAGES
+from pipelines.evaluate_config import EVALUATE_STAGE
 from pipelines.report.model import CheckRow, count_statuses, worst_status
 from smplxpp.core.artifact import read_manifest
 from smplxpp.core.errors import InputError
@@ -85,6 +86,10 @@ def _remedy(run: Path, stage: str) -> str:
     """The command that makes a stage."""
     if stage == FIT_STAGE:
         return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
+    if stage in TRAIN_STAGES:
+        return f"smplxpp train --run {run} --capture DIR (with the training's options)"
+    if stage == EVALUATE_STAGE:
+        return f"smplxpp evaluate {run} --capture DIR (with the evaluation's options)"
     return f"smplxpp build --out {run} --from-stage {stage} (with the build's options)"
 
 

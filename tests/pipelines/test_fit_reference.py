@@ -92,7 +92,10 @@ def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
     assert next(s for s in summary["stages"] if s["stage"] == "70_bind")["state"] == "outdated"
 
 
-@pytest.mark.parametrize(("stage", "command"), [("70_bind", "fit-reference"), ("50_unpose", "build")])
+@pytest.mark.parametrize(
+    ("stage", "command"),
+    [("70_bind", "fit-reference"), ("50_unpose", "build"), ("85_bake", "train"), ("95_evaluate", "evaluate")],
+)
 def test_inspect_says_which_command_makes_a_stage(own, stage, command):
     assert f"smplxpp {command} " in inspect._remedy(own, stage)
 
