@@ -32,7 +32,6 @@ from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion
 from avatar.training.loop import STATE_FILE, Progress
-from avatar.training.machine import seeded
 from avatar.training.train import Session
 from smplxpp.core.artifact import jsonable, stage_key
 from smplxpp.core.atomic import atomic_write_text
@@ -187,8 +186,7 @@ class Ablation:
             report=lambda progress: observer.training(name, progress),
         )  # fmt: skip
         begin = time.perf_counter()
-        with seeded(piece.seed):
-            product, progress = piece.make(self.shop, self.piece, session)
+        product, progress = piece.make(self.shop, self.piece, session)
         if progress is not None and not progress.finished:
             return False
         piece.write(product, folder / PIECE_FILE)

@@ -30,6 +30,7 @@ from avatar.training.fit_config import FitConfig
 from avatar.training.fit_reference import FitScene, fit_reference
 from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.loop import Progress
+from avatar.training.machine import seeded
 from avatar.training.sequence import AvatarSequence
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from avatar.training.views import read_views
@@ -87,11 +88,6 @@ class Piece(ABC):
     def needs(self) -> tuple[str, ...]:
         """Names of the pieces that it is made from."""
 
-    @property
-    @abstractmethod
-    def seed(self) -> int:
-        """Of networks that start at random."""
-
     @abstractmethod
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Any, Progress | None]:
         """Train it, from the session's checkpoint if there is one; None for the progress of what needs no steps."""
@@ -115,10 +111,6 @@ class FitPiece(Piece):
     @property
     def needs(self) -> tuple[str, ...]:
         return ()
-
-    @property
-    def seed(self) -> int:
-        return self.config.seed
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[BoundGaussians, Progress]:
         sequence = shop.sequence(self.ground)
@@ -153,10 +145,6 @@ class TeacherPiece(Piece):
     def needs(self) -> tuple[str, ...]:
         return (self.gaussians,)
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[TeacherAvatar, Progress]:
         return fit_teacher(shop.sequence(self.ground), get(self.gaussians), self.networks, self.config, session)
 
@@ -177,10 +165,6 @@ class BakePiece(Piece):
     def needs(self) -> tuple[str, ...]:
         return (self.source,)
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
         source, sequence = get(self.source), shop.sequence(self.ground)
         teacher = source if isinstance(source, TeacherAvatar) else None
@@ -200,10 +184,6 @@ class CompensatePiece(Piece):
     def needs(self) -> tuple[str, ...]:
         return (self.student,)
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
         sequence = shop.sequence(self.ground)
         return compensate(sequence, get(self.student), fitting(self.shapes, sequence.rig), self.config, session)
@@ -220,7 +200,6 @@ class PrunedPiece(Piece):
     student: str
     keep: float
     max_bytes: float
-    seed = 0  # nothing is random
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -245,12 +224,10 @@ class BaselinePiece(Piece):
     def needs(self) -> tuple[str, ...]:
         return (self.gaussians,)
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Baseline, Progress]:
-        sequence, model = shop.sequence(self.ground), self._untrained(shop, get)
+        sequence = shop.sequence(self.ground)
+        with seeded(self.config.seed):
+            model = self._untrained(shop, get)
         progress = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
         return model.eval(), progress
 
@@ -275,7 +252,6 @@ class SamePiece(Piece):
     """A student that another piece has already made."""
 
     student: str
-    seed = 0  # nothing is random
 
     @property
     def needs(self) -> tuple[str, ...]:
