@@ -1,0 +1,156 @@
+"""Avatars as files: what is read back is what was written, and what cannot be read is said."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from avatar.models.blend_shapes import BlendShapeConfig
+from avatar.models.model_file import HEADER, SCHEMA, load_avatar, save_avatar
+from avatar.models.rig import Rig
+from avatar.models.student import Student, StudentConfig
+from avatar.models.teacher_avatar import TeacherAvatar
+from smplxpp.core.errors import InputError
+from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
+
+EYES = torch.tensor([[0.0, 0.8, 2.0]])
+SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8)
+KINDS = ("teacher", "student", "no field", "control points", "shapes", "local", "gated", "pruned")
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return Rig(template())
+
+
+def make(kind: str, rig: Rig):
+    torch.manual_seed(0)
+    if kind == "teacher":
+        model = TeacherAvatar(replace(TINY_TEACHER, noise=True), rig, varied(gaussians()))
+    else:
+        shapes = {"shapes": SHAPES, "local": replace(SHAPES, parts=4), "gated": replace(SHAPES, gated=True),
+                  "pruned": replace(SHAPES, parts=3, gated=True, jaw=True)}.get(kind)  # fmt: skip
+        config = StudentConfig(
+            None if kind == "no field" else TINY_FIELD, shapes, 40 if kind == "control points" else 0
+        )
+        model = Student(config, rig, varied(gaussians()), () if kind == "no field" else (0, 2, 3))
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            if not name.startswith("gaussians."):
+                value.add_(0.02 * torch.randn(value.shape))
+    if kind == "pruned":
+        model = model.with_blend_shapes(model.blend_shapes.pruned(torch.ones(3, 5), keep=0.3))
+    return model
+
+
+def look(model, rig) -> list[torch.Tensor]:
+    with torch.no_grad():
+        posed = model(rig.motion(dance().frame(3), frame=3), EYES)
+    return [posed.vertices, posed.gaussians.means, posed.gaussians.scales, posed.gaussians.quats,
+            posed.gaussians.opacities, posed.colors]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_gives_the_same_avatar_bit_for_bit(kind, rig, tmp_path):
+    model = make(kind, rig)
+    size = save_avatar(tmp_path / "a.safetensors", model)
+    assert size == (tmp_path / "a.safetensors").stat().st_size
+    other = load_avatar(tmp_path / "a.safetensors", rig)
+    assert type(other) is type(model) and other.config == model.config and not other.training
+    own, read = model.state_dict(), other.state_dict()
+    assert own.keys() == read.keys()
+    assert all(value.dtype == read[name].dtype and torch.equal(value, read[name]) for name, value in own.items())
+    for a, b in zip(look(model, rig), look(other, rig), strict=True):
+        assert torch.equal(a, b)
+    save_avatar(tmp_path / "b.safetensors", other)
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_compact_file_is_within_half_precision_and_half_the_size(kind, rig, tmp_path):
+    model = make(kind, rig)
+    whole = save_avatar(tmp_path / "whole.safetensors", model)
+    compact = save_avatar(tmp_path / "compact.safetensors", model, compact=True)
+    assert compact < 0.6 * whole
+    other = load_avatar(tmp_path / "compact.safetensors", rig)
+    for (name, value), read in zip(model.state_dict().items(), other.state_dict().values(), strict=True):
+        assert value.dtype == read.dtype
+        torch.testing.assert_close(read, value, rtol=2.0**-10, atol=1e-6, msg=name)
+    for a, b in zip(look(model, rig), look(other, rig), strict=True):
+        torch.testing.assert_close(a, b, rtol=0.01, atol=0.01)
+
+
+def test_frames_that_have_a_code_are_remembered(rig, tmp_path):
+    save_avatar(tmp_path / "a", make("student", rig))
+    assert load_avatar(tmp_path / "a", rig).frames == (0, 2, 3)
+
+
+def changed(path, *, about=None, tensors=None, header=HEADER) -> None:
+    """Rewrite a file with other metadata or tensors."""
+    with safe_open(path, framework="pt") as file:
+        own = json.loads(file.metadata()[HEADER])
+        kept = {name: file.get_tensor(name) for name in file.keys()}
+    save_file({**kept, **(tensors or {})} if tensors is None or tensors else {}, path,
+              metadata={header: json.dumps({**own, **(about or {})})})  # fmt: skip
+
+
+def test_files_that_are_no_avatar_are_refused(rig, tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(InputError, match="smplxpp train"):
+        load_avatar(path, rig)
+    path.write_bytes(b"not a model")
+    with pytest.raises(InputError, match="smplxpp train"):
+        load_avatar(path, rig)
+    save_file({"x": torch.zeros(3)}, path)
+    with pytest.raises(InputError, match="smplxpp train"):
+        load_avatar(path, rig)
+    save_avatar(path, make("student", rig))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="smplxpp train"):
+        load_avatar(path, rig)
+
+
+def test_a_newer_version_is_named(rig, tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_avatar(path, make("student", rig))
+    changed(path, about={"schema": SCHEMA + 1})
+    with pytest.raises(InputError, match=f"version {SCHEMA + 1}.*[Uu]pdate"):
+        load_avatar(path, rig)
+
+
+def test_an_avatar_of_another_template_is_refused(rig, tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_avatar(path, make("teacher", rig))
+    other = replace(template(), faces=template().faces[::-1])
+    with pytest.raises(InputError, match="of this template"):
+        load_avatar(path, Rig(other))
+
+
+def test_tensors_of_another_shape_are_named(rig, tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_avatar(path, make("student", rig))
+    changed(path, tensors={"codes.codes": torch.zeros(2, 4)})
+    with pytest.raises(InputError, match=r"codes\.codes of shape"):
+        load_avatar(path, rig)
+
+
+def test_a_configuration_with_unknown_fields_is_refused(rig, tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_avatar(path, make("teacher", rig))
+    changed(path, about={"config": {"in_size": 16}})
+    with pytest.raises(InputError, match="stored TeacherConfig"):
+        load_avatar(path, rig)
+
+
+@pytest.mark.parametrize("about", [{"topology": 3}, {"field": {}}, {"blend_shapes": {"parts": 2}}])
+def test_metadata_that_makes_no_sense_is_refused(rig, tmp_path, about):
+    path = tmp_path / "a.safetensors"
+    save_avatar(path, make("student", rig))
+    changed(path, about=about)
+    with pytest.raises(InputError):
+        load_avatar(path, rig)

@@ -1,0 +1,56 @@
+"""Presets: the paper's numbers, and what seeds and shares change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from avatar.training.presets import TRAINING_PRESETS, training_preset
+from smplxpp.core.errors import InputError
+
+STAGES = ("fit", "teacher", "bake", "compensate")
+
+
+def test_the_papers_numbers():
+    paper = training_preset("paper")
+    iterations = (paper.teacher.iterations, paper.bake.iterations, paper.compensate.iterations)
+    assert iterations == (600_000, 30_000, 100_000)
+    assert paper.fit.sampling.count == 270_000 and paper.compensate.items == 4
+    assert (paper.blend_shapes.head_shapes, paper.blend_shapes.body_shapes) == (8, 20)
+    assert paper.teacher.rate == paper.bake.rate == paper.compensate.rate == 5e-4
+    for stage in (paper.teacher, paper.bake, paper.compensate):
+        weights = stage.weights
+        assert (weights.dssim, weights.perceptual, weights.normal, weights.alpha) == (0.2, 0.01, 0.02, 0.0)
+    assert (paper.bake.nonrigid, paper.bake.semantic) == (0.1, 1.0)
+
+
+@pytest.mark.parametrize("name", TRAINING_PRESETS)
+def test_a_seed_reaches_every_stage_and_nothing_else(name):
+    preset = training_preset(name)
+    seeded = preset.seeded(7)
+    assert {getattr(seeded, stage).seed for stage in STAGES} == {7} and seeded.fit.sampling.seed == 7
+    assert seeded.seeded(0) == preset.seeded(0)
+
+
+@pytest.mark.parametrize("name", TRAINING_PRESETS)
+def test_a_share_is_one_of_the_iterations_alone(name):
+    preset, tenth = training_preset(name), training_preset(name).shortened(0.1)
+    for stage in STAGES:
+        own, short = getattr(preset, stage), getattr(tenth, stage)
+        assert short.iterations == round(0.1 * own.iterations)
+        same = {"iterations": own.iterations, **({"pretrain": own.pretrain} if stage == "teacher" else {})}
+        assert replace(short, **same) == own
+    assert tenth.teacher.pretrain == round(0.1 * preset.teacher.pretrain)
+    assert all(getattr(preset.shortened(1e-9), stage).iterations == 1 for stage in STAGES)
+
+
+@pytest.mark.parametrize("name", TRAINING_PRESETS)
+def test_the_bakes_student_has_no_blend_shapes(name):
+    student = training_preset(name).student()
+    assert student.blend_shapes is None and student.field == training_preset(name).networks.field
+
+
+def test_an_unknown_name_is_refused():
+    with pytest.raises(InputError, match="'paper' or 'gpu' or 'cpu' or 'demo'"):
+        training_preset("tpu")
