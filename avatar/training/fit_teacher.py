@@ -9,11 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avatar.losses.deformation import DisplacementLoss
 from avatar.models.posed import PosedAvatar
 from avatar.models.teacher import Residuals
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import Track
 from avatar.training.gradient_task import ParameterGroup
 from avatar.training.sequence import AvatarSequence, Item, eyes_of
+from avatar.training.track import TrackConfig
 from avatar.training.view_task import ViewConfig, ViewTask
 
 
@@ -22,8 +25,9 @@ class FitTeacherConfig(ViewConfig):
     """Choices of the teacher's training.
 
     Attributes:
-        iterations: 600k in the paper. pretrain: steps before those that teach networks which start at random to give
-            zero residuals, `mean |maps|`; 5k in Animatable Gaussians.
+        iterations: 600k in the paper. pretrain: of them, those at the start that teach the networks residuals without
+            rendering: zero ones (5k steps in Animatable Gaussians), or with `track` the displacements that were found.
+        track: follow the surface first; None: the paper's way.
         view_jitter: standard deviation of the noise on the directions that colour sees, as a share of the distance.
         displacement: weight of `mean |dU|^2` over the Gaussians, in units of the map.
     """
@@ -32,15 +36,31 @@ class FitTeacherConfig(ViewConfig):
     pretrain: int = 5_000
     view_jitter: float = 0.1
     displacement: float = 0.0
+    track: TrackConfig | None = None
 
 
 class TeacherTask(ViewTask):
-    """`L_rec` of the teacher's renderings; the first `pretrain` of the iterations ask for zero residuals."""
+    """`L_rec` of the teacher's renderings; the first `pretrain` of the iterations ask for known residuals.
 
-    def __init__(self, sequence: AvatarSequence, teacher: TeacherAvatar, config: FitTeacherConfig, **options: Any):
+    Args:
+        track: displacements to start from; None: zero.
+    """
+
+    def __init__(
+        self,
+        sequence: AvatarSequence,
+        teacher: TeacherAvatar,
+        config: FitTeacherConfig,
+        *,
+        track: Track | None = None,
+        **options: Any,
+    ) -> None:
         networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
         super().__init__(sequence, teacher, config, [networks], **options)
-        self.teacher, self.config = teacher, config
+        self.teacher, self.config, self.track = teacher, config, track
+        self.displacement_loss = DisplacementLoss(
+            sequence.rig, teacher.frame, teacher.config.out_size, teacher.config.position_scale
+        )
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Of one frame: the networks run once for all its cameras."""
@@ -48,14 +68,21 @@ class TeacherTask(ViewTask):
         motion, eyes = self.sequence.motion(item.frame), eyes_of(views)
         maps = self._maps(item, eyes)
         if self.iteration < self.config.pretrain:
-            size = maps.shape.abs().mean() + maps.colour.abs().mean()
-            return size, {"residuals": float(size.detach())}
+            return self._known_residuals(item.frame, maps)
         posed = self.teacher.posed(motion, eyes, maps)
         total, terms, _ = self.compared(posed, views)
         if self.config.displacement:
             moved = maps.shape[..., :3].square().mean()
             total = total + self.config.displacement * moved
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
+
+    def _known_residuals(self, frame: int, maps: Residuals) -> tuple[Tensor, dict[str, float]]:
+        """`mean |maps - known|`, where only displacements may be known to differ from zero."""
+        others = maps.shape[..., 3:].abs().mean() + maps.colour.abs().mean()
+        known = torch.zeros_like(self.sequence.rig.vertices) if self.track is None else self.track.displacements(frame)
+        moved = self.displacement_loss(known, maps.position[0])
+        total = others + moved
+        return total, {"loss": float(total.detach()), "residuals": float(others.detach()), "nonrigid": float(moved)}
 
     def _maps(self, item: Item, eyes: Tensor) -> Residuals:
         motion = self.sequence.motion(item.frame)

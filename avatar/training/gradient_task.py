@@ -129,6 +129,10 @@ class GradientTask(ABC):
     def loss(self, item: Any) -> tuple[Tensor, Mapping[str, float]]:
         """The loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
 
+    def share(self, iteration: int, group: ParameterGroup) -> float:
+        """Of a group's rate at a step: the configuration's schedule."""
+        return self.optimiser_config.share(iteration, group.final)
+
     def name_of(self, item: Any) -> str:
         """A micro-batch in the user's words: "frame 12, cameras Cam001 Cam002"."""
         return str(item)
@@ -154,7 +158,7 @@ class GradientTask(ABC):
         """
         items = self.items(iteration)
         for group, told in zip(self.optimiser.param_groups, self.groups, strict=True):
-            group["lr"] = told.rate * self.optimiser_config.share(iteration, told.final)
+            group["lr"] = told.rate * self.share(iteration, told)
         self.optimiser.zero_grad(set_to_none=True)
         outcomes = self.distributed.share_out(items, lambda own: self._backward(own, len(items)))
         for item, figures in zip(items, outcomes, strict=True):

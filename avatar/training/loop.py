@@ -72,7 +72,7 @@ class Progress:
 
     Attributes:
         iteration, iterations: steps done, steps in all.
-        seconds: spent in steps, all sessions together.
+        seconds: spent in steps, all sessions together. session_seconds: of them, in this session.
         rate: steps a second of this session.
         metrics: of the last logged step. evaluation: figures, when this call follows an evaluation.
     """
@@ -83,6 +83,7 @@ class Progress:
     rate: float
     metrics: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Mapping[str, Any] | None = None
+    session_seconds: float = 0.0
 
     @property
     def finished(self) -> bool:
@@ -122,7 +123,7 @@ def run_training(
 
     def progress(evaluation: Mapping[str, Any] | None = None) -> Progress:
         rate = (done - first) / spent if spent else 0.0
-        return Progress(done, config.iterations, spent_before + spent, rate, logged, evaluation)
+        return Progress(done, config.iterations, spent_before + spent, rate, logged, evaluation, spent)
 
     def log(kind: str, values: Mapping[str, Any]) -> None:
         seconds = round(spent_before + spent, 3)

@@ -14,6 +14,7 @@ from avatar.training.bake import BakeConfig
 from avatar.training.compensate import CompensateConfig
 from avatar.training.fit_config import PRESETS, FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig
+from avatar.training.track import TrackConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ class TrainingPreset:
             teacher=replace(
                 self.teacher, iterations=fewer(self.teacher.iterations), pretrain=round(share * self.teacher.pretrain)
             ),
-            bake=replace(self.bake, iterations=fewer(self.bake.iterations)),
+            bake=replace(self.bake, iterations=fewer(self.bake.iterations), pretrain=round(share * self.bake.pretrain)),
             compensate=replace(self.compensate, iterations=fewer(self.compensate.iterations)),
         )
 
@@ -75,9 +76,15 @@ def _lean(name: str, *, count: int, fit: int, teacher: int, bake: int, compensat
         networks=network_preset(name),
         fit=FitConfig(sampling=SamplingConfig(count=count), iterations=fit),
         teacher=FitTeacherConfig(
-            iterations=teacher, pretrain=0, views=4, rate=5e-3, attributes=0.5, weights=_LEAN_WEIGHTS, coarse=0.4
+            iterations=teacher,
+            pretrain=teacher // 2,
+            views=3,
+            rate=3e-3,
+            attributes=0.3,
+            weights=_LEAN_WEIGHTS,
+            track=TrackConfig(),
         ),
-        bake=BakeConfig(iterations=bake, views=2, rate=2e-3, null_share=0.2, weights=_LEAN_WEIGHTS),
+        bake=BakeConfig(iterations=bake, pretrain=bake // 2, views=2, rate=2e-3, null_share=0.2, weights=_LEAN_WEIGHTS),
         compensate=CompensateConfig(
             iterations=compensate, items=1, views=2, rate=1e-3, null_share=0.2, attributes=0.2, weights=_LEAN_WEIGHTS
         ),

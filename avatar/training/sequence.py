@@ -118,14 +118,15 @@ class AvatarSequence:
         for number in range(step * count, (step + 1) * count):
             epoch, place = divmod(number, len(self.train_frames))
             frame = self.train_frames[_shuffled((seed, 0, epoch), len(self.train_frames))[place]]
-            out.append(Item(frame, self._cameras(frame, epoch, views, seed)))
+            out.append(Item(frame, self.cameras(frame, epoch, views, seed)))
         return out
 
-    def _cameras(self, frame: int, epoch: int, views: int, seed: int) -> tuple[str, ...]:
+    def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
+        """Training cameras for a visit of a frame: visit after visit every camera comes equally often."""
         names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
         views = min(views, len(names))
         chosen = []
-        for number in range(epoch * views, (epoch + 1) * views):
+        for number in range(visit * views, (visit + 1) * views):
             cycle, place = divmod(number, len(names))
             chosen.append(names[_shuffled((seed, 1, frame, cycle), len(names))[place]])
         return tuple(chosen)

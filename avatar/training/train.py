@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher import TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import Track, TrackedAvatar
 from avatar.training.bake import BakeConfig, BakeTask
 from avatar.training.compensate import CompensateConfig, CompensateTask
 from avatar.training.distributed import Distributed
@@ -20,6 +21,7 @@ from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.loop import LoopConfig, Progress, run_training
 from avatar.training.machine import seeded
 from avatar.training.sequence import AvatarSequence
+from avatar.training.track import TrackConfig, TrackTask
 from avatar.training.view_task import Preview, ViewConfig, ViewTask
 
 
@@ -58,6 +60,14 @@ class Session:
         )  # fmt: skip
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
+    def within(self, name: str) -> Session:
+        """The same in a folder of its own, without previews."""
+        return replace(self, folder=self.folder / name, preview=lambda images: None)
+
+    def after(self, progress: Progress) -> Session:
+        """What is left of the time after a training that came first."""
+        return replace(self, max_seconds=max(self.max_seconds - progress.session_seconds, 0.0))
+
 
 def fit_teacher(
     sequence: AvatarSequence,
@@ -66,11 +76,27 @@ def fit_teacher(
     config: FitTeacherConfig,
     session: Session,
 ) -> tuple[TeacherAvatar, Progress]:
-    """Train a teacher on Gaussians of the template."""
+    """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
     with seeded(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
-    progress = session.run(lambda: TeacherTask(sequence, teacher, config, **session.options), config)
+    track = None
+    if config.track is not None:
+        track, progress = follow_surface(sequence, gaussians, config.track, session.within("track"))
+        if not progress.finished:
+            return teacher.eval(), progress
+        session = session.after(progress)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, track=track, **session.options), config)
     return teacher.eval(), progress
+
+
+def follow_surface(
+    sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
+) -> tuple[Track, Progress]:
+    """Displacements of every training frame, one frame after the other."""
+    avatar = TrackedAvatar(sequence.rig, gaussians, config.control_points)
+    task = TrackTask(sequence, avatar, config, **session.options)
+    progress = session.run(lambda: task, task.config)
+    return task.track(), progress
 
 
 def bake(

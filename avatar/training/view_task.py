@@ -41,7 +41,7 @@ class ViewConfig:
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
             found there first.
         eps2d: see `rasterize`.
-        amp: networks in bfloat16 on CUDA. clip: largest norm of the gradient.
+        betas: Adam's. amp: networks in bfloat16 on CUDA. clip: largest norm of the gradient.
         evaluations: how often held-out views are measured, evenly. evaluated: how many frames of either kind then.
         seed: of the order of frames and views and of all noise.
     """
@@ -56,6 +56,7 @@ class ViewConfig:
     perceptual_every: int = 1
     coarse: float = 0.0
     eps2d: float = 0.1
+    betas: tuple[float, float] = (0.9, 0.999)
     amp: bool = False
     clip: float = math.inf
     evaluations: int = 6
@@ -73,7 +74,7 @@ class ViewConfig:
 
     def optimiser(self) -> OptimiserConfig:
         """Of these steps."""
-        return OptimiserConfig(iterations=self.iterations, amp=self.amp, clip=self.clip, eps=1e-15)
+        return OptimiserConfig(iterations=self.iterations, betas=self.betas, eps=1e-15, amp=self.amp, clip=self.clip)
 
     @property
     def evaluate_every(self) -> int:

@@ -1,0 +1,89 @@
+"""Surfaces followed through a sequence: displacements of control points, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.control_points import choose_control_points
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.posed import PosedAvatar
+from avatar.models.rig import Motion, Rig
+
+
+class ControlCage(nn.Module):
+    """Interpolates displacements of K control points of a template to its vertices, part by part.
+
+    Args:
+        rig: of the template. count: K.
+    """
+
+    def __init__(self, rig: Rig, count: int) -> None:
+        super().__init__()
+        template = rig.template
+        control = choose_control_points(template.vertices, template.vertex_part, count=count)
+        neighbours = torch.tensor(control.neighbours, device=rig.device)
+        self.count = len(control.vertices)
+        self.register_buffer("neighbours", neighbours)
+        self.register_buffer("weights", torch.tensor(control.weights, dtype=torch.float32, device=rig.device))
+        # Two control points are neighbours if some vertex has them as its two nearest.
+        pairs = neighbours[:, :2].sort(dim=1).values
+        self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
+
+    def forward(self, controls: Tensor) -> Tensor:
+        """(K, 3) -> (V, 3) metres."""
+        return (controls[self.neighbours] * self.weights[..., None]).sum(1)
+
+    def roughness(self, controls: Tensor) -> Tensor:
+        """Mean squared difference of neighbours, square metres."""
+        return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
+
+
+class TrackedAvatar(nn.Module):
+    """Gaussians on a mesh that control points move in one frame at a time (an `AvatarModel`).
+
+    Args:
+        rig: of the template. gaussians: on it; they stay as they are.
+        count: control points.
+    """
+
+    def __init__(self, rig: Rig, gaussians: BoundGaussians, count: int) -> None:
+        super().__init__()
+        self.rig = rig
+        self.gaussians = LearnedGaussians(gaussians)
+        self.cage = ControlCage(rig, count)
+        self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
+        """(K, 3) metres, of the frame that is being followed."""
+        self.to(rig.device)
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The avatar in a pose, displaced by the control points as they stand."""
+        displacements = self.cage(self.controls)
+        vertices = self.rig.pose(motion, displacements)
+        frames = triangle_frames(vertices, self.rig.faces)
+        bound = self.gaussians()
+        world = world_from_frames(bound, frames)
+        colors = view_colors(bound, frames, world.means.detach(), eyes)
+        return PosedAvatar(vertices, world, colors, bound, displacements)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A surface followed through frames.
+
+    Attributes:
+        row: of every frame. controls: (T, K, 3) metres. cage: interpolates them.
+    """
+
+    row: dict[int, int]
+    controls: Tensor
+    cage: ControlCage
+
+    def displacements(self, frame: int) -> Tensor:
+        """(V, 3) metres along the axes of the T-pose."""
+        return self.cage(self.controls[self.row[frame]])
