@@ -45,6 +45,8 @@ class Ablate:
     """Measure every n-th frame."""
     metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
     """Perceptual distance to measure, and to train with where the preset does."""
+    samples: int = 100_000
+    """Points of a mesh for its distance to the true surface; 0 leaves the surface out."""
     hold_out: tuple[str, ...] = ()
     """Cameras to keep from training and to measure on; by default those that the capture holds out."""
     params: OptionalPath = None
@@ -78,7 +80,9 @@ class Ablate:
             if not value > 0:
                 raise InputError(f"option {name}", expected="a number above 0", received=f"{value:g}")
         rows, preset = ablation_rows(self.rows), self.training()
-        config = EvaluationConfig(protocol=ProtocolConfig(every=self.every), metric=self.metric, speed_pictures=0)
+        config = EvaluationConfig(
+            protocol=ProtocolConfig(every=self.every), metric=self.metric, samples=self.samples, speed_pictures=0
+        )
         with _progress(enabled=not self.json) as (training, measuring):
             outcome = ablate(
                 self.run_folder,

@@ -1,0 +1,83 @@
+"""`smplxpp ablate` on a moving doll: files, one table, what stands, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.cli import main
+from tests.baselines.moving_doll import HEIGHT, WIDTH, write_moving_capture, write_moving_run
+
+QUICK = (
+    *("--preset", "demo", "--iterations-share", "0.01", "--gaussians", "400", "--every", "3", "--device", "cpu"),
+    *("--metric", "none", "--samples", "0"),
+)
+ROWS = ("no-gaussians", "lbs")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_moving_capture(tmp_path_factory.mktemp("doll") / "capture")
+
+
+def ablate(run, capture, *options: str) -> int:
+    return main(["ablate", "--run", str(run), "--capture", str(capture), *QUICK, "--rows", *ROWS, *options])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, capture):
+    run = write_moving_run(tmp_path_factory.mktemp("run"))
+    assert ablate(run, capture) == 0
+    return run
+
+
+def test_table_figures_and_pictures(finished, capsys, capture):
+    folder = finished / "ablation"
+    with open(folder / "table.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row[""] for row in rows] == ["w/o Gau Non.", "LBS Gaussians"]
+    results = json.loads((folder / "results.json").read_text())
+    assert results["waiting"] == [] and results["rows"]["lbs"]["title"] == "LBS Gaussians"
+    assert float(rows[1]["novel_view.psnr"]) == results["rows"]["lbs"]["figures"]["novel_view.psnr"]
+    assert results["preset"]["fit"]["sampling"]["count"] == 400
+    assert "w/o Gau Non." in (folder / "table.txt").read_text() and "toprule" in (folder / "table.tex").read_text()
+    names = {path.stem for path in (folder / "pictures").glob("*.png")}
+    assert {"novel_view_Held_000000", "novel_pose_Held_000004"} <= names
+    with Image.open(folder / "pictures" / "novel_pose_Held_000004.png") as strip:
+        assert strip.width == 3 * WIDTH + 2 * 4 and strip.height > HEIGHT  # photograph and two rows
+        shown = np.asarray(strip)[:HEIGHT, :WIDTH]
+    with Image.open(capture / "rgbs" / "Held" / "Held_rgb000004.png") as photograph:
+        assert np.array_equal(shown, np.asarray(photograph))
+    # The same again trains nothing, and prints the same table.
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("piece.json")}
+    capsys.readouterr()
+    assert ablate(finished, capture) == 0
+    assert "w/o Gau Non." in capsys.readouterr().out
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("piece.json")}
+
+
+def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, capture, capsys):
+    run = write_moving_run(tmp_path / "run")
+    assert ablate(run, capture, "--max-minutes", "1e-6") == 0
+    assert "still to train: gaussians, teacher, bake, lbs" in capsys.readouterr().out
+    assert json.loads((run / "ablation" / "results.json").read_text())["rows"] == {}
+
+
+def test_what_is_refused_before_work_starts(tmp_path, capture, capsys):
+    run = write_moving_run(tmp_path / "run")
+    for options, message in (
+        (("--rows", "everything"), "ablation rows"),
+        (("--max-minutes", "0"), "option max-minutes"),
+        (("--iterations-share", "-1"), "option iterations-share"),
+        (("--seed", "-3"), "option seed"),
+        (("--every", "0"), "evaluation: every"),
+    ):
+        assert ablate(run, capture, *options) == 2
+        assert message in capsys.readouterr().err
+    assert ablate(tmp_path / "empty", capture) == 2
+    assert "smplxpp build" in capsys.readouterr().err
+    assert not (run / "ablation").exists()
