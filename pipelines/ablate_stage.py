@@ -46,10 +46,12 @@ class AblationRun:
     """How it runs; nothing in it changes a figure.
 
     Attributes:
+        command: in words, for `results.json`.
         device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' pieces anew.
         training: called with the name of a piece and its progress. measuring: with a row, frames done, all frames.
     """
 
+    command: str = ""
     device: str = "cpu"
     max_seconds: float = math.inf
     force: bool = False
@@ -104,7 +106,8 @@ def ablate(
         observer = Observer(how.training, how.measuring, lambda name, found: _keep_pictures(folder, name, found))
         result = ablation.run(rows, config, max_seconds=how.max_seconds, observer=observer)
         waiting = unfinished(ablation, rows, result.waiting)
-        return _write(folder, result, {"preset": preset, "scale": inputs.scale}, waiting)
+        about = {"command": how.command, "preset": preset, "scale": inputs.scale, "device": how.device}
+        return _write(folder, result, about, waiting)
 
 
 def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:

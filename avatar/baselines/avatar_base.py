@@ -54,15 +54,15 @@ class ResidualBaseline(Baseline):
     def __init__(self, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int], *, code_size: int) -> None:
         super().__init__()
         gaussians.check_topology(rig.faces, "template of the baseline")
+        gaussians = gaussians.to(device=rig.device)
         self.rig = rig
         self.gaussians = LearnedGaussians(gaussians)
         self.gaussians.normalise_quats()
         self.codes = FrameCodes(frames, code_size)
         canonical = triangle_frames(rig.vertices, rig.faces)
-        face = gaussians.face_index.to(rig.device)
-        self.register_buffer("corner_weights", corner_weights(gaussians).to(rig.device), persistent=False)
-        self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
-        points = (self.corner_weights[..., None] * canonical.corners[face]).sum(1)
+        self.register_buffer("corner_weights", corner_weights(gaussians), persistent=False)
+        self.register_buffer("canonical_from_local", canonical.rotations[gaussians.face_index], persistent=False)
+        points = (self.corner_weights[..., None] * canonical.corners[gaussians.face_index]).sum(1)
         self.register_buffer("points", points, persistent=False)
 
     @abstractmethod

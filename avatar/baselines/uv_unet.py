@@ -88,7 +88,8 @@ class UVUNetAvatar(ResidualBaseline):
         texels = torch.nonzero(anchor >= 0)[:, 0]
         grid = torch.tensor(2.0 * atlas.pixels / size - 1.0, dtype=torch.float32, device=rig.device)
         self.register_buffer("texels", texels, persistent=False)
-        self.register_buffer("texel_corners", rig.faces[self.gaussians.face_index[anchor[texels]]], persistent=False)
+        face = gaussians.face_index.to(rig.device)[anchor[texels]]
+        self.register_buffer("texel_corners", rig.faces[face], persistent=False)
         self.register_buffer("texel_weights", self.corner_weights[anchor[texels]], persistent=False)
         self.register_buffer("grid", grid[None, None], persistent=False)
         self.person = nn.Parameter(torch.zeros(1, config.features, size, size))

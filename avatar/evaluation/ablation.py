@@ -31,7 +31,8 @@ from avatar.evaluation.tables import Column, FigureTable
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion
-from avatar.training.loop import STATE_FILE, Progress
+from avatar.training.loop import METRICS_FILE, STATE_FILE, Progress
+from avatar.training.metrics_log import read_metrics
 from avatar.training.train import Session
 from smplxpp.core.artifact import jsonable, stage_key
 from smplxpp.core.atomic import atomic_write_text
@@ -190,13 +191,11 @@ class Ablation:
         if progress is not None and not progress.finished:
             return False
         piece.write(product, folder / PIECE_FILE)
-        done = {
-            "key": self.key(name),
-            "seconds": time.perf_counter() - begin if progress is None else progress.seconds,
-            "iterations": 0 if progress is None else progress.iterations,
-        }
+        seconds, iterations = (time.perf_counter() - begin, 0) if progress is None else _spent(folder)
+        done = {"key": self.key(name), "seconds": seconds, "iterations": iterations}
         atomic_write_text(folder / RECORD_FILE, json.dumps(done, indent=1))
-        (folder / STATE_FILE).unlink(missing_ok=True)
+        for state in folder.rglob(STATE_FILE):
+            state.unlink()
         return True
 
     def _row_key(self, row: Row, config: EvaluationConfig) -> str:
@@ -280,6 +279,12 @@ def unfinished(ablation: Ablation, rows: Mapping[str, Row], names: Sequence[str]
     """Pieces that rows still need, in the order in which they are made."""
     pieces = [piece for name in names for piece in ablation.closure(rows[name].piece)]
     return [piece for piece in dict.fromkeys(pieces) if ablation.record(piece) is None]
+
+
+def _spent(folder: Path) -> tuple[float, int]:
+    """Seconds and iterations of all trainings that logged in a piece's folder: a teacher's may be two."""
+    last = [read_metrics(path)[-1] for path in sorted(folder.rglob(METRICS_FILE))]
+    return sum(entry["seconds"] for entry in last), sum(entry["iteration"] for entry in last)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

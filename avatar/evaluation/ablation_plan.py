@@ -59,6 +59,7 @@ PAPER_ROWS: Mapping[str, Row] = {
     "full": Row("Full", "full", "teacher, bake, blend shapes"),
 }
 OPTION_ROWS: Mapping[str, Row] = {
+    "no-tracking": Row("w/o tracking", "untracked", "the teacher starts from zero residuals, as in the paper"),
     "local": Row(
         "local blend shapes", "local", f"{LOCAL['parts']} parts of the Gaussians with coefficients of their own"
     ),
@@ -126,11 +127,14 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
             config=replace(preset.compensate, null_share=max(preset.compensate.null_share, null)),
         )
 
+    teacher = preset.teacher
+    if teacher.track is not None:
+        teacher = replace(teacher, track=replace(teacher.track, reference=frame))
     for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
         fit = f"{prefix}gaussians"
         pieces[fit] = FitPiece(ground=ground, config=replace(preset.fit, evaluations=1), frame=frame)
         pieces[f"{prefix}teacher"] = TeacherPiece(
-            ground=ground, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher
+            ground=ground, gaussians=fit, networks=preset.networks.teacher, config=teacher
         )
         pieces[f"{prefix}bake"] = BakePiece(
             ground=ground, source=f"{prefix}teacher", student=student, config=preset.bake
@@ -142,6 +146,13 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     bake("no_teacher_bake", source="gaussians")
     compensate("no_teacher", "no_teacher_bake")
 
+    if teacher.track is None:
+        pieces["untracked"] = SamePiece(student="full")
+    else:
+        from_zero = replace(teacher, track=None, pretrain=0)
+        pieces["untracked_teacher"] = replace(pieces["teacher"], config=from_zero)
+        bake("untracked_bake", source="untracked_teacher")
+        compensate("untracked", "untracked_bake")
     compensate("local", "bake", **LOCAL)
     compensate("gated", "bake", gated=True)
     pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE, max_bytes=1e6 * PRUNED_MEGABYTES)
@@ -152,10 +163,10 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     else:
         bake("null_code_bake", null_share=max(preset.bake.null_share, NULL_SHARE))
         compensate("null_code", "null_code_bake", null=NULL_SHARE)
-    return pieces | _baseline_pieces(preset, pieces["gaussians"])
+    return pieces | _baseline_pieces(preset, pieces)
 
 
-def _baseline_pieces(preset: TrainingPreset, fit: FitPiece) -> dict[str, Piece]:
+def _baseline_pieces(preset: TrainingPreset, pieces: Mapping[str, Piece]) -> dict[str, Piece]:
     """Avatars of other kinds: as many steps on photographs as the student's bake and compensation have together."""
     steps = preset.bake.iterations + preset.compensate.iterations
     own = {f.name: getattr(preset.bake, f.name) for f in fields(PhotographConfig)}
@@ -171,8 +182,6 @@ def _baseline_pieces(preset: TrainingPreset, fit: FitPiece) -> dict[str, Piece]:
         "mlp": BaselinePiece(gaussians="gaussians", model=PointMLPConfig(), config=photographs),
         "uv": BaselinePiece(ground=NAKED, gaussians="naked_gaussians", model=unet, config=photographs),
         "mesh": BaselinePiece(gaussians="gaussians", model=mesh, config=replace(photographs, attributes=0.0)),
-        "outer_gaussians": replace(fit, ground=OUTER),
-        "outer_teacher": TeacherPiece(
-            ground=OUTER, gaussians="outer_gaussians", networks=preset.networks.teacher, config=preset.teacher
-        ),
+        "outer_gaussians": replace(pieces["gaussians"], ground=OUTER),
+        "outer_teacher": replace(pieces["teacher"], ground=OUTER, gaussians="outer_gaussians"),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from avatar.training import Progress as TrainingProgress
     from avatar.training.presets import TrainingPreset
     from pipelines.ablate_stage import AblationOutcome
+
+
+UNTOLD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "force", "json")
 
 
 @dataclass(frozen=True)
@@ -88,11 +91,23 @@ class Ablate:
                 self.run_folder,
                 TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale),
                 rows, preset, config,
-                AblationRun(choose_device(self.device), 60.0 * self.max_minutes, self.force, training, measuring),
+                AblationRun(
+                    self.command(), choose_device(self.device), 60.0 * self.max_minutes, self.force, training, measuring
+                ),
             )  # fmt: skip
         if not self.json:
             _print(outcome)
         return outcome.results
+
+    def command(self) -> str:
+        """What was asked for, without where it lies and how long it may take."""
+        told = ["smplxpp ablate --run RUN --capture DIR"]
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if f.name not in UNTOLD and (value != f.default or f.name == "preset"):
+                shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+                told.append(f"--{f.name.replace('_', '-')} {shown}")
+        return " ".join(told)
 
     def training(self) -> TrainingPreset:
         """The preset with the options' changes.

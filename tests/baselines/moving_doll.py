@@ -22,6 +22,7 @@ from avatar.training.compensate import CompensateConfig
 from avatar.training.fit_config import FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.presets import TrainingPreset
+from avatar.training.track import Level, TrackConfig
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.camera import Camera
@@ -39,23 +40,27 @@ SWAY = 0.25
 """Metres that the hem moves for a nod of one radian, which skinning knows nothing of."""
 
 
+TORSO = 642
+"""Vertices of the torso, which come first; the head's 162 follow."""
+
+
 @cache
 def template() -> Template:
     """Torso and head are the body, an open cone round the legs is the skirt."""
     body = load_body()
-    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball, fine = (trimesh.creation.icosphere(subdivisions=k) for k in (2, 3))
     head = ball.vertices * 0.13 + (0.0, 0.80, 0.0)
-    torso = ball.vertices * (0.18, 0.34, 0.13) + (0.0, 0.35, 0.0)
+    torso = fine.vertices * (0.18, 0.34, 0.13) + (0.0, 0.35, 0.0)
     cone = _cone(rings=7, sides=24)
-    count, own = 2 * len(ball.vertices), 2 * len(ball.vertices) + len(cone.vertices)
+    count, own = TORSO + len(head), TORSO + len(head) + len(cone.vertices)
     joints = len(body.joint_names)
     weights = np.zeros((own, joints))
     weights[:, 0] = 1.0
-    weights[len(ball.vertices) : count] = np.eye(joints)[body.joint_names.index("head")]
+    weights[TORSO:count] = np.eye(joints)[body.joint_names.index("head")]
     rng = np.random.default_rng(0)
     return Template(
         vertices=np.concatenate([torso, head, cone.vertices]),
-        faces=np.concatenate([ball.faces, ball.faces + len(ball.vertices), cone.faces + count]),
+        faces=np.concatenate([fine.faces, ball.faces + TORSO, cone.faces + count]),
         vertex_labels=np.repeat([SKIN.id, LOWER.id], [count, own - count]),
         vertex_part=np.repeat([0, 1], [count, own - count]),
         part_names=("body", "lower"), vertex_colors=np.full((own, 3), 128),
@@ -133,13 +138,18 @@ def tiny_preset(iterations: int = 3) -> TrainingPreset:
         networks="shared", in_size=32, out_size=64, bottleneck=8, channel_base=64, channel_max=8, style_size=8,
         style_layers=1, noise=False, zero_output=True,
     )  # fmt: skip
+    track = TrackConfig(levels=(Level(0, 2, 2e-3),), control_points=60, views=2)
     shared = {"iterations": iterations, "evaluations": 1, "evaluated": 1, "null_share": 0.2,
               "weights": ReconstructionWeights(perceptual=0.0, alpha=0.1)}  # fmt: skip
     return TrainingPreset(
         networks=NetworkPreset(teacher, FieldConfig(width=16, hidden_layers=2, code_size=4), BlendShapeConfig()),
         fit=FitConfig(sampling=SamplingConfig(count=500), iterations=iterations, margin=4),
         teacher=FitTeacherConfig(
-            **{k: v for k, v in shared.items() if k != "null_share"}, pretrain=0, rate=2e-3, attributes=0.5
+            **{k: v for k, v in shared.items() if k != "null_share"},
+            pretrain=1,
+            rate=2e-3,
+            attributes=0.5,
+            track=track,
         ),
         bake=BakeConfig(**shared, rate=2e-3, views=2),
         compensate=CompensateConfig(**shared, rate=2e-3, items=1, views=2),

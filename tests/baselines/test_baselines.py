@@ -22,7 +22,7 @@ from avatar.training.machine import seeded
 from avatar.training.sequence import AvatarSequence
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
-from tests.baselines.moving_doll import open_moving, params, template
+from tests.baselines.moving_doll import TORSO, open_moving, params, template
 
 SAMPLING = SamplingConfig(count=500)
 KINDS = {
@@ -131,9 +131,9 @@ def test_the_naked_body_carries_them_too(capture):
 
 
 def test_an_outer_surface_has_no_layers():
-    head = np.arange(162, 324)
+    head = np.arange(TORSO, TORSO + 162)
     vertices = template().vertices.copy()
-    vertices[head] = 0.5 * (vertices[head] - vertices[head].mean(axis=0)) + vertices[:162].mean(axis=0)
+    vertices[head] = 0.5 * (vertices[head] - vertices[head].mean(axis=0)) + vertices[:TORSO].mean(axis=0)
     layered = replace(template(), vertices=vertices)  # the head is in the torso: no view sees it
     outer = outer_template(layered)
     assert not np.isin(outer.faces, head).any() and len(outer.faces) < len(layered.faces)

@@ -87,6 +87,15 @@ def test_the_null_code_is_trained_only_where_the_preset_does_not(tmp_path):
     assert pieces["bake"].config.null_share == 0
 
 
+def test_tracking_is_left_out_of_the_row_that_says_so(tmp_path):
+    preset = tiny_preset()
+    pieces = ablation_pieces(preset, frame=2)
+    assert pieces["teacher"].config.track.reference == 2 and pieces["untracked_teacher"].config.track is None
+    assert pieces["untracked_bake"] == replace(pieces["bake"], source="untracked_teacher")
+    without = replace(preset, teacher=replace(preset.teacher, track=None))
+    assert ablation_pieces(without, frame=2)["untracked"] == SamePiece(student="full")
+
+
 def test_a_change_makes_anew_what_depends_on_it_and_nothing_else(shop, tmp_path):
     old = planned(shop, tmp_path)
     preset = tiny_preset()

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks import machine
+from benchmarks.ablation import AblationBenchmark
 from pipelines.cli import main
+from smplxpp.core.errors import InputError
 from tests.baselines.moving_doll import HEIGHT, WIDTH, write_moving_capture, write_moving_run
 
 QUICK = (
@@ -44,6 +47,8 @@ def test_table_figures_and_pictures(finished, capsys, capture):
     assert results["waiting"] == [] and results["rows"]["lbs"]["title"] == "LBS Gaussians"
     assert float(rows[1]["novel_view.psnr"]) == results["rows"]["lbs"]["figures"]["novel_view.psnr"]
     assert results["preset"]["fit"]["sampling"]["count"] == 400
+    assert results["command"].startswith("smplxpp ablate --run RUN --capture DIR --preset demo --rows no-gaussians lbs")
+    assert "--iterations-share 0.01 --gaussians 400" in results["command"] and "device" not in results["command"]
     assert "w/o Gau Non." in (folder / "table.txt").read_text() and "toprule" in (folder / "table.tex").read_text()
     names = {path.stem for path in (folder / "pictures").glob("*.png")}
     assert {"novel_view_Held_000000", "novel_pose_Held_000004"} <= names
@@ -65,6 +70,17 @@ def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, captu
     assert ablate(run, capture, "--max-minutes", "1e-6") == 0
     assert "still to train: gaussians, teacher, bake, lbs" in capsys.readouterr().out
     assert json.loads((run / "ablation" / "results.json").read_text())["rows"] == {}
+
+
+def test_the_benchmark_stores_the_table_with_its_command(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(machine, "RESULTS", tmp_path)
+    AblationBenchmark(finished).run()
+    stored = json.loads((tmp_path / "ablation_moving doll.json").read_text())
+    assert "--iterations-share 0.01" in stored["command"] and stored["figures"]["gaussians"] == 400
+    lbs = stored["figures"]["rows"]["LBS Gaussians"]
+    assert lbs["what"] and lbs["novel_view.psnr"] > 0 and lbs["iterations"] > 0
+    with pytest.raises(InputError, match="expected finished rows"):
+        AblationBenchmark(tmp_path).run()
 
 
 def test_what_is_refused_before_work_starts(tmp_path, capture, capsys):
