@@ -82,7 +82,7 @@ class TeacherTask(ViewTask):
         known = torch.zeros_like(self.sequence.rig.vertices) if self.track is None else self.track.displacements(frame)
         moved = self.displacement_loss(known, maps.position[0])
         total = others + moved
-        return total, {"loss": float(total.detach()), "residuals": float(others.detach()), "nonrigid": float(moved)}
+        return total, {"loss": float(total.detach()), "residuals": float(others.detach()), "nonrigid": float(moved.detach())}
 
     def _maps(self, item: Item, eyes: Tensor) -> Residuals:
         motion = self.sequence.motion(item.frame)
