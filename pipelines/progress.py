@@ -75,7 +75,7 @@ def training_progress(
             figures.append(f"{state.rate:.1f} it/s")
         if "psnr" in quality:  # a training taken up again has none before its next evaluation
             figures.append(f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}")
-        bar.update(task, completed=state.iteration, figures="  ".join(figures))
+        bar.update(task, completed=state.iteration, total=state.iterations, figures="  ".join(figures))
 
     try:
         yield show

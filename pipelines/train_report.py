@@ -75,10 +75,10 @@ def training_section(record: StageRecord) -> Section:
     stage, numbers = record.folder.name, record.manifest["numbers"]
     title, what = _TITLES[stage]
     pictures, comparisons = _pictures(record.folder)
-    lines = [json.loads(line) for line in (record.folder / "metrics.jsonl").read_text().splitlines()]
+    lines = _entries(record.folder / "metrics.jsonl")
     return Section(
         title=title,
-        text=(what, _how(numbers), _files(numbers), numbers["convention"]),
+        text=(what, _how(numbers), _files(numbers)),
         pictures=(*pictures, Picture(f"error, of 255: 0 to {ERROR_LIMIT} and more", encode_png(error_legend()))),
         comparisons=comparisons,
         curves=_curves(lines, held_out=numbers["held_out_cameras"]),
@@ -92,12 +92,13 @@ def _how(numbers: Mapping[str, Any]) -> str:
     memory = ", ".join(f"{size / 1e9:.1f} GB {where}" for where, size in (
         (name, numbers["peak_memory"].get(key)) for key, name in (("host", "of memory"), ("device", "on the GPU"))
     ) if size)  # fmt: skip
-    processes = numbers["processes"]
+    processes, tracking = numbers["processes"], numbers["seconds_of_tracking"]
+    before = f" The surface was followed through the frames first, in {tracking:.0f} s." if tracking else ""
     return (
         f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations on "
         f"{numbers['training_frames']} frames of {numbers['training_cameras']} cameras in "
         f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.2f} a second"
-        f"{f' by {processes} processes' if processes > 1 else ''}; at most {memory}.{stopped}"
+        f"{f' by {processes} processes' if processes > 1 else ''}; at most {memory}.{before}{stopped}"
     )
 
 
@@ -111,7 +112,7 @@ def _files(numbers: Mapping[str, Any]) -> str:
 
 
 def _table(numbers: Mapping[str, Any]) -> Table:
-    states = [("start", numbers["start"]), (f"after {numbers['measured_at']:,} iterations", numbers)]
+    states = [("start", numbers["start"]), (f"after {numbers['measured_at'] or 0:,} iterations", numbers)]
     if "compact" in numbers:
         states.append(("the compact file", numbers["compact"]))
     rows = tuple(
@@ -120,7 +121,11 @@ def _table(numbers: Mapping[str, Any]) -> Table:
         for name, state in states
         if kind in state
     )
-    return Table(("views", "of", *_FIGURES.values()), rows, "means over the measured views")
+    return Table(
+        ("views", "of", *_FIGURES.values()),
+        rows,
+        "means over the measured views; person: where mask or rendered opacity exceed 0.02",
+    )
 
 
 def _pictures(folder: Path) -> tuple[list[Picture], tuple[Comparison, ...]]:
@@ -157,6 +162,11 @@ def _curves(lines: list[dict[str, Any]], *, held_out: bool) -> tuple[Curve, ...]
                 for value in (_seconds, lambda line: line["loss"])]  # fmt: skip
         curves.append(Curve("loss", {"training": (np.array(mean[0]), np.array(mean[1]))}, "seconds"))
     return tuple(curves)
+
+
+def _entries(path: Path) -> list[dict[str, Any]]:
+    """Of a log; none where training ended before its first step."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def _seconds(line: Mapping[str, Any]) -> float:

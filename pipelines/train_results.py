@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,9 @@ from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.compact import pruned_to
 from avatar.training.compensate import CompensateConfig, CompensateTask
-from avatar.training.loop import METRICS_FILE, Progress
+from avatar.training.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
 from avatar.training.machine import peak_memory
+from avatar.training.metrics_log import read_metrics
 from avatar.training.quality import CONVENTION
 from avatar.training.sequence import AvatarSequence
 from avatar.training.views import read_view
@@ -25,6 +26,8 @@ from pipelines.fit_pictures import write_strip
 from pipelines.train_names import KINDS, kind_name
 from smplxpp.capture import Capture
 from smplxpp.core.artifact import Check, StageOutput
+
+TRACK_METRICS = "track_metrics.jsonl"
 
 
 def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
@@ -38,6 +41,16 @@ def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.
             write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
 
     return write
+
+
+def keep_logs(work: Path, folder: Path) -> None:
+    """Copy what a training has logged and shown into its stage; a tracking that came first has its own metrics."""
+    for name in ("previews", TENSORBOARD_FOLDER):
+        if (work / name).is_dir():
+            shutil.copytree(work / name, folder / name)
+    for source, name in ((work / METRICS_FILE, METRICS_FILE), (work / "track" / METRICS_FILE, TRACK_METRICS)):
+        if source.is_file():
+            shutil.copyfile(source, folder / name)
 
 
 def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
@@ -80,15 +93,16 @@ def stage_output(
     *,
     overlap: float,
 ) -> StageOutput:
-    """Numbers and checks of a stage whose `metrics.jsonl` is in `folder`.
+    """Numbers and checks of a stage whose logs are in `folder`.
 
     Args:
         done: where training ended. numbers: of the files that were written.
         overlap: of the template and the masks.
     """
-    lines = [json.loads(line) for line in (folder / METRICS_FILE).read_text().splitlines()]
-    evaluations = [line for line in lines if line["kind"] == "evaluation"]
-    start, end = evaluations[0], evaluations[-1]
+    evaluations = [line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation"]
+    # None while a tracking is under way: nothing of the training itself has been measured.
+    start, end = (evaluations[0], evaluations[-1]) if evaluations else ({}, {})
+    tracked = read_metrics(folder / TRACK_METRICS)
     held_out = bool(sequence.capture.splits.novel_view_cameras)
     found = {kind: end[kind] for kind in KINDS if kind in end}
     everything = {
@@ -105,7 +119,8 @@ def stage_output(
         "training_cameras": len(sequence.train_cameras),
         "held_out_cameras": held_out,
         "convention": CONVENTION,
-        "measured_at": end["iteration"],
+        "seconds_of_tracking": tracked[-1]["seconds"] if tracked else 0.0,
+        "measured_at": end.get("iteration"),
         "start": {kind: start[kind] for kind in KINDS if kind in start},
         **found,
     }

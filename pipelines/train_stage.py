@@ -20,7 +20,7 @@ from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.model_file import load_avatar
 from avatar.models.posed import AvatarModel
 from avatar.training.distributed import Distributed
-from avatar.training.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
+from avatar.training.loop import Progress
 from avatar.training.presets import TrainingPreset
 from avatar.training.sequence import AvatarSequence
 from avatar.training.shortage import explain_shortage
@@ -39,7 +39,7 @@ from pipelines.build_config import (
 from pipelines.fit_stage import fit
 from pipelines.run_folder import own_run_folder
 from pipelines.train_inputs import TrainInputs, TrainScene
-from pipelines.train_results import preview_writer, stage_output, write_model, write_student
+from pipelines.train_results import keep_logs, preview_writer, stage_output, write_model, write_student
 from smplxpp.core.artifact import (
     StageOutput,
     StageRecord,
@@ -55,6 +55,8 @@ from smplxpp.core.errors import InputError
 log = logging.getLogger(__name__)
 OWN_FIT = "train.json"
 """Names the reference fit in a run that a training made: one that the user made is never replaced."""
+ONE_STEP = 1e-9
+"""Seconds: a training that is begun takes a step."""
 Shapes = Literal["full", "local", "pruned"]
 LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
 Bar = Callable[[str, int], AbstractContextManager[Callable[[Progress], None]]]
@@ -179,7 +181,8 @@ def _fit_alone(training: Training) -> StageRecord:
     with training.options.bar("fit", config.iterations) as progress:
         record = fit(
             run, training.inputs.of_frame(training.scene.frame), config, device=training.device,
-            max_seconds=training.deadline - time.monotonic(), force=training.options.force, progress=progress,
+            max_seconds=max(training.deadline - time.monotonic(), ONE_STEP), force=training.options.force,
+            progress=progress,
         )  # fmt: skip
     atomic_write_text(mark, json.dumps({"fit": record.manifest["key"]}) + "\n")
     return record
@@ -195,12 +198,15 @@ def _own_fit(mark: Path) -> str | None:
 def _teacher(training: Training) -> StageRecord:
     preset, needs = training.config.preset, (GAUSSIANS,)
     gaussians = load_bound(_require(training, *needs), faces=training.scene.template.faces)
+    config = preset.teacher
+    if config.track is not None:
+        config = replace(config, track=replace(config.track, reference=training.scene.frame, seed=config.seed))
 
     def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
-        return fit_teacher(sequence, gaussians, preset.networks.teacher, preset.teacher, session)
+        return fit_teacher(sequence, gaussians, preset.networks.teacher, config, session)
 
     return _stage(
-        training, TEACHER_STAGE, preset.teacher, {"networks": preset.networks.teacher}, needs, work,
+        training, TEACHER_STAGE, config, {"networks": preset.networks.teacher}, needs, work,
         lambda folder, model, sequence, session: write_model(folder / Path(TEACHER).name, model),
     )  # fmt: skip
 
@@ -278,7 +284,8 @@ def _stage(
                "code": code_digest("smplxpp", "avatar"), "torch": version("torch")}  # fmt: skip
     folder = run / f"{name}_work"
     session = Session(
-        folder, stage_key(config=key_config, inputs=digests), metric, together, training.seconds_left(),
+        folder, stage_key(config=key_config, inputs=digests), metric, together,
+        max(training.seconds_left(), ONE_STEP),
         tensorboard=training.options.tensorboard, preview=preview_writer(scene.capture, folder),
     )  # fmt: skip
 
@@ -291,10 +298,7 @@ def _stage(
         with training.options.bar(name, config.iterations) as report:
             model, done, sequence = trained(replace(session, report=report))
         with explain_shortage(run):
-            shutil.copytree(folder / "previews", temporary / "previews")
-            shutil.copyfile(folder / METRICS_FILE, temporary / METRICS_FILE)
-            if training.options.tensorboard:
-                shutil.copytree(folder / TENSORBOARD_FOLDER, temporary / TENSORBOARD_FOLDER)
+            keep_logs(folder, temporary)
             numbers = {**write(temporary, model, sequence, session), "processes": together.world_size}
             return stage_output(temporary, model, done, sequence, numbers, overlap=scene.overlap)
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.blend_shapes import BlendShapeConfig
@@ -92,10 +94,20 @@ def fit_teacher(
 def follow_surface(
     sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
 ) -> tuple[Track, Progress]:
-    """Displacements of every training frame, one frame after the other."""
-    avatar = TrackedAvatar(sequence.rig, gaussians, config.control_points)
-    task = TrackTask(sequence, avatar, config, **session.options)
-    progress = session.run(lambda: task, task.config)
+    """Displacements of every training frame, one frame after the other.
+
+    Steps have one frame each: of several processes the first follows it, and the others hear what it found.
+    """
+    together = session.distributed or Distributed()
+    avatar = TrackedAvatar(sequence.rig, gaussians, min(config.control_points, len(sequence.rig.vertices)))
+    task = TrackTask(sequence, avatar, config, **{**session.options, "distributed": None})
+
+    def alone() -> tuple[Tensor, Progress]:
+        progress = session.run(lambda: task, task.config)
+        return task.solved.cpu(), progress
+
+    solved, progress = together.from_first(alone)
+    task.solved.copy_(solved)
     return task.track(), progress
 
 

@@ -196,9 +196,8 @@ def _changed(preset: TrainingPreset, iterations: dict[str, int | None], gaussian
     if gaussians is not None:
         fit = changed.get("fit", preset.fit)
         changed["fit"] = replace(fit, sampling=replace(fit.sampling, count=gaussians))
-    if "teacher" in changed:
-        teacher = changed["teacher"]
-        changed["teacher"] = replace(teacher, pretrain=min(teacher.pretrain, teacher.iterations // 2))
+    for stage in {"teacher", "bake"} & changed.keys():
+        changed[stage] = replace(changed[stage], pretrain=min(changed[stage].pretrain, changed[stage].iterations // 2))
     return replace(preset, **changed)
 
 

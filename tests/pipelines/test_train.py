@@ -1,0 +1,215 @@
+"""`smplxpp train` from end to end on a doll that dances: files, figures, skipping, resuming."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avatar.models.model_file import load_avatar
+from avatar.models.rig import Rig
+from avatar.training.bake import BakeTask
+from avatar.training.presets import TRAINING_PRESETS
+from pipelines.cli import main
+from pipelines.fit_pictures import read_strip
+from smplxpp.core.artifact import read_manifest
+from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
+from tests.training.dancing_doll import HELD_OUT, template, write_dance, write_dance_run
+
+ROOT = Path(__file__).resolve().parents[2]
+MODELS = {
+    "80_teacher": {"teacher.safetensors"},
+    "85_bake": {"student.safetensors"},
+    "90_compensate": {"student.safetensors", "student_compact.safetensors"},
+}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_dance(tmp_path_factory.mktemp("captures") / "dance")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, capture):
+    run = write_dance_run(tmp_path_factory.mktemp("runs") / "dance")
+    assert train(run, capture) == 0
+    return run
+
+
+@pytest.fixture
+def own(trained, tmp_path):
+    """A copy of the trained run to change."""
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+@pytest.fixture
+def fitted(trained, tmp_path):
+    """A run with the reference fit alone."""
+    run = write_dance_run(tmp_path / "run")
+    shutil.copytree(trained / "70_bind", run / "70_bind")
+    shutil.copy(trained / "train.json", run)
+    return run
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_files_and_figures_of_every_stage(trained, stage):
+    folder = trained / stage
+    previews = {f"previews/Held0_{frame:06d}.png" for frame in (1, 3, 4, 5)}
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    logs = {"metrics.jsonl", *(["track_metrics.jsonl"] if stage == "80_teacher" else [])}
+    assert files == {"manifest.json", *logs, *previews, *MODELS[stage]}
+    manifest = read_manifest(folder)
+    numbers = manifest["numbers"]
+    assert numbers["finished"] and numbers["iterations_done"] == 3 and numbers["processes"] == 1
+    assert (numbers["training_frames"], numbers["training_cameras"]) == (4, 4)
+    assert numbers["bytes"] == {name: (folder / name).stat().st_size for name in MODELS[stage]}
+    assert numbers["gaussians"] == 300 and numbers["parameters"]["total"] > 300 * 20
+    assert numbers["peak_memory"]["host"] > 50e6
+    assert (numbers["seconds_of_tracking"] > 0) == (stage == "80_teacher")
+    for kind in ("novel_view", "novel_pose"):
+        assert 3 < numbers[kind]["psnr"] < 60 and 3 < numbers["start"][kind]["psnr"] < 60
+    assert {c["name"] for c in manifest["checks"]} >= {
+        "held-out views: PSNR of the person", "held-out poses: SSIM", "iterations done"
+    }  # fmt: skip
+    real, rendered, _ = read_strip(folder / "previews" / "Held0_000004.png")
+    assert real.shape == rendered.shape == (64, 48, 3) and real.max() > 100
+    assert not list(trained.glob("*_work"))
+
+
+def test_inputs_are_the_files_of_earlier_stages(trained):
+    inputs = {stage: set(read_manifest(trained / stage)["inputs"]) for stage in STAGES}
+    assert "70_bind/gaussians.safetensors" in inputs["80_teacher"]
+    assert "80_teacher/teacher.safetensors" in inputs["85_bake"]
+    assert "85_bake/student.safetensors" in inputs["90_compensate"]
+    assert all(
+        {"60_assemble/smplxpp.npz", "capture/parameters", "capture/cameras", "code"} <= i for i in inputs.values()
+    )
+
+
+def test_the_models_load_and_the_students_blend_shapes_fit_the_template(trained):
+    rig = Rig(template())
+    teacher = load_avatar(trained / "80_teacher" / "teacher.safetensors", rig)
+    student = load_avatar(trained / "90_compensate" / "student_compact.safetensors", rig)
+    assert len(teacher.gaussians) == len(student.gaussians) == 300
+    assert student.config.blend_shapes.expression_size == rig.expression_size == 2
+    assert student.frames == (0, 1, 2, 3)
+
+
+def test_what_stands_is_not_trained_again(own, capture, capsys):
+    made = {stage: (own / stage / "manifest.json").stat().st_mtime_ns for stage in STAGES}
+    assert train(own, capture) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["finished"] and not any(stage["ran"] for stage in answer["stages"].values())
+    assert list(answer["stages"]) == ["fit", "teacher", "bake", "compensate"]
+    assert made == {stage: (own / stage / "manifest.json").stat().st_mtime_ns for stage in STAGES}
+
+
+def test_other_options_train_what_they_concern(own, capture, capsys):
+    assert train(own, capture, "--compensate-iterations", "2", "--blend-shapes", "local", "--perceptual", "none") == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert [name for name, numbers in stages.items() if numbers["ran"]] == ["compensate"]
+    shapes = load_avatar(own / "90_compensate" / "student.safetensors", Rig(template())).config.blend_shapes
+    assert (shapes.parts, shapes.shapes) == (256, 16)
+
+
+def test_pruned_blend_shapes_fit_the_compact_file_into_its_size(own, capture, capsys):
+    limit = 0.1
+    assert train(own, capture, "--blend-shapes", "pruned", "--max-megabytes", str(limit)) == 0
+    numbers = json.loads(capsys.readouterr().out)["stages"]["compensate"]
+    assert numbers["bytes"]["student_compact.safetensors"] <= 1e6 * limit
+    assert 0 < numbers["compact"]["kept_blend_shapes"] < 1 and "novel_pose" in numbers["compact"]
+    whole = load_avatar(own / "90_compensate" / "student.safetensors", Rig(template()))
+    assert len(whole.blend_shapes.active) == 300
+
+
+def test_a_limit_of_time_gives_a_model_and_the_same_command_goes_on(trained, fitted, capture, capsys):
+    assert train(fitted, capture, "--stage", "teacher", "--max-minutes", "1e-9") == 0
+    first = json.loads(capsys.readouterr().out)
+    assert not first["finished"] and first["stages"]["teacher"]["iterations_done"] == 1  # of the tracking
+    assert first["stages"]["teacher"]["measured_at"] is None
+    load_avatar(fitted / "80_teacher" / "teacher.safetensors", Rig(template()))
+    assert (fitted / "80_teacher_work").is_dir()
+    assert train(fitted, capture, "--stage", "bake") == 2  # of a teacher that is not finished
+    assert "1 of 8 iterations" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert train(fitted, capture) == 0
+    assert same_models(fitted, trained) and not list(fitted.glob("*_work"))
+
+
+def test_a_killed_training_goes_on(trained, fitted, capture, monkeypatch):
+    step = BakeTask.step
+
+    def killed(self, iteration):
+        if iteration == 2:
+            raise KeyboardInterrupt
+        return step(self, iteration)
+
+    often(monkeypatch)
+    monkeypatch.setattr(BakeTask, "step", killed)
+    assert train(fitted, capture) == 130
+    assert (fitted / "80_teacher").is_dir() and not (fitted / "85_bake").exists()
+    monkeypatch.setattr(BakeTask, "step", step)
+    assert train(fitted, capture) == 0
+    assert same_models(fitted, trained)
+
+
+def test_checkpoints_of_other_options_are_not_overwritten(fitted, capture, capsys):
+    assert train(fitted, capture, "--stage", "teacher", "--max-minutes", "1e-9") == 0
+    capsys.readouterr()
+    state_file = fitted / "80_teacher_work" / "track" / "state.safetensors"
+    state = state_file.read_bytes()
+    assert train(fitted, capture, "--stage", "teacher", "--seed", "5") == 2
+    assert "--force" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert state_file.read_bytes() == state
+    assert train(fitted, capture, "--stage", "teacher", "--seed", "5", "--force") == 0
+
+
+def test_a_reference_fit_of_the_users_own_is_taken(tmp_path, capture, caplog):
+    run = write_dance_run(tmp_path / "run")
+    options = ("--gaussians", "123", "--iterations", "1", "--hold-out", "Ring3", "--json", "--no-report")
+    assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
+    made = (run / "70_bind" / "manifest.json").read_bytes()
+    with caplog.at_level("INFO"):
+        assert train(run, capture, "--until", "teacher", "--force") == 0
+    assert (run / "70_bind" / "manifest.json").read_bytes() == made and "taken as it stands" in caplog.text
+    assert read_manifest(run / "80_teacher")["numbers"]["gaussians"] == 123
+
+
+def test_a_students_bake_without_a_teacher(fitted, capture, capsys):
+    assert train(fitted, capture, "--no-teacher", "--until", "bake") == 0
+    assert list(json.loads(capsys.readouterr().out)["stages"]) == ["fit", "bake"]
+    assert not (fitted / "80_teacher").exists()
+    assert "70_bind/gaussians.safetensors" in read_manifest(fitted / "85_bake")["inputs"]
+
+
+def test_held_out_cameras_and_scale_are_the_users_choice(fitted, capture):
+    options = ("--stage", "teacher", "--hold-out", "Ring1", "--scale", "0.5", "--teacher-iterations", "1")
+    assert train(fitted, capture, *options) == 0
+    assert read_strip(fitted / "80_teacher" / "previews" / "Ring1_000001.png")[0].shape == (32, 24, 3)
+    assert read_manifest(fitted / "80_teacher")["numbers"]["training_cameras"] == 3 + len(HELD_OUT)
+
+
+def test_the_terminal_shows_figures(own, capture, capsys, monkeypatch):
+    monkeypatch.setitem(TRAINING_PRESETS, "demo", QUICK)
+    options = [option for option in SMALL if option != "--json"]
+    assert main(["train", "--run", str(own), "--capture", str(capture), *options]) == 0
+    out = capsys.readouterr().out
+    assert all(stage in out for stage in ("70_bind", *STAGES)) and "stands" in out and "3 of 3" in out
+
+
+@pytest.mark.slow
+def test_torchrun_trains_with_two_processes(fitted, capture):
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
+               "pipelines.cli", "train", "--run-folder", str(fitted), "--capture", str(capture), *SMALL]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    answer = json.loads(done.stdout)  # the first process alone speaks
+    assert answer["finished"]
+    for stage in STAGES:
+        manifest = read_manifest(fitted / stage)
+        assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["items"] >= 2

@@ -1,0 +1,59 @@
+"""Trainings of a few steps for the tests of `smplxpp train`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+from avatar.models.presets import NetworkPreset
+from avatar.training.presets import TRAINING_PRESETS
+from avatar.training.track import Level, TrackConfig
+from pipelines.cli import main
+from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER
+
+STAGES = ("80_teacher", "85_bake", "90_compensate")
+SMALL = (
+    "--preset", "demo", "--gaussians", "300", "--fit-iterations", "2", "--teacher-iterations", "3",
+    "--bake-iterations", "3", "--compensate-iterations", "3", "--device", "cpu", "--json", "--no-report",
+)  # fmt: skip
+DEMO = TRAINING_PRESETS["demo"]
+QUICK = replace(
+    DEMO, networks=NetworkPreset(TINY_TEACHER, TINY_FIELD, DEMO.blend_shapes),
+    teacher=replace(DEMO.teacher, track=TrackConfig(levels=(Level(1, 2, 2e-3),), control_points=24)),
+)  # fmt: skip
+
+
+def train(run: Path, capture: Path, *options: str) -> int:
+    """The command, with tiny networks as the preset "demo"."""
+    with mock.patch.dict(TRAINING_PRESETS, demo=QUICK):
+        return main(["train", "--run", str(run), "--capture", str(capture), *SMALL, *options])
+
+
+def refused(capsys, run: Path, capture: Path, *options: str) -> str:
+    """The message of a training that must be refused before anything is written."""
+    before = sorted(run.rglob("*")) if run.exists() else []
+    assert train(run, capture, *options) == 2
+    message = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert (sorted(run.rglob("*")) if run.exists() else []) == before
+    return message
+
+
+def same_models(one: Path, two: Path) -> bool:
+    """Whether two runs hold the same models, byte for byte."""
+    files = sorted(path.relative_to(one) for stage in STAGES for path in (one / stage).glob("*.safetensors"))
+    assert len(files) == 4
+    return all((one / file).read_bytes() == (two / file).read_bytes() for file in files)
+
+
+def often(monkeypatch) -> None:
+    """A checkpoint after every step."""
+    from avatar.training import loop
+
+    init = loop.LoopConfig.__init__
+
+    def changed(self, **values):
+        init(self, **{**values, "checkpoint_seconds": 0.0})
+
+    monkeypatch.setattr(loop.LoopConfig, "__init__", changed)

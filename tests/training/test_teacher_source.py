@@ -1,0 +1,74 @@
+"""What the teacher says is asked for once, kept within bounds, and the same from memory."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from avatar.training.sequence import eyes_of
+from avatar.training.teacher_source import TeacherSource
+from tests.training.dancing_doll import sequence, write_dance
+from tests.training.test_view_tasks import taught
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    return sequence(write_dance(tmp_path_factory.mktemp("captures") / "dance"))
+
+
+def source(frames, **options) -> TeacherSource:
+    return TeacherSource(taught(frames), frames, **{"eps2d": 0.1, "tau": 8.0, "normals": True, **options})
+
+
+def test_lessons_show_what_the_teacher_renders(frames):
+    from avatar.render.avatar_view import render_view
+
+    own, views = source(frames), [frames.view(name, 1) for name in ("Ring0", "Ring2")]
+    lessons = own.lessons(1, views)
+    with torch.no_grad():
+        posed = own.teacher(frames.motion(1), eyes_of(views))
+    for index, (view, lesson) in enumerate(zip(views, lessons, strict=True)):
+        seen = render_view(posed, index, view, frames.background, normals=True, extra=own.labels)
+        torch.testing.assert_close(lesson.target.image, seen.image, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(lesson.target.alpha, seen.alpha, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(lesson.labels, seen.extra, rtol=2e-3, atol=2e-3)
+        known = lesson.target.normals.abs().sum(-1) > 0
+        assert bool((seen.alpha[known] > 0.5).all()) and known.any()
+    assert not any(p.requires_grad for p in own.teacher.parameters())
+
+
+def test_maps_are_the_teachers(frames):
+    own = source(frames)
+    with torch.no_grad():
+        maps = own.teacher.residual_maps(frames.motion(2), torch.zeros(1, 3))
+    torch.testing.assert_close(own.displacements(2), maps.position[0], rtol=1e-3, atol=1e-6)
+
+
+def test_a_lesson_is_drawn_once(frames, monkeypatch):
+    own, views = source(frames), [frames.view("Ring1", 0)]
+    first = own.lessons(0, views)[0]
+    monkeypatch.setattr(TeacherSource, "_draw", None)
+    again = own.lessons(0, views)[0]
+    assert torch.equal(first.target.image, again.target.image) and torch.equal(first.labels, again.labels)
+
+
+def test_memory_is_bounded_and_the_oldest_goes(frames):
+    one = source(frames)
+    one.lessons(0, [frames.view("Ring0", 0)])
+    size = one._bytes
+    own = source(frames, max_bytes=int(2.5 * size))
+    for frame in range(4):
+        own.lessons(frame, [frames.view("Ring0", frame)])
+        assert own._bytes <= own.max_bytes
+        assert own._bytes == sum(t.numel() * t.element_size() for kept in own._kept.values() for t in kept)
+    assert [key[0] for key in own._kept] == [2, 3]
+    without = source(frames, max_bytes=0)
+    torch.testing.assert_close(
+        without.lessons(0, [frames.view("Ring0", 0)])[0].labels, one.lessons(0, [frames.view("Ring0", 0)])[0].labels
+    )
+    assert not without._kept
+
+
+def test_without_normals_a_lesson_has_none(frames):
+    lesson = source(frames, normals=False).lessons(0, [frames.view("Ring0", 0)])[0]
+    assert lesson.target.normals is None and lesson.labels.shape[-1] == 3
