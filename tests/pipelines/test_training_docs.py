@@ -1,0 +1,54 @@
+"""The guide's table of presets says what the presets are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from avatar.models.teacher import Teacher
+from avatar.training.presets import TRAINING_PRESETS, TrainingPreset
+
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "avatar_training.md"
+
+
+def rows() -> list[str]:
+    """Of the table, a column for every preset."""
+    columns = [_column(preset) for preset in TRAINING_PRESETS.values()]
+    return [f"| {name} | " + " | ".join(column[name] for column in columns) + " |" for name in columns[0]]
+
+
+def _column(preset: TrainingPreset) -> dict[str, str]:
+    network, teacher, bake, compensate = preset.networks.teacher, preset.teacher, preset.bake, preset.compensate
+    with torch.device("meta"):
+        millions = sum(p.numel() for p in Teacher(network).parameters()) / 1e6
+    stages = (teacher, bake, compensate)
+    weights = {stage.weights for stage in stages}
+    assert len(weights) == 1
+    (weight,) = weights
+    return {
+        "Gaussians": f"{preset.fit.sampling.count:,}",
+        "iterations of the fit": f"{preset.fit.iterations:,}",
+        "teacher: maps in, out, pixels": f"{network.in_size}, {network.out_size}",
+        "teacher: parameters, millions": f"{millions:.3g}",
+        "surface followed first": "no" if teacher.track is None else f"{teacher.track.steps} steps a frame",
+        "teacher: iterations": f"{teacher.iterations:,}",
+        "bake: iterations": f"{bake.iterations:,}",
+        "compensation: iterations": f"{compensate.iterations:,}",
+        "of them without rendering": f"{teacher.pretrain:,}, {bake.pretrain:,}, 0",
+        "poses a step": ", ".join(str(stage.items) for stage in stages),
+        "cameras a pose": ", ".join(str(stage.views) for stage in stages),
+        "rate of the networks": ", ".join(f"{stage.rate:g}" for stage in stages),
+        "rate of the attributes, of the fit's": ", ".join(f"{stage.attributes:g}" for stage in stages),
+        "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
+        "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
+        "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
+        "jaw drives the head": "yes" if preset.blend_shapes.jaw else "no",
+    }
+
+
+def test_the_table_is_that_of_the_presets():
+    text = GUIDE.read_text()
+    missing = [row for row in rows() if row not in text]
+    assert not missing, "docs/avatar_training.md lacks:\n" + "\n".join(missing)
+    assert "| | " + " | ".join(TRAINING_PRESETS) + " |" in text
