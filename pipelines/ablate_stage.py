@@ -29,6 +29,7 @@ from avatar.evaluation.report import view_key
 from avatar.evaluation.tables import FigureTable
 from avatar.training.loop import Progress
 from avatar.training.presets import TrainingPreset
+from pipelines.ablate_adopt import adopt_trained
 from pipelines.pictures import caption, encode_png, row
 from pipelines.run_folder import own_run_folder
 from pipelines.train_inputs import TrainInputs, open_scene
@@ -103,6 +104,8 @@ def ablate(
         )
         if how.force:
             ablation.forget(rows)
+        else:
+            adopt_trained(run, ablation, scene, scale=inputs.scale, perceptual=perceptual)
         observer = Observer(how.training, how.measuring, lambda name, found: _keep_pictures(folder, name, found))
         result = ablation.run(rows, config, max_seconds=how.max_seconds, observer=observer)
         waiting = unfinished(ablation, rows, result.waiting)

@@ -167,6 +167,11 @@ class Ablation:
         """A finished piece, read from its file."""
         return self.pieces[name].read(self.folder / name / PIECE_FILE, self.shop, self.piece)
 
+    def adopt(self, name: str, path: Path, *, seconds: float, iterations: int) -> None:
+        """Take a file that was made as the piece is, by other means, in its place."""
+        self.pieces[name].write(self.pieces[name].read(path, self.shop, self.piece), self.folder / name / PIECE_FILE)
+        self._finish(name, seconds, iterations)
+
     def forget(self, rows: Mapping[str, Row]) -> None:
         """Remove rows and all pieces that they are made from, checkpoints included."""
         for name, row in rows.items():
@@ -182,6 +187,9 @@ class Ablation:
             return False
         log.info("ablation: training %s", name)
         piece, folder = self.pieces[name], self.folder / name
+        if (folder / RECORD_FILE).is_file():
+            for stale in folder.rglob(METRICS_FILE):  # of a finished piece that no longer stands
+                stale.unlink()
         session = Session(
             folder, key=self.key(name), perceptual=self.perceptual, max_seconds=end - time.monotonic(),
             report=lambda progress: observer.training(name, progress),
@@ -192,11 +200,15 @@ class Ablation:
             return False
         piece.write(product, folder / PIECE_FILE)
         seconds, iterations = (time.perf_counter() - begin, 0) if progress is None else _spent(folder)
-        done = {"key": self.key(name), "seconds": seconds, "iterations": iterations}
-        atomic_write_text(folder / RECORD_FILE, json.dumps(done, indent=1))
-        for state in folder.rglob(STATE_FILE):
-            state.unlink()
+        self._finish(name, seconds, iterations)
         return True
+
+    def _finish(self, name: str, seconds: float, iterations: int) -> None:
+        """Record a piece whose file is written."""
+        done = {"key": self.key(name), "seconds": seconds, "iterations": iterations}
+        atomic_write_text(self.folder / name / RECORD_FILE, json.dumps(done, indent=1))
+        for state in (self.folder / name).rglob(STATE_FILE):
+            state.unlink()
 
     def _row_key(self, row: Row, config: EvaluationConfig) -> str:
         return stage_key(config={"row": row, "evaluation": config}, inputs={"piece": self.key(row.piece)})

@@ -129,7 +129,7 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
 
     teacher = preset.teacher
     if teacher.track is not None:
-        teacher = replace(teacher, track=replace(teacher.track, reference=frame))
+        teacher = replace(teacher, track=replace(teacher.track, reference=frame, seed=teacher.seed))
     for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
         fit = f"{prefix}gaussians"
         pieces[fit] = FitPiece(ground=ground, config=replace(preset.fit, evaluations=1), frame=frame)
