@@ -1,0 +1,129 @@
+"""The report's sections on trainings: pictures, figures, curves, and which trainings belong to the report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from pipelines.report import Report, write_report
+from pipelines.train_names import kind_name, spread
+from pipelines.train_report import standing_trainings, training_key_numbers, training_section
+from smplxpp.core.artifact import StageRecord, read_manifest
+from tests.pipelines.training_runs import STAGES, train
+from tests.training.dancing_doll import write_dance, write_dance_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    base = tmp_path_factory.mktemp("report")
+    run, capture = write_dance_run(base / "run"), write_dance(base / "capture")
+    assert train(run, capture) == 0
+    return run
+
+
+@pytest.fixture
+def own(run, tmp_path):
+    return shutil.copytree(run, tmp_path / "own")
+
+
+def standing(run) -> dict[str, StageRecord]:
+    fit = StageRecord(run / "70_bind", read_manifest(run / "70_bind"), ran=False)
+    return standing_trainings(run, [fit])
+
+
+def change(folder, **fields) -> None:
+    """Rewrite fields of a manifest."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**manifest, **fields}))
+
+
+def test_every_training_has_a_section_with_its_figures(run):
+    for stage, title in zip(STAGES, ("Teacher", "Bake", "Compensation"), strict=True):
+        record = standing(run)[stage]
+        section, numbers = training_section(record), record.manifest["numbers"]
+        assert section.title == title
+        text = " ".join(section.text)
+        assert "3 of 3 iterations" in text and "4 frames of 4 cameras" in text and ".safetensors" in text
+        assert ("followed through the frames" in text) == (stage == "80_teacher")
+        table = section.tables[0]
+        states = ["start", "after 3 iterations", *(["the compact file"] if stage == "90_compensate" else [])]
+        assert [row[:2] for row in table.rows] == [
+            (kind, state) for kind in ("held-out views", "held-out poses") for state in states
+        ]
+        assert table.rows[1][2] == numbers["novel_view"]["psnr"]
+        assert {check.stage for check in section.checks} == {stage}
+        captions = [picture.caption for picture in section.pictures]
+        assert sum(caption.startswith("Held0, frame") for caption in captions) == len(section.comparisons) == 4
+
+
+def test_curves_follow_evaluations_and_steps(own):
+    lines = [
+        {"kind": "evaluation", "iteration": k, "seconds": 2.0 * k, "novel_view": {"psnr": 20.0 + k, "ssim": 0.9}}
+        for k in range(3)
+    ]
+    lines += [{"kind": "step", "iteration": k, "seconds": 0.1 * k, "loss": 1.0 / k} for k in range(1, 1001)]
+    (own / "85_bake" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    psnr, ssim, loss = training_section(standing(own)["85_bake"]).curves
+    np.testing.assert_array_equal(psnr.lines["held-out views"], ([0.0, 2.0, 4.0], [20.0, 21.0, 22.0]))
+    assert set(ssim.lines) == {"held-out views"}
+    seconds, values = loss.lines["training"]
+    assert len(seconds) == len(values) == 300 and (np.diff(seconds) > 0).all() and (np.diff(values) < 0).all()
+
+
+def test_key_numbers_are_those_of_the_last_training(run):
+    records = standing(run)
+    names = [number.label for number in training_key_numbers(records)]
+    assert names == ["student, held-out views", "student, held-out poses"]
+    assert training_key_numbers({}) == ()
+    teacher = {"80_teacher": records["80_teacher"]}
+    assert training_key_numbers(teacher)[0].value == (
+        f"{records['80_teacher'].manifest['numbers']['novel_view']['psnr']:.1f} dB"
+    )
+
+
+def test_trainings_of_files_that_were_made_anew_are_left_out(own):
+    assert list(standing(own)) == list(STAGES)
+    shutil.rmtree(own / "85_bake")
+    assert list(standing(own)) == ["80_teacher", "90_compensate"]
+    inputs = read_manifest(own / "80_teacher")["inputs"]
+    change(own / "80_teacher", inputs={**inputs, "70_bind/gaussians.safetensors": "other"})
+    assert "80_teacher" not in standing(own)
+
+
+def test_what_an_outdated_training_gave_on_is_outdated_too(own):
+    inputs = read_manifest(own / "80_teacher")["inputs"]
+    change(own / "80_teacher", inputs={**inputs, "70_bind/gaussians.safetensors": "other"})
+    assert standing(own) == {}
+
+
+def test_a_training_that_was_stopped_before_its_first_step_still_has_a_section(run, tmp_path):
+    record = standing(run)["80_teacher"]
+    folder = shutil.copytree(record.folder, tmp_path / "80_teacher")
+    (folder / "metrics.jsonl").unlink()
+    shutil.rmtree(folder / "previews")
+    numbers = {name: value for name, value in record.manifest["numbers"].items() if not name.startswith("novel")}
+    numbers |= {"start": {}, "measured_at": None, "finished": False}
+    section = training_section(StageRecord(folder, {**record.manifest, "numbers": numbers}, ran=True))
+    assert not section.curves and not section.comparisons and not section.tables[0].rows
+    assert "limit of time" in " ".join(section.text)
+
+
+def test_the_page_is_written(run, tmp_path):
+    sections = tuple(training_section(record) for record in standing(run).values())
+    report = Report(
+        subject="doll", summary="three trainings", hero=(), key_numbers=training_key_numbers(standing(run)), checks=(),
+        seconds={}, sections=sections, provenance={},
+    )  # fmt: skip
+    page = write_report(tmp_path / "report.html", report).read_text()
+    assert all(section.title in page for section in sections) and "PSNR" in page
+
+
+def test_names_and_spread():
+    assert kind_name("novel_view", held_out=True) == "held-out views"
+    assert kind_name("novel_view", held_out=False) == "training views"
+    assert kind_name("novel_pose", held_out=False) == "held-out poses"
+    assert spread([], 3) == [] and spread([5], 3) == [5]
+    assert spread(range(10), 3) == [0, 4, 9] and spread(range(2), 4) == [0, 1]
