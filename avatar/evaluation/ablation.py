@@ -115,6 +115,7 @@ class Ablation:
     ) -> None:
         self.shop, self.pieces, self.folder, self.inputs = shop, pieces, Path(folder), inputs
         self.perceptual = perceptual
+        self._keys: dict[str, str] = {}
 
     def run(
         self,
@@ -152,10 +153,14 @@ class Ablation:
 
     def key(self, name: str) -> str:
         """What decides a piece: its configuration, those of all that it is made from, the inputs."""
-        chain = [
-            {"kind": type(piece).__name__, **jsonable(piece)} for piece in map(self.pieces.get, self.closure(name))
-        ]
-        return stage_key(config={"pieces": chain, "device": self.shop.device}, inputs=self.inputs)
+        if name not in self._keys:
+            chain = [
+                {"kind": type(piece).__name__, **jsonable(piece)} for piece in map(self.pieces.get, self.closure(name))
+            ]
+            metric = None if self.perceptual is None else self.perceptual.name
+            config = {"pieces": chain, "device": self.shop.device, "perceptual": metric}
+            self._keys[name] = stage_key(config=config, inputs=self.inputs)
+        return self._keys[name]
 
     def record(self, name: str) -> dict[str, Any] | None:
         """Key, seconds and iterations of a piece that stands, else None."""
