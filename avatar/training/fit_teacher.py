@@ -82,7 +82,8 @@ class TeacherTask(ViewTask):
         known = torch.zeros_like(self.sequence.rig.vertices) if self.track is None else self.track.displacements(frame)
         moved = self.displacement_loss(known, maps.position[0])
         total = others + moved
-        return total, {"loss": float(total.detach()), "residuals": float(others.detach()), "nonrigid": float(moved.detach())}
+        terms = {"loss": total, "residuals": others, "nonrigid": moved}
+        return total, {name: float(term.detach()) for name, term in terms.items()}
 
     def _maps(self, item: Item, eyes: Tensor) -> Residuals:
         motion = self.sequence.motion(item.frame)

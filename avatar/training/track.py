@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avatar.losses.deformation import Strain
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked import Track, TrackedAvatar
 from avatar.training.gradient_task import ParameterGroup
@@ -46,6 +47,7 @@ class TrackConfig:
         levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
         control_points: on the template. views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
+        strain: weight of the mean squared strain of the clothes' edges: cloth folds, and hardly stretches.
         extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
         reference: frame to begin with, where the Gaussians were fitted; None: the first training frame.
@@ -56,6 +58,7 @@ class TrackConfig:
     control_points: int = 600
     views: int = 3
     smoothness: float = 20.0
+    strain: float = 2.0
     extrapolation: float = 0.8
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.1)
@@ -66,7 +69,13 @@ class TrackConfig:
     def __post_init__(self) -> None:
         if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.rate <= 0 for level in self.levels):
             raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
-        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("extrapolation", 0)):
+        for name, least in (
+            ("control_points", 1),
+            ("views", 1),
+            ("smoothness", 0),
+            ("strain", 0),
+            ("extrapolation", 0),
+        ):
             if not getattr(self, name) >= least:
                 raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
 
@@ -91,6 +100,7 @@ class TrackTask(ViewTask):
         super().__init__(sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)],
                          **options)  # fmt: skip
         self.avatar, self.track_config = avatar, config
+        self.strain = Strain(sequence.rig, sequence.rig.pose(sequence.motion(self.order[0])))
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
     def items(self, iteration: int) -> Sequence[Item]:
@@ -128,11 +138,14 @@ class TrackTask(ViewTask):
         return views
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """`L_rec` and the roughness of the displacements."""
+        """`L_rec`, the roughness of the displacements, and the strain of the clothes."""
         views = self.views(item)
-        total, terms, _ = self.compared(self.avatar(self.sequence.motion(item.frame), eyes_of(views)), views)
+        posed = self.avatar(self.sequence.motion(item.frame), eyes_of(views))
+        total, terms, _ = self.compared(posed, views)
         total = total + self.track_config.smoothness * self.avatar.cage.roughness(self.avatar.controls)
-        return total, {"loss": float(total.detach()), **terms}
+        strain = self.strain(posed.vertices)
+        total = total + self.track_config.strain * strain
+        return total, {"loss": float(total.detach()), **terms, "strain": float(strain.detach())}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
         """A step of the frame's; the first one leaves the frame before."""
