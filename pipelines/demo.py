@@ -1,4 +1,4 @@
-"""`make demo`: the embedded person, from scan and photographs to a template, Gaussians on it, a report and a film."""
+"""`make demo`: the embedded person, from scan and photographs to a template, a trained student, a report and a film."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from rich.logging import RichHandler
 
 from pipelines.commands.animate import Animate
 from pipelines.commands.build import Build
-from pipelines.commands.fit_reference import FitReference
+from pipelines.commands.evaluate import Evaluate
+from pipelines.commands.train import Train
 from smplxpp.core.errors import InputError
 
 # Below what the small scan has, so that simplification has something to do.
@@ -23,7 +24,8 @@ FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 
 @dataclass(frozen=True)
 class Demo:
-    """Build the embedded person's template, fit Gaussians to its photographs, animate it, say where the report lies."""
+    """Build the embedded person's template, train teacher and student on its photographs, measure both, animate the
+    template, say where the report lies."""
 
     out: Path = Path("runs/demo")
     """Folder of the run."""
@@ -31,7 +33,7 @@ class Demo:
     """Capture to build; the embedded person by default."""
 
     def run(self) -> Path:
-        """Build, fit and animate; returns the path of the report.
+        """Build, train, evaluate and animate; returns the path of the report.
 
         Raises:
             InputError: the fixture is not there (an installed package does not hold it).
@@ -40,7 +42,8 @@ class Demo:
         if not self.capture.is_dir():
             raise InputError("fixture", expected="a folder", received=str(self.capture), remedy="run in a checkout")
         Build(out=self.out, capture=self.capture, budgets=BUDGETS).run()
-        FitReference(run_folder=self.out, capture=self.capture, preset="quick").run()
+        Train(run_folder=self.out, capture=self.capture, preset="demo").run()
+        Evaluate(run_folder=self.out, capture=self.capture).run()
         film = self.out / "motion.mp4"
         Animate(run_folder=self.out, params=self.capture / "params" / "params.npz", out=film, height=540).run()
         report = self.out / "report.html"

@@ -27,6 +27,7 @@ SCHEMA = 1
 HEADER = "avatar"
 GAUSSIANS = "gaussians."
 SHAPES = "blend_shapes."
+KINDS = ("teacher", "student")
 
 
 def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bool = False) -> int:
@@ -95,6 +96,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})[HEADER])
             newer = about["schema"] > SCHEMA
+            kinds = {name: type(about[name]) for name in ("kind", "topology", "face_count")}
+            if not newer and (kinds != {"kind": str, "topology": str, "face_count": int} or about["kind"] not in KINDS):
+                raise ValueError(f"an unknown kind of model, {about['kind']!r}")
             tensors = {} if newer else {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(

@@ -42,10 +42,11 @@ class TrainingPreset:
 
     def seeded(self, seed: int) -> TrainingPreset:
         """The same with another seed everywhere."""
+        track = self.teacher.track
         return replace(
             self,
             fit=replace(self.fit, seed=seed, sampling=replace(self.fit.sampling, seed=seed)),
-            teacher=replace(self.teacher, seed=seed),
+            teacher=replace(self.teacher, seed=seed, track=track and replace(track, seed=seed)),
             bake=replace(self.bake, seed=seed),
             compensate=replace(self.compensate, seed=seed),
         )
