@@ -144,6 +144,8 @@ def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiti
         "waiting": waiting,
         "evaluation": result.report.as_dict() if result.rows else None,
     })  # fmt: skip
+    for stale in (*folder.glob("table.*"), *(folder / PICTURES).glob("*.png")):
+        stale.unlink()
     if result.rows:
         for suffix, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label="tab:ablation"))):
             atomic_write_text(folder / f"table.{suffix}", text)
