@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
-from avatar.gaussians.frames import MIN_EDGE
 from avatar.models.map_sampling import MapFrame
 from avatar.models.rig import Rig
 from avatar.render.mesh_maps import front_back_maps
@@ -52,26 +51,3 @@ def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) ->
     corners = labels[rig.faces[gaussians.face_index]]
     u, v = gaussians.barycentric.unbind(-1)
     return (torch.stack([u, v, 1.0 - u - v], dim=-1)[..., None] * corners).sum(1)
-
-
-class Strain:
-    """Mean squared strain of the clothes' edges, `mean (|e| / |e_0| - 1)^2`; 0 for a template without clothes.
-
-    Args:
-        rig: of the template. vertices: (V, 3) where the clothes lie as they were made, metres.
-    """
-
-    def __init__(self, rig: Rig, vertices: Tensor) -> None:
-        faces = rig.faces[rig.cloth_mask[rig.faces].all(dim=1)]
-        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
-        self.edges = torch.unique(pairs, dim=0)
-        self.lengths = self._lengths(vertices).clamp_min(MIN_EDGE)
-
-    def __call__(self, vertices: Tensor) -> Tensor:
-        """Scalar of (V, 3) posed vertices, with gradients."""
-        if not len(self.edges):
-            return vertices.new_zeros(())
-        return (self._lengths(vertices) / self.lengths - 1.0).square().mean()
-
-    def _lengths(self, vertices: Tensor) -> Tensor:
-        return (vertices[self.edges[:, 0]] - vertices[self.edges[:, 1]]).norm(dim=-1)

@@ -95,7 +95,8 @@ def run_training(
 ) -> Progress:
     """Train, from the checkpoint in `folder` if there is one, else from the start.
 
-    `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. Evaluations do not count as time spent.
+    `folder` gets `metrics.jsonl` and `state.safetensors`. A finished training is taken from there as it ended: what comes
+    after it may be killed too. Evaluations do not count as time spent.
     Where several processes train, all start from the first one's state, its clock is everyone's, and it alone reads,
     evaluates and writes.
 
@@ -162,7 +163,7 @@ def run_training(
             if unsaved >= config.checkpoint_seconds and not last:
                 together.from_first(save)
                 unsaved = 0.0
-        if done < config.iterations:
+        if done > first:
             together.from_first(save)
         return progress()
 

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.losses.deformation import Strain
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked import Track, TrackedAvatar
 from avatar.training.gradient_task import ParameterGroup
@@ -47,21 +46,19 @@ class TrackConfig:
         levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
         control_points: on the template. views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
-        strain: weight of the mean squared strain of the clothes' edges: cloth folds, and hardly stretches.
         extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
         reference: frame to begin with, where the Gaussians were fitted; None: the first training frame.
         seed: of the order of views.
     """
 
-    levels: tuple[Level, ...] = (Level(2, 10, 4e-3), Level(1, 8, 3e-3), Level(0, 10, 2e-3))
+    levels: tuple[Level, ...] = (Level(2, 14, 5e-3), Level(1, 10, 4e-3), Level(0, 10, 2e-3))
     control_points: int = 600
     views: int = 3
     smoothness: float = 20.0
-    strain: float = 2.0
     extrapolation: float = 0.8
     weights: ReconstructionWeights = field(
-        default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.1)
+        default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
     )
     reference: int | None = None
     seed: int = 0
@@ -69,13 +66,7 @@ class TrackConfig:
     def __post_init__(self) -> None:
         if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.rate <= 0 for level in self.levels):
             raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
-        for name, least in (
-            ("control_points", 1),
-            ("views", 1),
-            ("smoothness", 0),
-            ("strain", 0),
-            ("extrapolation", 0),
-        ):
+        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("extrapolation", 0)):
             if not getattr(self, name) >= least:
                 raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
 
@@ -100,7 +91,6 @@ class TrackTask(ViewTask):
         super().__init__(sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)],
                          **options)  # fmt: skip
         self.avatar, self.track_config = avatar, config
-        self.strain = Strain(sequence.rig, sequence.rig.pose(sequence.motion(self.order[0])))
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
     def items(self, iteration: int) -> Sequence[Item]:
@@ -138,14 +128,12 @@ class TrackTask(ViewTask):
         return views
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """`L_rec`, the roughness of the displacements, and the strain of the clothes."""
+        """`L_rec` and the roughness of the displacements."""
         views = self.views(item)
         posed = self.avatar(self.sequence.motion(item.frame), eyes_of(views))
         total, terms, _ = self.compared(posed, views)
         total = total + self.track_config.smoothness * self.avatar.cage.roughness(self.avatar.controls)
-        strain = self.strain(posed.vertices)
-        total = total + self.track_config.strain * strain
-        return total, {"loss": float(total.detach()), **terms, "strain": float(strain.detach())}
+        return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
         """A step of the frame's; the first one leaves the frame before."""
