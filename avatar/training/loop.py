@@ -95,8 +95,8 @@ def run_training(
 ) -> Progress:
     """Train, from the checkpoint in `folder` if there is one, else from the start.
 
-    `folder` gets `metrics.jsonl` and `state.safetensors`. A finished training is taken from there as it ended: what comes
-    after it may be killed too. Evaluations do not count as time spent.
+    `folder` gets `metrics.jsonl` and `state.safetensors`. A finished training is taken from there as it ended: what
+    comes after it may be killed too. Evaluations do not count as time spent.
     Where several processes train, all start from the first one's state, its clock is everyone's, and it alone reads,
     evaluates and writes.
 
