@@ -55,6 +55,7 @@ class LoopConfig:
             and an evaluation at the start.
         checkpoint_seconds: a kill loses at most the steps of this time.
         max_seconds: stop with a checkpoint when this session has worked as long.
+        keep_end: keep a checkpoint of the end too: the training is the first part of a longer work, which may be killed.
         tensorboard: log for TensorBoard too.
     """
 
@@ -63,6 +64,7 @@ class LoopConfig:
     evaluate_every: int = 250
     checkpoint_seconds: float = 30.0
     max_seconds: float = float("inf")
+    keep_end: bool = False
     tensorboard: bool = False
 
 
@@ -95,8 +97,7 @@ def run_training(
 ) -> Progress:
     """Train, from the checkpoint in `folder` if there is one, else from the start.
 
-    `folder` gets `metrics.jsonl` and `state.safetensors`. A finished training is taken from there as it ended: what
-    comes after it may be killed too. Evaluations do not count as time spent.
+    `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. Evaluations do not count as time spent.
     Where several processes train, all start from the first one's state, its clock is everyone's, and it alone reads,
     evaluates and writes.
 
@@ -163,7 +164,7 @@ def run_training(
             if unsaved >= config.checkpoint_seconds and not last:
                 together.from_first(save)
                 unsaved = 0.0
-        if done > first:
+        if done < config.iterations or (config.keep_end and done > first):
             together.from_first(save)
         return progress()
 

@@ -54,11 +54,11 @@ class Session:
         """Of a `ViewTask`."""
         return {"perceptual": self.perceptual, "distributed": self.distributed, "preview": self.preview}
 
-    def run(self, make: Callable[[], ViewTask], config: ViewConfig) -> Progress:
+    def run(self, make: Callable[[], ViewTask], config: ViewConfig, *, keep_end: bool = False) -> Progress:
         """Train what `make` gives."""
         loop = LoopConfig(
             iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds,
-            tensorboard=self.tensorboard,
+            keep_end=keep_end, tensorboard=self.tensorboard,
         )  # fmt: skip
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
@@ -103,7 +103,7 @@ def follow_surface(
     task = TrackTask(sequence, avatar, config, **{**session.options, "distributed": None})
 
     def alone() -> tuple[Tensor, Progress]:
-        progress = session.run(lambda: task, task.config)
+        progress = session.run(lambda: task, task.config, keep_end=True)
         return task.solved.cpu(), progress
 
     solved, progress = together.from_first(alone)

@@ -123,6 +123,13 @@ def test_the_teacher_follows_first_within_its_time(frames, tmp_path):
     assert done.finished and done.iterations == 3
 
 
+def test_what_was_found_is_taken_up_without_a_step(frames, track, tmp_path):
+    first, _ = follow_surface(frames, painted(), CONFIG, Session(tmp_path))
+    again, progress = follow_surface(frames, painted(), CONFIG, Session(tmp_path))
+    assert torch.equal(first.controls, again.controls) and torch.equal(first.controls, track.controls)
+    assert progress.finished and progress.session_seconds == 0.0
+
+
 @pytest.mark.parametrize("change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}])
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError):
