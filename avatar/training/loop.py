@@ -55,7 +55,7 @@ class LoopConfig:
             and an evaluation at the start.
         checkpoint_seconds: a kill loses at most the steps of this time.
         max_seconds: stop with a checkpoint when this session has worked as long.
-        keep_end: keep a checkpoint of the end too: the training is the first part of a longer work, which may be killed.
+        keep_end: keep a checkpoint of the end too: what comes after this training may be killed as well.
         tensorboard: log for TensorBoard too.
     """
 
