@@ -111,7 +111,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
         blend_shapes=BlendShapeConfig(jaw=True),
     ),
     "cpu": _lean("cpu", count=50_000, fit=300, teacher=1200, bake=1200, compensate=1200),
-    "demo": _lean("demo", count=15_000, fit=100, teacher=100, bake=100, compensate=100),
+    "demo": _lean("demo", count=15_000, fit=100, teacher=100, bake=100, compensate=400),
 }
 
 
