@@ -65,7 +65,7 @@ def teacher_steps(name: str, options: Options) -> dict[str, dict]:
     teacher = Teacher(config).to(options.device)
     size, count = config.in_size, GAUSSIANS[name]
     points, normals = body_points(count, options.device)
-    sampler = MapSampler(MapFrame((0.0, 0.0, 0.0)), config.out_size, points, normals)
+    sampler = MapSampler(MapFrame((0.0, 0.0, 0.0)), config.out_size, points, normals[:, 2] >= 0)
     positions, semantics = torch.rand(2, 1, 2, size, size, 3, device=options.device)
     views = torch.rand(1, 2, size, size, device=options.device)
 

@@ -149,7 +149,7 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     if teacher.track is None:
         pieces["untracked"] = SamePiece(student="full")
     else:
-        from_zero = replace(teacher, track=None, pretrain=0)
+        from_zero = replace(teacher, track=None, pretrain=None)
         pieces["untracked_teacher"] = replace(pieces["teacher"], config=from_zero)
         bake("untracked_bake", source="untracked_teacher")
         compensate("untracked", "untracked_bake")

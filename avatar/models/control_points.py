@@ -8,6 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.template import Template
+
+CLOTH_DENSITY = 4.0
+"""Control points of a vertex of the clothes, where one of the body has 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,12 @@ class ControlPoints:
 
 
 def choose_control_points(
-    vertices: np.ndarray, groups: np.ndarray, *, count: int, neighbour_count: int = 6
+    vertices: np.ndarray,
+    groups: np.ndarray,
+    *,
+    count: int,
+    neighbour_count: int = 6,
+    importance: np.ndarray | None = None,
 ) -> ControlPoints:
     """Spread control points evenly over every group of vertices and tie each vertex to the nearest of its own group.
 
@@ -40,12 +49,14 @@ def choose_control_points(
         groups: (V,) integers.
         count: of control points, shared among the groups by their numbers of vertices (at least one each).
         neighbour_count: control points a vertex depends on.
+        importance: (V,) positive; a group's vertices count as many times in its share. None: all alike.
 
     Raises:
         InputError: fewer control points than groups or more than vertices, or no neighbour.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     names, group = np.unique(np.asarray(groups), return_inverse=True)
+    importance = np.ones(len(vertices)) if importance is None else np.asarray(importance, dtype=np.float64)
     if not len(names) <= count <= len(vertices):
         raise InputError(
             "number of control points",
@@ -58,7 +69,7 @@ def choose_control_points(
     chosen: list[np.ndarray] = []
     neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
     weights = np.zeros((len(vertices), neighbour_count))
-    before, shares = 0, _shares(np.bincount(group), count)
+    before, shares = 0, _shares(np.bincount(group), np.bincount(group, weights=importance), count)
     for k in range(len(names)):
         members = np.flatnonzero(group == k)
         share = shares[k]
@@ -73,12 +84,31 @@ def choose_control_points(
     return ControlPoints(np.concatenate(chosen), neighbours, weights)
 
 
-def _shares(sizes: np.ndarray, count: int) -> np.ndarray:
-    """`count` split in proportion to `sizes`, exactly: at least one each, the largest remainders rounded up."""
-    exact = 1.0 + (count - len(sizes)) * (sizes - 1) / max(sizes.sum() - len(sizes), 1)
-    shares = np.floor(exact).astype(np.int64)
-    rest = np.argsort(shares - exact, kind="stable")[: count - shares.sum()]
-    shares[rest] += 1
+def template_control_points(template: Template, count: int) -> ControlPoints:
+    """Control points of a template, part by part; its clothes, which fold, have `CLOTH_DENSITY` times as many.
+
+    Args:
+        count: of control points; all vertices where there are no more.
+    """
+    density = np.where(template.cloth_mask, CLOTH_DENSITY, 1.0)
+    count = min(count, template.vertex_count)
+    return choose_control_points(template.vertices, template.vertex_part, count=count, importance=density)
+
+
+def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
+    """`count` split in proportion to `wishes`, exactly: from 1 to the size of each group.
+
+    The largest remainders are rounded up; what a full group cannot take goes to the others in the same proportion.
+    """
+    shares = np.ones(len(sizes), dtype=np.int64)
+    while (left := count - shares.sum()) > 0:
+        open_wishes = np.where(shares < sizes, wishes, 0.0)
+        more = left * open_wishes / open_wishes.sum()
+        whole = np.minimum(np.floor(more).astype(np.int64), sizes - shares)
+        if not whole.any():
+            rest = np.argsort(-(more - whole), kind="stable")
+            whole[rest[shares[rest] < sizes[rest]][:left]] = 1
+        shares += whole
     return shares
 
 

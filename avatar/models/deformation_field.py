@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from avatar.models.config import require_at_least
 from avatar.models.control_points import ControlPoints
+from avatar.models.sparse_rows import SparseRows
 from smplxpp.core.errors import InputError
 
 
@@ -125,22 +126,32 @@ class DeformationField(nn.Module):
             vertices, cloth_mask = vertices[where], cloth_mask[where]
             neighbours = torch.as_tensor(control.neighbours, device=vertices.device)
             weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
+            self.rows: SparseRows | None = SparseRows(neighbours, weights, len(where))
         else:
-            neighbours = weights = None
+            self.rows = None
+            where = torch.arange(len(vertices), device=vertices.device)
+        self.register_buffer("points", where, persistent=False)
         self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
         self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
-        self.register_buffer("neighbours", neighbours, persistent=False)
-        self.register_buffer("weights", weights, persistent=False)
 
     def forward(self, pose: Tensor, code: Tensor) -> Tensor:
-        """Displacements of all vertices.
+        """(B, V, 3) metres, displacements of all vertices along the canonical axes; see `at_points`."""
+        moved = self.at_points(pose, code)
+        if self.rows is None:
+            return moved
+        # Poses side by side are one table.
+        spread = self.rows(moved.transpose(0, 1).flatten(1))
+        return spread.unflatten(1, (len(moved), 3)).transpose(0, 1)
+
+    def at_points(self, pose: Tensor, code: Tensor) -> Tensor:
+        """Displacements where the networks are evaluated: the K control points, or all vertices.
 
         Args:
             pose: (B, pose_size) theta, axis-angle, radians.
             code: (B, code_size) frame codes.
 
         Returns:
-            (B, V, 3) metres, along the canonical axes.
+            (B, K, 3) metres, along the canonical axes.
 
         Raises:
             InputError: poses or codes of another length or number.
@@ -154,10 +165,7 @@ class DeformationField(nn.Module):
             )
         frames = torch.cat([pose, code], dim=1)
         moved = self.body(self.encodings, frames)
-        moved = moved.index_add(1, self.cloth_index, self.cloth(self.encodings[self.cloth_index], frames))
-        if self.neighbours is None:
-            return moved
-        return (moved[:, self.neighbours] * self.weights[..., None]).sum(dim=2)
+        return moved.index_add(1, self.cloth_index, self.cloth(self.encodings[self.cloth_index], frames))
 
 
 class FrameCodes(nn.Module):

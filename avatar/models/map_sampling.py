@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
+from avatar.models.sparse_rows import SparseRows
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 
@@ -52,48 +52,30 @@ class MapFrame:
         return torch.stack([x, -y], dim=-1) * (0.5 * size / self.half_extent) + 0.5 * size
 
 
-class _Bags(torch.autograd.Function):
-    """Sparse matrix times (rows, C) table, by weighted sums of rows; the adjoint is the transposed sparse matrix."""
-
-    @staticmethod
-    def forward(ctx, table: Tensor, *matrices: Tensor) -> Tensor:
-        ctx.save_for_backward(*matrices)
-        rows, offsets, weights = matrices[:3]
-        return F.embedding_bag(rows, table.to(weights.dtype), offsets, mode="sum", per_sample_weights=weights)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        rows, offsets, weights = ctx.saved_tensors[3:]
-        gradient = gradient.to(weights.dtype)
-        summed = F.embedding_bag(rows, gradient, offsets, mode="sum", per_sample_weights=weights)
-        return summed, *(None for _ in ctx.saved_tensors)
-
-
 class MapSampler(nn.Module):
-    """Looks N Gaussians up in front and back maps, bilinearly, each on the side that it faces.
+    """Looks N Gaussians up in front and back maps, bilinearly, each on its own side.
 
-    A Gaussian faces the front where its canonical normal has `z >= 0`. Values hold at pixel centres (`grid_sample`'s
+    Values hold at pixel centres (`grid_sample`'s
     `align_corners=False`); beyond the outermost centres the border's value holds. The lookup is linear in the maps and
-    the same for every frame, so it is prepared as a sparse matrix and its transpose: several times faster than
-    `grid_sample` on a CPU, and the sums of its gradient have one order on any device.
+    the same for every frame, so it is prepared as a sparse matrix: several times faster than `grid_sample` on a CPU.
 
     Args:
         frame: of the maps.
         size: side of the maps in pixels.
         points: (N, 3) canonical positions, metres.
-        normals: (N, 3) canonical normals, any length.
+        front: (N,) bool, True for those on the front map.
 
     Raises:
-        InputError: points that are not finite or outside the frame, or normals of another shape.
+        InputError: points that are not finite or outside the frame, or sides of another number.
     """
 
-    def __init__(self, frame: MapFrame, size: int, points: Tensor, normals: Tensor) -> None:
+    def __init__(self, frame: MapFrame, size: int, points: Tensor, front: Tensor) -> None:
         super().__init__()
-        if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
+        if points.ndim != 2 or points.shape[1] != 3 or front.shape != points.shape[:1]:
             raise InputError(
                 "canonical Gaussians",
-                expected="positions and normals of shape (N, 3)",
-                received=f"shapes {tuple(points.shape)} and {tuple(normals.shape)}",
+                expected="positions of shape (N, 3) and sides of shape (N,)",
+                received=f"shapes {tuple(points.shape)} and {tuple(front.shape)}",
             )
         pixels = frame.pixels_from_canonical(points.detach(), size)
         beyond = float((pixels - 0.5 * size).abs().max()) * 2.0 / size if len(pixels) else 0.0
@@ -105,26 +87,13 @@ class MapSampler(nn.Module):
                 remedy="check the units, or choose a larger half extent",
             )
         self.size = size
-        faces_back = normals[:, 2] < 0
         corner = (pixels - 0.5).floor().clamp(0, size - 2)
         right, down = (pixels - 0.5 - corner).clamp(0.0, 1.0).unbind(-1)
         column, row = corner.long().unbind(-1)
-        first = (faces_back * size + row) * size + column
-        rows = torch.stack([first, first + 1, first + size, first + size + 1], dim=1).flatten()
+        first = (~front * size + row) * size + column
+        rows = torch.stack([first, first + 1, first + size, first + size + 1], dim=1)
         weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]
-        weights = torch.stack(weights, dim=1).flatten()
-
-        order = torch.argsort(rows, stable=True)
-        counts = torch.bincount(rows, minlength=2 * size * size)
-        self.register_buffer("faces_front", ~faces_back, persistent=False)
-        matrices = {
-            "rows": rows, "offsets": torch.arange(0, 4 * len(points), 4, device=rows.device), "weights": weights,
-            "transposed_rows": order // 4, "transposed_offsets": counts.cumsum(0) - counts,
-            "transposed_weights": weights[order],
-        }  # fmt: skip
-        self._names = tuple(matrices)
-        for name, value in matrices.items():
-            self.register_buffer(name, value, persistent=False)
+        self.lookup = SparseRows(rows, torch.stack(weights, dim=1), 2 * size * size)
 
     def forward(self, maps: Tensor) -> Tensor:
         """(B, 2, size, size, C) front and back maps -> (B, N, C).
@@ -138,5 +107,4 @@ class MapSampler(nn.Module):
                 expected=f"shape (B, 2, {self.size}, {self.size}, C)",
                 received=f"shape {tuple(maps.shape)}",
             )
-        matrices = [getattr(self, name) for name in self._names]
-        return torch.stack([_Bags.apply(table, *matrices) for table in maps.flatten(1, 3)])
+        return torch.stack([self.lookup(table) for table in maps.flatten(1, 3)])

@@ -19,7 +19,14 @@ class NetworkPreset:
     blend_shapes: BlendShapeConfig
 
 
-_LEAN = {"networks": "shared", "style_layers": 1, "noise": False, "zero_output": True}
+_LEAN = {
+    "networks": "shared",
+    "position_size": 128,
+    "centred": True,
+    "style_layers": 1,
+    "noise": False,
+    "zero_output": True,
+}
 
 _TEACHERS = {
     "paper": TeacherConfig(),
@@ -27,9 +34,7 @@ _TEACHERS = {
         in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
     ),
     "cpu": TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN),
-    "demo": TeacherConfig(
-        in_size=64, out_size=128, bottleneck=16, channel_base=512, channel_max=32, style_size=16, **_LEAN
-    ),
+    "demo": TeacherConfig(in_size=64, out_size=128, channel_base=512, channel_max=32, style_size=16, **_LEAN),
 }
 
 NETWORK_PRESETS = {

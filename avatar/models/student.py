@@ -14,7 +14,7 @@ from avatar.gaussians.sampling import head_faces
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.config import require_at_least
-from avatar.models.control_points import choose_control_points
+from avatar.models.control_points import choose_control_points, template_control_points
 from avatar.models.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.posed import PosedAvatar
@@ -119,10 +119,7 @@ class Student(nn.Module):
 
 
 def _make_field(config: StudentConfig, rig: Rig) -> DeformationField:
-    control = None
-    if config.control_points:
-        template = rig.template
-        control = choose_control_points(template.vertices, template.vertex_part, count=config.control_points)
+    control = template_control_points(rig.template, config.control_points) if config.control_points else None
     return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control)
 
 

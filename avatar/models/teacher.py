@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from avatar.models.config import require_choice
@@ -27,6 +28,11 @@ class TeacherConfig:
         semantics: how the semantic colours join the positions: "sum" (6 input channels) or "concatenate" (12).
         sees_view: colour depends on the viewing direction.
         position_scale: metres of displacement for an output of 1.
+        position_size: side in pixels of the output of a smaller network for the position alone, which sees the input at
+            half that size and is enlarged to `out_size`; 0: the position is one of the others' outputs. Displacements
+            are smoother than colours, and the smaller network learns them many times faster.
+        centred: show the networks by how much a pose's map differs from the mean of the training frames, in units of
+            the differences' standard deviation; False: the map itself, in metres.
         in_size, out_size, bottleneck, channel_base, channel_max, style_size, style_layers, noise, zero_output: of each
             StyleUNet, see `StyleUNetConfig`.
 
@@ -38,6 +44,8 @@ class TeacherConfig:
     semantics: str = "sum"
     sees_view: bool = True
     position_scale: float = 0.05
+    position_size: int = 0
+    centred: bool = False
     in_size: int = 512
     out_size: int = 1024
     bottleneck: int = 8
@@ -53,16 +61,25 @@ class TeacherConfig:
         require_choice("teacher semantics", self.semantics, ("sum", "concatenate"))
         if not self.position_scale > 0:
             raise InputError("teacher position_scale", expected="above 0 m", received=f"{self.position_scale:g}")
+        largest = min(2 * self.in_size, self.out_size)
+        if not 0 <= self.position_size <= largest:
+            raise InputError("teacher position_size", expected=f"from 0 to {largest}", received=str(self.position_size))
         self.network_configs()
 
     def network_configs(self) -> dict[str, StyleUNetConfig]:
         """The StyleUNets by name."""
-        colour = Head(COLOUR, sees_view=self.sees_view)
-        if self.networks == "shared":
-            heads = {"all": (Head(POSITION + OTHER), colour)}
+        position, other, colour = (Head(POSITION),), (Head(OTHER),), Head(COLOUR, sees_view=self.sees_view)
+        if self.networks == "separate":
+            heads = {"position": position, "colour": (colour,), "other": other}
+        elif self.position_size:
+            heads = {"position": position, "all": (*other, colour)}
         else:
-            heads = {"position": (Head(POSITION),), "colour": (colour,), "other": (Head(OTHER),)}
-        return {name: self._network_config(its_heads) for name, its_heads in heads.items()}
+            heads = {"all": (Head(POSITION + OTHER), colour)}
+        configs = {name: self._network_config(its_heads) for name, its_heads in heads.items()}
+        if self.position_size:
+            size = self.position_size
+            configs["position"] = replace(configs["position"], in_size=size // 2, out_size=size)
+        return configs
 
     def _network_config(self, heads: tuple[Head, ...]) -> StyleUNetConfig:
         return StyleUNetConfig(
@@ -163,20 +180,46 @@ class Teacher(nn.Module):
         _require_shape("semantic maps", semantics, (B if len(semantics) != 1 else 1, 2, size, size, 3))
         if view_cosines is not None:
             _require_shape("view maps", view_cosines, (V if B == 1 else B, 2, size, size))
+        image = self._image(positions, semantics)
+        if "position" not in self.networks:
+            shape, colour = self.networks["all"](image, view_cosines)
+            return Residuals(shape, colour, self.config.position_scale)
+        position = self._position(image)
+        if "all" in self.networks:
+            other, colour = self.networks["all"](image, view_cosines)
+        else:
+            (colour,) = self.networks["colour"](image, view_cosines)
+            (other,) = self.networks["other"](image)
+        return Residuals(torch.cat([position, other], dim=-1), colour, self.config.position_scale)
+
+    def positions(self, positions: Tensor, semantics: Tensor) -> Tensor:
+        """The residuals of the position alone, (B, 2, R, R, 3) in units of `position_scale`.
+
+        Args:
+            positions, semantics: as in `forward`.
+        """
+        image = self._image(positions, semantics)
+        return self._position(image) if "position" in self.networks else self.networks["all"](image)[0][..., :POSITION]
+
+    def _image(self, positions: Tensor, semantics: Tensor) -> Tensor:
+        """(B, channels, S, S) input of the StyleUNets."""
         if self.config.semantics == "sum":
             image = positions + semantics
         else:
             image = torch.cat([positions, semantics.expand_as(positions)], dim=-1)
-        image = image.permute(0, 1, 4, 2, 3).flatten(1, 2)
+        return image.permute(0, 1, 4, 2, 3).flatten(1, 2)
 
-        if self.config.networks == "shared":
-            shape, colour = self.networks["all"](image, view_cosines)
-        else:
-            (position,) = self.networks["position"](image)
-            (colour,) = self.networks["colour"](image, view_cosines)
-            (other,) = self.networks["other"](image)
-            shape = torch.cat([position, other], dim=-1)
-        return Residuals(shape, colour, self.config.position_scale)
+    def _position(self, image: Tensor) -> Tensor:
+        """(B, 2, R, R, 3) of the position's own network."""
+        network, out = self.networks["position"], self.config.out_size
+        if image.shape[-1] != network.config.in_size:
+            image = F.interpolate(image, size=(network.config.in_size,) * 2, mode="area")
+        (maps,) = network(image)
+        if maps.shape[2] == out:
+            return maps
+        channels_first = maps.flatten(0, 1).permute(0, 3, 1, 2)
+        larger = F.interpolate(channels_first, size=(out, out), mode="bilinear", align_corners=False)
+        return larger.permute(0, 2, 3, 1).unflatten(0, maps.shape[:2])
 
 
 def _require_shape(subject: str, value: Tensor, shape: tuple[int, ...]) -> None:

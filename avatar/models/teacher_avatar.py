@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.map_sampling import MapFrame, MapSampler
+from avatar.models.map_sides import map_sides
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion, Rig
 from avatar.models.teacher import Residuals, Teacher, TeacherConfig, local_offsets
@@ -22,12 +24,17 @@ HALF_EXTENT = 1.0
 """Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""
 
 
+STILL = 1e-3
+"""Metres: poses that differ less are not told apart more than that."""
+
+
 @dataclass(frozen=True, eq=False)
 class TeacherMaps:
     """What the networks are shown of a pose.
 
     Attributes:
-        positions: (1, 2, S, S, 3) posed coordinates without the root's motion, metres.
+        positions: (1, 2, S, S, 3) posed coordinates without the root's motion, metres; or, `centred`, by how many
+            deviations they differ from the mean.
         cosines: (C, 2, S, S) between posed normals and the directions to C cameras, or None.
     """
 
@@ -60,30 +67,65 @@ class TeacherAvatar(nn.Module):
         face, (u, v) = gaussians.face_index.to(rig.device), gaussians.barycentric.to(rig.device).unbind(-1)
         weights = torch.stack([u, v, 1.0 - u - v], dim=-1)
         points = (weights[..., None] * canonical.corners[face]).sum(1)
-        self.sampler = MapSampler(self.frame, config.out_size, points, canonical.rotations[face, :, 0])
+        sides = map_sides(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
+        self.sampler = MapSampler(self.frame, config.out_size, points, sides.front)
         self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)
         self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
         self.register_buffer("semantics", self.maps.interpolate(rig.semantic_colors)[None], persistent=False)
+        if config.centred:
+            self.register_buffer("mean_positions", torch.zeros(2, config.in_size, config.in_size, 3))
+            self.register_buffer("deviation", torch.ones(()))
         self.to(rig.device)
+
+    def centre(self, motions: Iterable[Motion]) -> None:
+        """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""
+        if not self.config.centred:
+            return
+        count, total, squares = 0, 0.0, 0.0
+        for motion in motions:
+            _, positions = self._root_positions(motion)
+            count, total, squares = count + 1, total + positions.double(), squares + positions.double().square()
+        mean = total / count
+        variance = (squares / count - mean.square()).clamp(min=0.0)[self.maps.mask].mean()
+        self.mean_positions.copy_(mean)
+        self.deviation.copy_(variance.sqrt().clamp(min=STILL))
+
+    def _root_positions(self, motion: Motion) -> tuple[Tensor, Tensor]:
+        """Skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
+        with torch.no_grad():
+            to_root = motion.root_from_world
+            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
+            return vertices, self.maps.interpolate(vertices)
+
+    def position_input(self, motion: Motion) -> Tensor:
+        """(1, 2, S, S, 3) maps of a pose as the networks are shown them; a constant for gradients."""
+        return self._shown(self._root_positions(motion)[1])
+
+    def _shown(self, positions: Tensor) -> Tensor:
+        return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
     def inputs(self, motion: Motion, eyes: Tensor) -> TeacherMaps:
         """Maps of a pose and of C cameras at `eyes` (C, 3); constants for gradients."""
         with torch.no_grad():
             to_root = motion.root_from_world
-            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
-            positions = self.maps.interpolate(vertices)
+            vertices, positions = self._root_positions(motion)
             if not self.config.sees_view:
-                return TeacherMaps(positions[None], None)
+                return TeacherMaps(self._shown(positions), None)
             normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
             from_root = eyes @ to_root[:3, :3].T + to_root[:3, 3]
             directions = F.normalize(from_root[:, None, None, None] - positions, dim=-1)
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
-            return TeacherMaps(positions[None], cosines * self.maps.mask)
+            return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
 
     def residual_maps(self, motion: Motion, eyes: Tensor) -> Residuals:
         """Maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
         maps = self.inputs(motion, eyes)
         return self.networks(maps.positions, self.semantics, maps.cosines)
+
+    def displacement_maps(self, motions: Sequence[Motion]) -> Tensor:
+        """(B, 2, R, R, 3) metres, dU in B poses; the networks of other residuals do not run if they are apart."""
+        inputs = torch.cat([self.position_input(motion) for motion in motions])
+        return self.config.position_scale * self.networks.positions(inputs, self.semantics)
 
     def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
         """The teacher in a pose, as C cameras at `eyes` (C, 3) see it."""

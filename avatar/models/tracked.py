@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
-from avatar.models.control_points import choose_control_points
+from avatar.models.control_points import template_control_points
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion, Rig
+from avatar.models.sparse_rows import SparseRows
 
 
 class ControlCage(nn.Module):
@@ -25,19 +26,18 @@ class ControlCage(nn.Module):
 
     def __init__(self, rig: Rig, count: int) -> None:
         super().__init__()
-        template = rig.template
-        control = choose_control_points(template.vertices, template.vertex_part, count=count)
+        control = template_control_points(rig.template, count)
         neighbours = torch.tensor(control.neighbours, device=rig.device)
         self.count = len(control.vertices)
-        self.register_buffer("neighbours", neighbours)
-        self.register_buffer("weights", torch.tensor(control.weights, dtype=torch.float32, device=rig.device))
+        weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
+        self.rows = SparseRows(neighbours, weights, self.count)
         # Two control points are neighbours if some vertex has them as its two nearest.
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
 
     def forward(self, controls: Tensor) -> Tensor:
         """(K, 3) -> (V, 3) metres."""
-        return (controls[self.neighbours] * self.weights[..., None]).sum(1)
+        return self.rows(controls)
 
     def roughness(self, controls: Tensor) -> Tensor:
         """Mean squared difference of neighbours, square metres."""

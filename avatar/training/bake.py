@@ -14,6 +14,7 @@ from avatar.models.rig import Motion
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.gradient_task import ParameterGroup
+from avatar.training.pretrain import PretrainConfig
 from avatar.training.sequence import AvatarSequence, Item, eyes_of
 from avatar.training.teacher_source import TeacherSource
 from avatar.training.view_task import ViewConfig, ViewTask
@@ -26,7 +27,8 @@ class BakeConfig(ViewConfig):
 
     Attributes:
         iterations: 30k in the paper. attributes: the paper refines them.
-        pretrain: of the iterations, those at the start that have `L_non` alone and render nothing; 0 in the paper.
+        pretrain: `L_non` alone before the iterations, without rendering; None in the paper.
+        imagined: poses between those of the training frames that the pretraining asks the teacher about.
         nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
         tau: radians a metre, of the semantic labels.
         code_rate: Adam's step of the frame codes, as a multiple of `rate`.
@@ -36,7 +38,8 @@ class BakeConfig(ViewConfig):
 
     iterations: int = 30_000
     attributes: float = 0.5
-    pretrain: int = 0
+    pretrain: PretrainConfig | None = None
+    imagined: int = 0
     nonrigid: float = 0.1
     semantic: float = 1.0
     tau: float = TAU
@@ -46,7 +49,7 @@ class BakeConfig(ViewConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("pretrain", "nonrigid", "semantic", "code_rate", "pose_noise"):
+        for name in ("imagined", "nonrigid", "semantic", "code_rate", "pose_noise"):
             if not getattr(self, name) >= 0.0:
                 raise InputError(f"bake: {name}", expected="at least 0", received=repr(getattr(self, name)))
         if not 0.0 <= self.null_share <= 1.0:
@@ -91,10 +94,6 @@ class BakeTask(ViewTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Of one frame."""
         motion = self._seen(self.sequence.motion(item.frame))
-        if self.source is not None and self.iteration < self.config.pretrain and self.student.field is not None:
-            displacements = self.student.displacements(motion)
-            nonrigid = self.displacement_loss(displacements, self.source.displacements(item.frame))
-            return nonrigid, {"nonrigid": float(nonrigid.detach())}
         views = self.views(item)
         posed = self.student(motion, eyes_of(views))
         if self.source is None:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from avatar.losses.deformation import DisplacementLoss
 from avatar.models.posed import PosedAvatar
 from avatar.models.teacher import Residuals
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.models.tracked import Track
 from avatar.training.gradient_task import ParameterGroup
+from avatar.training.pretrain import PretrainConfig
 from avatar.training.sequence import AvatarSequence, Item, eyes_of
 from avatar.training.track import TrackConfig
 from avatar.training.view_task import ViewConfig, ViewTask
@@ -25,65 +24,42 @@ class FitTeacherConfig(ViewConfig):
     """Choices of the teacher's training.
 
     Attributes:
-        iterations: 600k in the paper. pretrain: of them, those at the start that teach the networks residuals without
-            rendering: zero ones (5k steps in Animatable Gaussians), or with `track` the displacements that were found.
+        iterations: 600k in the paper.
+        pretrain: before them, without rendering: to zero residuals (5k steps in Animatable Gaussians), or with `track`
+            to the displacements that were found. None: the networks start as they are.
         track: follow the surface first; None: the paper's way.
         view_jitter: standard deviation of the noise on the directions that colour sees, as a share of the distance.
         displacement: weight of `mean |dU|^2` over the Gaussians, in units of the map.
     """
 
     iterations: int = 600_000
-    pretrain: int = 5_000
+    pretrain: PretrainConfig | None = field(default_factory=lambda: PretrainConfig(iterations=5_000))
     view_jitter: float = 0.1
     displacement: float = 0.0
     track: TrackConfig | None = None
 
 
 class TeacherTask(ViewTask):
-    """`L_rec` of the teacher's renderings; the first `pretrain` of the iterations ask for known residuals.
-
-    Args:
-        track: displacements to start from; None: zero.
-    """
+    """`L_rec` of the teacher's renderings."""
 
     def __init__(
-        self,
-        sequence: AvatarSequence,
-        teacher: TeacherAvatar,
-        config: FitTeacherConfig,
-        *,
-        track: Track | None = None,
-        **options: Any,
+        self, sequence: AvatarSequence, teacher: TeacherAvatar, config: FitTeacherConfig, **options: Any
     ) -> None:
         networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
         super().__init__(sequence, teacher, config, [networks], **options)
-        self.teacher, self.config, self.track = teacher, config, track
-        self.displacement_loss = DisplacementLoss(
-            sequence.rig, teacher.frame, teacher.config.out_size, teacher.config.position_scale
-        )
+        self.teacher, self.config = teacher, config
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Of one frame: the networks run once for all its cameras."""
         views = self.views(item)
         motion, eyes = self.sequence.motion(item.frame), eyes_of(views)
         maps = self._maps(item, eyes)
-        if self.iteration < self.config.pretrain:
-            return self._known_residuals(item.frame, maps)
         posed = self.teacher.posed(motion, eyes, maps)
         total, terms, _ = self.compared(posed, views)
         if self.config.displacement:
             moved = maps.shape[..., :3].square().mean()
             total = total + self.config.displacement * moved
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
-
-    def _known_residuals(self, frame: int, maps: Residuals) -> tuple[Tensor, dict[str, float]]:
-        """`mean |maps - known|`, where only displacements may be known to differ from zero."""
-        others = maps.shape[..., 3:].abs().mean() + maps.colour.abs().mean()
-        known = torch.zeros_like(self.sequence.rig.vertices) if self.track is None else self.track.displacements(frame)
-        moved = self.displacement_loss(known, maps.position[0])
-        total = others + moved
-        terms = {"loss": total, "residuals": others, "nonrigid": moved}
-        return total, {name: float(term.detach()) for name, term in terms.items()}
 
     def _maps(self, item: Item, eyes: Tensor) -> Residuals:
         motion = self.sequence.motion(item.frame)

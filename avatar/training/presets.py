@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
@@ -14,7 +15,8 @@ from avatar.training.bake import BakeConfig
 from avatar.training.compensate import CompensateConfig
 from avatar.training.fit_config import PRESETS, FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig
-from avatar.training.track import TrackConfig
+from avatar.training.pretrain import PretrainConfig
+from avatar.training.track import Level, TrackConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,37 +62,71 @@ class TrainingPreset:
         return replace(
             self,
             fit=replace(self.fit, iterations=fewer(self.fit.iterations)),
-            teacher=replace(
-                self.teacher, iterations=fewer(self.teacher.iterations), pretrain=round(share * self.teacher.pretrain)
-            ),
-            bake=replace(self.bake, iterations=fewer(self.bake.iterations), pretrain=round(share * self.bake.pretrain)),
+            teacher=with_iterations(self.teacher, fewer(self.teacher.iterations)),
+            bake=with_iterations(self.bake, fewer(self.bake.iterations)),
             compensate=replace(self.compensate, iterations=fewer(self.compensate.iterations)),
         )
+
+
+Pretrained = TypeVar("Pretrained", FitTeacherConfig, BakeConfig)
+
+
+def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
+    """A configuration with other iterations, and as large a share of its pretraining."""
+    pretrain = config.pretrain and config.pretrain.shortened(iterations / config.iterations)
+    return replace(config, iterations=iterations, pretrain=pretrain)
 
 
 _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 
 
-def _lean(name: str, *, count: int, fit: int, teacher: int, bake: int, compensate: int) -> TrainingPreset:
-    """Presets for two cores: several views a step, attributes that learn in every stage, no perceptual term."""
+@dataclass(frozen=True)
+class _Size:
+    """What tells one preset for two cores from another: Gaussians, control points, iterations of every training."""
+
+    gaussians: int
+    control_points: int
+    track: tuple[Level, ...]
+    pretrain: int
+    fit: int
+    teacher: int
+    bake: int
+    compensate: int
+
+
+def _lean(name: str, size: _Size) -> TrainingPreset:
+    """Presets for two cores: the surface is followed first, networks learn what was found before they see photographs,
+    several views a step, attributes that learn in every stage, no perceptual term."""
+    pretrain = PretrainConfig(iterations=size.pretrain, batch=8, rate=1e-2, final=0.02, warmup=20, betas=(0.9, 0.99))
     return TrainingPreset(
         networks=network_preset(name),
-        fit=FitConfig(sampling=SamplingConfig(count=count), iterations=fit),
+        fit=FitConfig(sampling=SamplingConfig(count=size.gaussians), iterations=size.fit),
         teacher=FitTeacherConfig(
-            iterations=teacher,
-            pretrain=teacher // 2,
+            iterations=size.teacher,
+            pretrain=pretrain,
             views=3,
-            rate=3e-3,
-            attributes=0.3,
+            rate=2e-3,
+            attributes=1.0,
             weights=_LEAN_WEIGHTS,
-            track=TrackConfig(),
+            track=TrackConfig(levels=size.track, control_points=size.control_points),
         ),
-        bake=BakeConfig(iterations=bake, pretrain=bake // 2, views=2, rate=2e-3, null_share=0.2, weights=_LEAN_WEIGHTS),
+        bake=BakeConfig(
+            iterations=size.bake,
+            pretrain=replace(pretrain, rate=5e-3),
+            imagined=96,
+            code_rate=5.0,
+            views=2,
+            rate=1e-3,
+            null_share=0.2,
+            weights=_LEAN_WEIGHTS,
+        ),
         compensate=CompensateConfig(
-            iterations=compensate, items=1, views=2, rate=1e-3, null_share=0.2, attributes=0.2, weights=_LEAN_WEIGHTS
+            iterations=size.compensate, items=1, views=2, rate=1e-3, null_share=0.2, attributes=0.5,
+            weights=_LEAN_WEIGHTS,
         ),
         blend_shapes=BlendShapeConfig(jaw=True),
-    )
+        control_points=size.control_points,
+    )  # fmt: skip
 
 
 TRAINING_PRESETS: dict[str, TrainingPreset] = {
@@ -105,13 +141,37 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
     "gpu": TrainingPreset(
         networks=network_preset("gpu"),
         fit=PRESETS["paper"],
-        teacher=FitTeacherConfig(iterations=60_000, pretrain=0, rate=1e-3, attributes=0.2, amp=True),
+        teacher=FitTeacherConfig(iterations=60_000, pretrain=None, rate=1e-3, attributes=0.2, amp=True),
         bake=BakeConfig(iterations=10_000, null_share=0.1),
         compensate=CompensateConfig(iterations=15_000, null_share=0.1),
         blend_shapes=BlendShapeConfig(jaw=True),
     ),
-    "cpu": _lean("cpu", count=50_000, fit=300, teacher=1200, bake=1200, compensate=1200),
-    "demo": _lean("demo", count=15_000, fit=100, teacher=100, bake=100, compensate=400),
+    "cpu": _lean(
+        "cpu",
+        _Size(
+            gaussians=50_000,
+            control_points=2400,
+            track=TrackConfig().levels,
+            pretrain=600,
+            fit=600,
+            teacher=600,
+            bake=600,
+            compensate=1200,
+        ),
+    ),
+    "demo": _lean(
+        "demo",
+        _Size(
+            gaussians=15_000,
+            control_points=800,
+            track=(Level(1, 8, 5e-3), Level(0, 8, 2e-3)),
+            pretrain=100,
+            fit=100,
+            teacher=60,
+            bake=60,
+            compensate=200,
+        ),
+    ),
 }
 
 

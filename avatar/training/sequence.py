@@ -150,6 +150,14 @@ def eyes_of(views: Sequence[View]) -> Tensor:
     return torch.stack([view.position for view in views])
 
 
+def evenly(frames: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the frames, each from the middle of its share."""
+    if not len(frames):
+        return []
+    count = min(count, len(frames))
+    return [frames[int((k + 0.5) * len(frames) / count)] for k in range(count)]
+
+
 def _training_part(capture: Capture) -> tuple[tuple[str, ...], tuple[int, ...]]:
     cameras = capture.splits.train_cameras
     presence = capture.presence()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +12,7 @@ from avatar.losses.deformation import semantic_labels
 from avatar.losses.reconstruction import Target
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.avatar_view import render_view
+from avatar.training.byte_cache import ByteCache
 from avatar.training.sequence import AvatarSequence, eyes_of
 from avatar.training.views import View
 
@@ -47,20 +47,17 @@ class TeacherSource:
         max_bytes: int = 2 << 30,
     ) -> None:  # fmt: skip
         self.teacher, self.sequence = teacher.requires_grad_(False), sequence
-        self.eps2d, self.normals, self.max_bytes = eps2d, normals, max_bytes
+        self.eps2d, self.normals = eps2d, normals
         self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
-        self._kept: OrderedDict[Hashable, tuple[Tensor, ...]] = OrderedDict()
-        self._bytes = 0
+        self._kept = ByteCache(max_bytes)
 
     def displacements(self, frame: int) -> Tensor:
         """(2, R, R, 3) metres, the teacher's position maps dU of a frame."""
 
         def make() -> tuple[Tensor, ...]:
-            motion = self.sequence.motion(frame)
-            maps = self.teacher.residual_maps(motion, motion.root_from_world.new_zeros(1, 3))
-            return (maps.position[0].half(),)
+            return (self.teacher.displacement_maps([self.sequence.motion(frame)])[0].half(),)
 
-        return self._get(("maps", frame), make)[0].float()
+        return self._kept.get(("maps", frame), make)[0].float()
 
     def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
         """What the teacher shows in views of a frame."""
@@ -73,7 +70,7 @@ class TeacherSource:
                 posed = self.teacher(self.sequence.motion(frame), eyes)
                 for index, k in enumerate(missing):
                     drawn[k] = self._draw(posed, index, views[k])
-        return [_lesson(self._get(key, lambda k=k: drawn[k])) for k, key in enumerate(keys)]
+        return [_lesson(self._kept.get(key, lambda k=k: drawn[k])) for k, key in enumerate(keys)]
 
     def _draw(self, posed, index: int, view: View) -> tuple[Tensor, ...]:
         seen = render_view(
@@ -83,24 +80,6 @@ class TeacherSource:
         if self.normals:
             tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
         return tuple(tensor.half() for tensor in tensors)
-
-    def _get(self, key: Hashable, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        with torch.no_grad():
-            made = make()
-        size = _bytes(made)
-        if size <= self.max_bytes:
-            self._kept[key] = made
-            self._bytes += size
-            while self._bytes > self.max_bytes:
-                self._bytes -= _bytes(self._kept.popitem(last=False)[1])
-        return made
-
-
-def _bytes(tensors: Sequence[Tensor]) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
 
 def _lesson(tensors: tuple[Tensor, ...]) -> Lesson:

@@ -35,7 +35,7 @@ class Level:
     rate: float
 
 
-LEVEL_END = 0.3
+LEVEL_END = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +52,11 @@ class TrackConfig:
         seed: of the order of views.
     """
 
-    levels: tuple[Level, ...] = (Level(2, 14, 5e-3), Level(1, 10, 4e-3), Level(0, 10, 2e-3))
-    control_points: int = 600
-    views: int = 3
-    smoothness: float = 20.0
-    extrapolation: float = 0.8
+    levels: tuple[Level, ...] = (Level(2, 20, 5e-3), Level(1, 16, 4e-3), Level(0, 20, 2e-3))
+    control_points: int = 2400
+    views: int = 4
+    smoothness: float = 80.0
+    extrapolation: float = 1.0
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
     )

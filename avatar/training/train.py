@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.blend_shapes import BlendShapeConfig
@@ -20,11 +18,18 @@ from avatar.training.bake import BakeConfig, BakeTask
 from avatar.training.compensate import CompensateConfig, CompensateTask
 from avatar.training.distributed import Distributed
 from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
+from avatar.training.gradient_task import GradientTask
 from avatar.training.loop import LoopConfig, Progress, run_training
 from avatar.training.machine import seeded
-from avatar.training.sequence import AvatarSequence
+from avatar.training.pretrain import PretrainConfig, PretrainFieldTask, PretrainTeacherTask
+from avatar.training.sequence import AvatarSequence, evenly
 from avatar.training.track import TrackConfig, TrackTask
-from avatar.training.view_task import Preview, ViewConfig, ViewTask
+from avatar.training.view_task import Preview, ViewConfig
+
+TRACK, PRETRAIN = "track", "pretrain"
+"""Folders of what comes before a training."""
+CENTRED_ON = 256
+"""Frames, spread over the training's, that centred inputs are measured on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +59,20 @@ class Session:
         """Of a `ViewTask`."""
         return {"perceptual": self.perceptual, "distributed": self.distributed, "preview": self.preview}
 
-    def run(self, make: Callable[[], ViewTask], config: ViewConfig, *, keep_end: bool = False) -> Progress:
+    def run(
+        self, make: Callable[[], GradientTask], config: ViewConfig | PretrainConfig, *, keep_end: bool = False
+    ) -> Progress:
         """Train what `make` gives."""
         loop = LoopConfig(
             iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds,
             keep_end=keep_end, tensorboard=self.tensorboard,
         )  # fmt: skip
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
+
+    def run_alone(self, make: Callable[[], GradientTask], config: ViewConfig | PretrainConfig) -> Progress:
+        """Train what `make` gives on the first process; the others wait. A checkpoint of the end is kept."""
+        together = self.distributed or Distributed()
+        return together.from_first(lambda: self.run(make, config, keep_end=True))
 
     def within(self, name: str) -> Session:
         """The same in a folder of its own, without previews."""
@@ -81,13 +93,23 @@ def fit_teacher(
     """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
     with seeded(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
+    teacher.centre(sequence.motion(frame) for frame in evenly(sequence.train_frames, CENTRED_ON))
     track = None
     if config.track is not None:
-        track, progress = follow_surface(sequence, gaussians, config.track, session.within("track"))
+        track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
-    progress = session.run(lambda: TeacherTask(sequence, teacher, config, track=track, **session.options), config)
+    # Networks whose output is zero know zero residuals already.
+    if config.pretrain is not None and (track is not None or not networks.zero_output):
+        pretrain = config.pretrain
+        progress = session.within(PRETRAIN).run_alone(
+            lambda: PretrainTeacherTask(sequence, teacher, pretrain, config.seed, track), pretrain
+        )
+        if not progress.finished:
+            return teacher.eval(), progress
+        session = session.after(progress)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, **session.options), config)
     return teacher.eval(), progress
 
 
@@ -98,16 +120,11 @@ def follow_surface(
 
     Steps have one frame each: of several processes the first follows it, and the others hear what it found.
     """
-    together = session.distributed or Distributed()
     avatar = TrackedAvatar(sequence.rig, gaussians, min(config.control_points, len(sequence.rig.vertices)))
     task = TrackTask(sequence, avatar, config, **{**session.options, "distributed": None})
-
-    def alone() -> tuple[Tensor, Progress]:
-        progress = session.run(lambda: task, task.config, keep_end=True)
-        return task.solved.cpu(), progress
-
-    solved, progress = together.from_first(alone)
-    task.solved.copy_(solved)
+    progress = session.run_alone(lambda: task, task.config)
+    together = session.distributed or Distributed()
+    task.solved.copy_(together.from_first(lambda: task.solved.cpu()))
     return task.track(), progress
 
 
@@ -123,6 +140,18 @@ def bake(
     """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
     with seeded(config.seed):
         made = Student(student, sequence.rig, gaussians, sequence.train_frames)
+    if config.pretrain is not None and teacher is not None and made.field is not None:
+        pretrain = config.pretrain
+        progress = session.within(PRETRAIN).run_alone(
+            lambda: PretrainFieldTask(
+                sequence, made, teacher, pretrain, config.seed,
+                code_rate=config.code_rate, null_share=config.null_share, imagined=config.imagined,
+            ),
+            pretrain,
+        )  # fmt: skip
+        if not progress.finished:
+            return made.eval(), progress
+        session = session.after(progress)
     progress = session.run(lambda: BakeTask(sequence, made, config, teacher=teacher, **session.options), config)
     return made.eval(), progress
 

@@ -21,7 +21,7 @@ from avatar.training.distributed import Distributed
 from avatar.training.fit_config import LearningRates
 from avatar.training.gradient_task import GradientTask, OptimiserConfig, ParameterGroup
 from avatar.training.quality import eight_bit, mean_quality, view_quality
-from avatar.training.sequence import AvatarSequence, Item, eyes_of
+from avatar.training.sequence import AvatarSequence, Item, evenly, eyes_of
 from avatar.training.views import View
 from smplxpp.core.errors import InputError
 
@@ -168,7 +168,7 @@ class ViewTask(GradientTask):
         images: dict[str, np.ndarray] = {}
         for kind, frames in (("novel_view", self.sequence.train_frames), ("novel_pose", splits.novel_pose_frames)):
             quality = {}
-            for frame in _spread(frames, self.config.evaluated):
+            for frame in evenly(frames, self.config.evaluated):
                 for camera in cameras:
                     if self.sequence.capture.file(camera, frame) is None:
                         continue
@@ -225,11 +225,3 @@ def pixel_size(sequence: AvatarSequence) -> float:
     center = sequence.rig.pose(sequence.motion(sequence.train_frames[0])).mean(0).cpu().numpy()
     cameras = [sequence.capture.cameras[name] for name in sequence.train_cameras]
     return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))
-
-
-def _spread(frames: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the frames, evenly from the middle of each share."""
-    if not len(frames):
-        return []
-    count = min(count, len(frames))
-    return [frames[int((k + 0.5) * len(frames) / count)] for k in range(count)]

@@ -189,15 +189,17 @@ class Train:
 
 def _changed(preset: TrainingPreset, iterations: dict[str, int | None], gaussians: int | None) -> TrainingPreset:
     """The preset with other iterations and another number of Gaussians."""
-    changed = {
-        stage: replace(getattr(preset, stage), iterations=count)
-        for stage, count in iterations.items() if count is not None
-    }  # fmt: skip
+    from avatar.training.presets import with_iterations
+
+    changed = {}
+    for stage, count in iterations.items():
+        if count is not None:
+            own = getattr(preset, stage)
+            change = with_iterations if stage in ("teacher", "bake") else replace
+            changed[stage] = change(own, iterations=count)
     if gaussians is not None:
         fit = changed.get("fit", preset.fit)
         changed["fit"] = replace(fit, sampling=replace(fit.sampling, count=gaussians))
-    for stage in {"teacher", "bake"} & changed.keys():
-        changed[stage] = replace(changed[stage], pretrain=min(changed[stage].pretrain, changed[stage].iterations // 2))
     return replace(preset, **changed)
 
 

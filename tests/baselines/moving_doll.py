@@ -22,6 +22,7 @@ from avatar.training.compensate import CompensateConfig
 from avatar.training.fit_config import FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.presets import TrainingPreset
+from avatar.training.pretrain import PretrainConfig
 from avatar.training.track import Level, TrackConfig
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -146,12 +147,12 @@ def tiny_preset(iterations: int = 3) -> TrainingPreset:
         fit=FitConfig(sampling=SamplingConfig(count=500), iterations=iterations, margin=4),
         teacher=FitTeacherConfig(
             **{k: v for k, v in shared.items() if k != "null_share"},
-            pretrain=1,
+            pretrain=PretrainConfig(iterations=2, batch=2),
             rate=2e-3,
             attributes=0.5,
             track=track,
         ),
-        bake=BakeConfig(**shared, rate=2e-3, views=2),
+        bake=BakeConfig(**shared, rate=2e-3, views=2, pretrain=PretrainConfig(iterations=2, batch=3), imagined=2),
         compensate=CompensateConfig(**shared, rate=2e-3, items=1, views=2),
         blend_shapes=BlendShapeConfig(head_shapes=2, body_shapes=3, width=8, jaw=True),
     )

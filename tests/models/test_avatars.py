@@ -105,6 +105,46 @@ def test_the_teachers_inputs_do_not_know_where_the_person_stands(rig):
         torch.testing.assert_close(one.cosines, two.cosines, rtol=0, atol=1e-4)
 
 
+CENTRED = replace(TINY_TEACHER, centred=True)
+
+
+def test_centred_inputs_have_mean_zero_and_deviation_one(rig):
+    teacher, plain = (TeacherAvatar(config, rig, gaussians()) for config in (CENTRED, TINY_TEACHER))
+    poses = [rig.motion(dance().frame(frame)) for frame in range(6)]
+    teacher.centre(poses)
+    shown = torch.cat([teacher.inputs(pose, EYES).positions for pose in poses])[:, teacher.maps.mask]
+    torch.testing.assert_close(shown.mean(0), torch.zeros(shown.shape[1:]), rtol=0, atol=1e-4)
+    assert float(shown.square().mean().sqrt()) == pytest.approx(1.0, rel=1e-3)
+    assert torch.equal(teacher.inputs(poses[2], EYES).positions, teacher.position_input(poses[2]))
+    # Only the position is shown otherwise, and a teacher that is not centred has nothing to learn.
+    plain.centre(poses)
+    assert not list(set(plain.state_dict()) & {"mean_positions", "deviation"})
+    one, two = teacher.inputs(poses[1], EYES), plain.inputs(poses[1], EYES)
+    back = one.positions * teacher.deviation + teacher.mean_positions
+    torch.testing.assert_close(back, two.positions, rtol=0, atol=1e-5)
+    assert (one.cosines is None and two.cosines is None) or torch.equal(one.cosines, two.cosines)
+
+
+def test_poses_that_do_not_differ_are_not_told_apart(rig):
+    teacher = TeacherAvatar(CENTRED, rig, gaussians())
+    pose = rig.motion(dance().frame(1))
+    teacher.centre([pose, pose])
+    assert teacher.position_input(pose).abs().max() < 1e-2 and teacher.deviation > 0
+
+
+@pytest.mark.parametrize("config", [TINY_TEACHER, CENTRED, replace(CENTRED, bottleneck=2, position_size=16)])
+def test_displacement_maps_of_poses_are_those_of_all_residuals(rig, config):
+    torch.manual_seed(0)
+    teacher = TeacherAvatar(replace(config, zero_output=False), rig, gaussians())
+    poses = [rig.motion(dance().frame(frame)) for frame in (1, 3)]
+    teacher.centre(poses)
+    with torch.no_grad():
+        together = teacher.displacement_maps(poses)
+        one_by_one = torch.cat([teacher.residual_maps(pose, EYES).position for pose in poses])
+    assert together.abs().max() > 0
+    torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-6)
+
+
 def test_the_maps_frame_holds_a_tall_body():
     assert map_frame(Rig(template())).half_extent == HALF_EXTENT
     tall = replace(template(), vertices=3.0 * template().vertices)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar.models.control_points import choose_control_points
+from avatar.models.control_points import CLOTH_DENSITY, choose_control_points, template_control_points
 from smplxpp.core.errors import InputError
+from tests.training.dancing_doll import template
 
 
 def sheet(count: int = 200, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -62,6 +63,48 @@ def test_points_are_spread_and_do_not_depend_on_a_rotation():
     same = groups[control.vertices][:, None] == groups[control.vertices]
     np.fill_diagonal(same, False)
     assert nearest[same].min() > 0.1
+
+
+def shares(groups: np.ndarray, count: int, importance: np.ndarray | None) -> np.ndarray:
+    points = np.random.default_rng(0).random((len(groups), 3))
+    control = choose_control_points(points, groups, count=count, importance=importance)
+    assert len(control.vertices) == count
+    return np.bincount(groups[control.vertices], minlength=groups.max() + 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), sizes=st.lists(st.integers(1, 25), min_size=1, max_size=5))
+def test_shares_are_exact_and_within_every_group(data, sizes):
+    groups = np.repeat(np.arange(len(sizes)), sizes)
+    count = data.draw(st.integers(len(sizes), len(groups)))
+    weight = data.draw(st.lists(st.floats(1e-3, 1e3), min_size=len(sizes), max_size=len(sizes)))
+    found = shares(groups, count, np.array(weight)[groups])
+    assert found.sum() == count and (found >= 1).all() and (found <= sizes).all()
+
+
+def test_importance_moves_shares():
+    groups = np.repeat([0, 1], [120, 60])
+    plain = shares(groups, 40, None)
+    np.testing.assert_array_equal(plain, shares(groups, 40, np.full(180, 7.0)))  # alike, whatever the number
+    assert abs(plain[0] - 2 * plain[1]) <= 2
+    heavy = shares(groups, 40, np.where(groups == 1, 4.0, 1.0))
+    assert abs(heavy[1] - 2 * heavy[0]) <= 2 and heavy.sum() == 40
+    # What is too much for a group goes to the other.
+    np.testing.assert_array_equal(shares(groups, 100, np.where(groups == 1, 1e6, 1.0)), [40, 60])
+
+
+def test_a_templates_clothes_have_more():
+    it = template()
+    control = template_control_points(it, 90)
+    cloth = int(it.cloth_mask[control.vertices].sum())
+    wishes = CLOTH_DENSITY * it.cloth_mask.sum(), (~it.cloth_mask).sum()
+    assert len(control.vertices) == 90 and abs(cloth - 90 * wishes[0] / sum(wishes)) <= 2
+    assert (it.vertex_part[control.vertices[control.neighbours]] == it.vertex_part[:, None]).all()
+
+
+def test_a_template_of_fewer_vertices_has_them_all():
+    control = template_control_points(template(), 10_000)
+    np.testing.assert_array_equal(np.sort(control.vertices), np.arange(template().vertex_count))
 
 
 def test_refused_numbers():

@@ -99,6 +99,23 @@ def test_every_vertex_a_control_point_is_the_plain_field():
     torch.testing.assert_close(controlled(*drive()), plain(*drive()), rtol=1e-4, atol=1e-5)
 
 
+def test_control_points_keep_what_the_networks_say_there():
+    points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    control = choose_control_points(points.numpy(), torch.arange(30).numpy() % 3 == 0, count=12)
+    field = random_field(control=control)
+    own, everywhere = field.at_points(*drive()), field(*drive())
+    assert own.shape == (2, 12, 3) and torch.equal(field.points, torch.as_tensor(control.vertices))
+    torch.testing.assert_close(everywhere[:, field.points], own, rtol=1e-4, atol=1e-5)
+    # Between them a vertex lies between its neighbours.
+    assert bool((everywhere.amax(1) <= own.amax(1) + 1e-5).all() and (everywhere.amin(1) >= own.amin(1) - 1e-5).all())
+
+
+def test_without_control_points_the_points_are_all_vertices():
+    field = random_field()
+    assert torch.equal(field.points, torch.arange(30))
+    assert torch.equal(field.at_points(*drive()), field(*drive()))
+
+
 def test_state_does_not_hold_the_template():
     assert all("weight" in name or "bias" in name for name in random_field().state_dict())
 

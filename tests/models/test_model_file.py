@@ -20,7 +20,7 @@ from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussia
 
 EYES = torch.tensor([[0.0, 0.8, 2.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8)
-KINDS = ("teacher", "student", "no field", "control points", "shapes", "local", "gated", "pruned")
+KINDS = ("teacher", "centred", "student", "no field", "control points", "shapes", "local", "gated", "pruned")
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +32,11 @@ def make(kind: str, rig: Rig):
     torch.manual_seed(0)
     if kind == "teacher":
         model = TeacherAvatar(replace(TINY_TEACHER, noise=True), rig, varied(gaussians()))
+    elif kind == "centred":
+        model = TeacherAvatar(
+            replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True), rig, varied(gaussians())
+        )
+        model.centre(rig.motion(dance().frame(frame)) for frame in range(4))
     else:
         shapes = {"shapes": SHAPES, "local": replace(SHAPES, parts=4), "gated": replace(SHAPES, gated=True),
                   "pruned": replace(SHAPES, parts=3, gated=True, jaw=True)}.get(kind)  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +16,9 @@ from smplxpp.core.errors import InputError
 TINY = TeacherConfig(
     in_size=16, out_size=32, bottleneck=4, channel_base=64, channel_max=8, style_size=4, style_layers=1
 )
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "networks.md"
+SMALL = replace(TINY, bottleneck=2, in_size=32, out_size=64, position_size=16)
+"""With a small network for the position."""
 
 
 def inputs(poses: int = 1, views: int | None = None, size: int = 16):
@@ -24,14 +28,17 @@ def inputs(poses: int = 1, views: int | None = None, size: int = 16):
     return positions, semantics, None if views is None else torch.rand(views, *shape[1:], generator=generator)
 
 
-@pytest.mark.parametrize(
-    ("name", "millions"), [("paper", 223.602404), ("gpu", 55.133374), ("cpu", 0.826440), ("demo", 0.051108)]
-)
-def test_documented_sizes_of_the_presets(name, millions):
+@pytest.mark.parametrize("name", NETWORK_PRESETS)
+def test_documented_sizes_of_the_presets(name):
+    """The first table of `docs/networks.md`."""
     config = network_preset(name).teacher
     with torch.device("meta"):
-        teacher = Teacher(config)
-    assert sum(p.numel() for p in teacher.parameters()) == round(1e6 * millions)
+        count = sum(p.numel() for p in Teacher(config).parameters())
+    row = next(line for line in DOCUMENT.read_text().splitlines() if line.startswith(f"| `{name}` |"))
+    _, sizes, networks, parameters, *_ = (cell.strip() for cell in row.strip("|").split("|"))
+    position = f"{config.position_size or config.out_size}"
+    assert sizes == f"{config.in_size}, {config.out_size}" and parameters == f"{count:,}"
+    assert networks == {"separate": "three", "shared": f"two, the position at {position}"}[config.networks]
 
 
 @pytest.mark.parametrize("networks", ["separate", "shared"])
@@ -51,6 +58,56 @@ def test_lean_presets_start_from_the_reference_frame(name):
     maps = Teacher(config)(*inputs(1, 1, config.in_size))
     assert maps.shape.shape == (1, 2, config.out_size, config.out_size, 10)
     assert maps.shape.abs().max() == 0 and maps.colour.abs().max() == 0
+
+
+@pytest.mark.parametrize("networks", ["separate", "shared"])
+def test_the_positions_own_network_gives_maps_of_the_same_size(networks):
+    torch.manual_seed(0)
+    teacher = Teacher(replace(SMALL, networks=networks))
+    own = teacher.networks["position"].config
+    assert (own.in_size, own.out_size) == (8, 16)
+    maps = teacher(*inputs(2, 2, 32))
+    assert maps.shape.shape == (2, 2, 64, 64, 10) and maps.colour.shape == (2, 2, 64, 64, 3)
+    (maps.shape.square().mean() + maps.colour.square().mean()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in teacher.parameters())
+
+
+@pytest.mark.parametrize("changes", [{}, {"networks": "shared"}, {"position_size": 0},
+                                     {"position_size": 0, "networks": "shared"}])  # fmt: skip
+def test_the_position_alone_is_that_of_all_residuals(changes):
+    torch.manual_seed(0)
+    teacher = Teacher(replace(SMALL, **changes))
+    positions, semantics, views = inputs(2, 2, 32)
+    alone = teacher.positions(positions, semantics[:1])
+    torch.testing.assert_close(alone, teacher(positions, semantics[:1], views).shape[..., :3])
+
+
+def test_a_network_of_the_others_size_is_the_separate_one():
+    results = []
+    for size in (0, TINY.out_size):
+        torch.manual_seed(0)
+        results.append(Teacher(replace(TINY, position_size=size))(*inputs(1, 1)))
+    assert torch.equal(results[0].shape, results[1].shape) and torch.equal(results[0].colour, results[1].colour)
+
+
+def test_enlarged_maps_have_the_small_ones_values_between_their_pixels():
+    torch.manual_seed(0)
+    large = Teacher(SMALL)
+    positions, semantics, _ = inputs(1, None, 32)
+    image = (positions + semantics).permute(0, 1, 4, 2, 3).flatten(1, 2)
+    (known,) = large.networks["position"](torch.nn.functional.avg_pool2d(image, 4))
+    found = large.positions(positions, semantics)
+    assert known.shape == (1, 2, 16, 16, 3) and found.shape == (1, 2, 64, 64, 3)
+    # The maps cover one square: a place has the same value in both, whatever their pixels are.
+    frame, points = MapFrame((0.0, 0.0, 0.0)), 1.8 * torch.rand(200, 3) - 0.9
+    pixels = (frame.pixels_from_canonical(points, 16) - 0.5).round() + 0.5
+    centres = torch.stack([pixels[:, 0] / 8 - 1, 1 - pixels[:, 1] / 8, points[:, 2]], dim=1)
+    front = points[:, 2] >= 0
+    in_small, in_large = (MapSampler(frame, maps.shape[2], centres, front)(maps) for maps in (known, found))
+    spread = known.std()
+    assert (in_large - in_small).abs().mean() < 0.25 * spread
+    assert bool((found.amax((2, 3)) <= known.amax((2, 3)) + 1e-6).all())
+    assert bool((found.amin((2, 3)) >= known.amin((2, 3)) - 1e-6).all())
 
 
 def test_shape_does_not_depend_on_the_view():
@@ -86,7 +143,7 @@ def test_sampled_residuals_are_those_of_the_maps():
     torch.manual_seed(0)
     maps = Teacher(TINY)(*inputs(1, 2))
     points = torch.rand(50, 3) - 0.5
-    sampler = MapSampler(MapFrame((0.0, 0.0, 0.0)), 32, points, torch.randn(50, 3))
+    sampler = MapSampler(MapFrame((0.0, 0.0, 0.0)), 32, points, torch.rand(50) < 0.5)
     sampled = maps.sampled(sampler)
     assert sampled.position.shape == (1, 50, 3) and sampled.colour.shape == (2, 50, 3)
     torch.testing.assert_close(sampled.position, sampler(maps.position))
@@ -107,6 +164,8 @@ def test_local_offsets_are_rotated_into_the_frames():
     [
         ({"networks": "two"}, "networks"), ({"semantics": "product"}, "semantics"), ({"in_size": 20}, "in_size"),
         ({"position_scale": 0.0}, "position_scale"), ({"position_scale": float("nan")}, "position_scale"),
+        ({"position_size": 64}, "position_size"), ({"position_size": -16}, "position_size"),
+        ({"position_size": 12}, "size"), ({"position_size": 8}, "size"),
     ],
 )  # fmt: skip
 def test_refused_configurations(changes, subject):

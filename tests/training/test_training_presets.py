@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from avatar.training.presets import TRAINING_PRESETS, training_preset
+from avatar.training.presets import TRAINING_PRESETS, training_preset, with_iterations
 from smplxpp.core.errors import InputError
 
 STAGES = ("fit", "teacher", "bake", "compensate")
@@ -41,8 +41,20 @@ def test_a_share_is_one_of_the_iterations_alone(name):
         assert short.iterations == round(0.1 * own.iterations)
         same = {"iterations": own.iterations} | ({"pretrain": own.pretrain} if hasattr(own, "pretrain") else {})
         assert replace(short, **same) == own
-    assert tenth.teacher.pretrain == round(0.1 * preset.teacher.pretrain)
+    for stage in ("teacher", "bake"):
+        own, short = getattr(preset, stage), getattr(tenth, stage)
+        share = short.iterations / own.iterations
+        assert short.pretrain == (None if own.pretrain is None else own.pretrain.shortened(share))
     assert all(getattr(preset.shortened(1e-9), stage).iterations == 1 for stage in STAGES)
+
+
+@pytest.mark.parametrize("name", TRAINING_PRESETS)
+def test_other_iterations_have_as_large_a_share_of_pretraining(name):
+    for config in (training_preset(name).teacher, training_preset(name).bake):
+        double = with_iterations(config, 2 * config.iterations)
+        assert double.iterations == 2 * config.iterations
+        assert with_iterations(double, config.iterations) == config
+        assert config.pretrain is None or double.pretrain.iterations == 2 * config.pretrain.iterations
 
 
 @pytest.mark.parametrize("name", TRAINING_PRESETS)

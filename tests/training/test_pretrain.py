@@ -1,0 +1,283 @@
+"""Pretraining on a doll: what is known is learned without rendering, resumed exactly, left out where needless."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.models.rig import Rig
+from avatar.models.student import Student, StudentConfig
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import ControlCage, Track
+from avatar.training.bake import BakeConfig
+from avatar.training.fit_teacher import FitTeacherConfig
+from avatar.training.gradient_task import GradientTask
+from avatar.training.loop import METRICS_FILE
+from avatar.training.metrics_log import read_metrics
+from avatar.training.pretrain import PretrainConfig, PretrainFieldTask, PretrainTeacherTask, _MapLookup
+from avatar.training.track import Level
+from avatar.training.train import PRETRAIN, TRACK, Session, bake, fit_teacher
+from smplxpp.core.errors import InputError
+from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, sequence, template, write_dance
+from tests.training.test_track import CONFIG as TRACKING
+from tests.training.test_view_tasks import BAKE, TEACHER
+from tests.training.toy import copied, same_state
+
+CONFIG = PretrainConfig(iterations=40, batch=2, rate=1e-2)
+APART = replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True)
+STUDENT = StudentConfig(field=TINY_FIELD, control_points=40)
+TASKS = ("displacements", "zero residuals", "field")
+ONE_STEP = 1e-12
+"""Seconds after which a training stops: with its first step."""
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    return sequence(write_dance(tmp_path_factory.mktemp("captures") / "dance"))
+
+
+@pytest.fixture(scope="module")
+def track(frames) -> Track:
+    """To one side in all frames, farther in some, the same everywhere on the template."""
+    cage = ControlCage(frames.rig, 24)
+    swing = torch.tensor([[0.03, 0.0, 0.0], [0.03, 0.01, 0.0], [0.04, 0.0, 0.0], [0.03, 0.0, 0.01]])
+    return Track({frame: row for row, frame in enumerate(frames.train_frames)}, swing[:, None].expand(-1, 24, -1), cage)
+
+
+def make_teacher(frames, config=APART, *, moved: float = 0.0) -> TeacherAvatar:
+    """A teacher from the same start every time; `moved`: with something to say."""
+    torch.manual_seed(0)
+    teacher = TeacherAvatar(config, frames.rig, gaussians())
+    teacher.centre(frames.motion(frame) for frame in frames.train_frames)
+    with torch.no_grad():
+        for value in teacher.networks.parameters():
+            value.add_(moved * torch.randn(value.shape))
+    return teacher
+
+
+def make(kind: str, frames, track, config=CONFIG, **changes) -> GradientTask:
+    """A task from the same start every time."""
+    if kind == "displacements":
+        return PretrainTeacherTask(frames, make_teacher(frames), config, 0, track)
+    if kind == "zero residuals":
+        return PretrainTeacherTask(frames, make_teacher(frames, replace(APART, zero_output=False)), config, 0, None)
+    teacher = make_teacher(frames, moved=0.05)
+    student = Student(STUDENT, frames.rig, gaussians(), frames.train_frames)
+    options = {"code_rate": 5.0, "null_share": 0.25, "imagined": 4, **changes}
+    return PretrainFieldTask(frames, student, teacher, config, 0, **options)
+
+
+def steps(task, count: int, start: int = 0) -> list[float]:
+    return [task.step(k)["loss"] for k in range(start, start + count)]
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_the_loss_falls(kind, frames, track):
+    losses = steps(make(kind, frames, track), 24)
+    assert np.mean(losses[-4:]) < 0.85 * np.mean(losses[:4])
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_a_restored_state_goes_on_bit_for_bit(kind, frames, track):
+    whole, before = make(kind, frames, track), make(kind, frames, track)
+    steps(whole, 5)
+    steps(before, 3)
+    after = make(kind, frames, track)
+    after.restore(copied(before.state()))
+    steps(after, 2, start=3)
+    assert same_state(whole.state(), after.state())
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_every_pose_comes_once_an_epoch_in_another_order(kind, frames, track):
+    task = make(kind, frames, track)
+    poses = 8 if kind == "field" else 4
+    per_epoch = poses // CONFIG.batch
+    epochs = [[n for k in range(e * per_epoch, (e + 1) * per_epoch) for n in task.items(k)[0]] for e in range(6)]
+    assert all(sorted(epoch) == list(range(poses)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_no_pose_comes_twice_where_batches_leave_some_over(frames, track):
+    task = make("displacements", frames, track, replace(CONFIG, batch=3))
+    assert all(len(set(task.items(k)[0])) == 3 for k in range(8))
+    assert {n for k in range(8) for n in task.items(k)[0]} == {0, 1, 2, 3}
+    assert make("displacements", frames, track, replace(CONFIG, batch=99)).batch == 4
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_a_batch_costs_the_mean_of_its_poses(kind, frames, track):
+    task = make(kind, frames, track, null_share=0.0)
+    task.items(0)
+    both, *single = (float(task.loss(item)[0].detach()) for item in ((1, 3), (1,), (3,)))
+    assert both == pytest.approx(np.mean(single), rel=1e-5)
+
+
+def test_known_displacements_move_the_position_alone(frames, track):
+    task = make("displacements", frames, track)
+    others = copied(task.teacher.networks.networks["all"].state_dict())
+    steps(task, 2)
+    assert same_state(others, task.teacher.networks.networks["all"].state_dict())
+
+
+def test_one_network_for_all_keeps_its_other_residuals_at_zero(frames, track):
+    teacher = make_teacher(frames, TINY_TEACHER)
+    steps(PretrainTeacherTask(frames, teacher, CONFIG, 0, track), 3)
+    with torch.no_grad():
+        maps = teacher.residual_maps(frames.motion(1), torch.zeros(1, 3))
+    assert maps.position.abs().max() > 0 and maps.shape[..., 3:].abs().max() == 0 and maps.colour.abs().max() == 0
+
+
+def test_the_teacher_comes_to_what_is_known(frames, track):
+    teacher = make_teacher(frames)
+    steps(PretrainTeacherTask(frames, teacher, replace(CONFIG, batch=4), 0, track), 40)
+    with torch.no_grad():
+        for frame in frames.train_frames:
+            found = teacher.sampler(teacher.displacement_maps([frames.motion(frame)]))[0]
+            known = track.displacements(frame)[0]  # the same everywhere
+            assert (found - known).norm(dim=-1).mean() < 0.5 * known.norm()
+
+
+def test_the_field_comes_to_the_teachers_displacements_at_its_points(frames, track):
+    task = make("field", frames, track, imagined=0, null_share=0.0)
+    lookup = _MapLookup(task.teacher, task.student.field.points)
+
+    def error() -> float:
+        with torch.no_grad():
+            differences = [
+                task.student.displacements(motion)[task.student.field.points]
+                - lookup(task.teacher.displacement_maps([motion]))[0]
+                for motion in map(frames.motion, frames.train_frames)
+            ]
+        return float(torch.stack(differences).norm(dim=-1).mean())
+
+    before = error()
+    steps(task, 40)
+    assert error() < 0.85 * before
+
+
+def test_imagined_poses_are_shown_with_the_null_code(frames, track, monkeypatch):
+    task, shown = make("field", frames, track, null_share=0.0), []
+    codes = task.student.codes.forward
+    monkeypatch.setattr(task.student.codes, "forward", lambda which: shown.append(which) or codes(which))
+    task.loss((0, 4, 2, 7))
+    assert shown == [[0, None, 2, None]]
+    assert task.name_of((0, 4)) == "poses 0 imagined 0"
+    everything = make("field", frames, track, null_share=1.0)
+    monkeypatch.setattr(everything.student.codes, "forward", lambda which: shown.append(which) or codes(which))
+    everything.loss((0, 1))
+    assert shown[-1] == [None, None]
+
+
+def test_imagined_poses_lie_on_lines_between_those_of_the_frames(frames, track):
+    task, again = (make("field", frames, track) for _ in range(2))
+    bodies = [dance().frame(frame).body_pose[0] for frame in frames.train_frames]
+    poses = [task._motion(number).pose.double().numpy() for number in range(4, 7)]
+    np.testing.assert_array_equal(poses[0], again._motion(4).pose.double().numpy())
+    assert not np.allclose(poses[0], poses[1])
+    for pose in poses:
+        misses = []
+        for a in bodies:
+            for b in bodies:
+                way = (b - a) / max(np.linalg.norm(b - a), 1e-9)
+                misses.append(np.linalg.norm(pose - a - (pose - a) @ way * way))
+        assert min(misses) < 1e-6
+
+
+def test_the_bakes_teacher_stays_as_it_is(frames, track):
+    task = make("field", frames, track)
+    before = copied(task.teacher.state_dict())
+    steps(task, 2)
+    assert same_state(before, task.teacher.state_dict())
+    assert all(value.grad is None for value in task.teacher.parameters())
+
+
+def hidden_stay(rig: Rig) -> torch.Tensor:
+    """(V,) bool: vertices that a map that moves everything leaves where they are."""
+    fine = replace(TINY_TEACHER, in_size=128, out_size=256, channel_base=128)
+    lookup = _MapLookup(TeacherAvatar(fine, rig, gaussians()), torch.arange(len(rig.vertices)))
+    moved = lookup(torch.full((1, 2, 256, 256, 3), 0.03))[0].abs().amax(dim=-1)
+    assert bool(((moved == 0) | ((moved - 0.03).abs() < 1e-6)).all())
+    return moved == 0
+
+
+def test_skin_under_clothes_stays(frames):
+    it = template()
+    stays = hidden_stay(frames.rig).numpy()
+    assert not stays[it.cloth_mask].any()
+    torso, head = np.split(np.flatnonzero(it.vertex_part == 0), 2)
+    under = torso[(np.abs(it.vertices[torso, 1] - 0.3) < 0.15) & (np.abs(it.vertices[torso, 2]) > 0.08)]
+    seen = head[np.abs(it.vertices[head, 2]) > 0.05]
+    assert len(under) > 5 and stays[under].all()
+    assert len(seen) > 5 and not stays[seen].any()
+
+
+def test_what_is_hidden_does_not_depend_on_where_the_body_stands(frames):
+    it = template()
+    away = replace(it, vertices=it.vertices + [0.0, 0.0, -0.6])
+    assert (hidden_stay(Rig(away)) == hidden_stay(frames.rig)).float().mean() > 0.99
+
+
+def short(**changes) -> FitTeacherConfig:
+    return replace(TEACHER, iterations=1, evaluations=1, pretrain=replace(CONFIG, iterations=2), **changes)
+
+
+def test_networks_that_start_at_zero_need_no_pretraining_without_a_track(frames, tmp_path):
+    for zero, folder in ((True, tmp_path / "zero"), (False, tmp_path / "random")):
+        _, done = fit_teacher(frames, gaussians(), replace(APART, zero_output=zero), short(), Session(folder))
+        assert done.finished and done.iterations == 1 and (folder / PRETRAIN).exists() != zero
+
+
+def test_a_teacher_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tmp_path):
+    config = short(track=replace(TRACKING, levels=(Level(1, 1, 6e-3),), control_points=12))
+    whole, done = fit_teacher(frames, gaussians(), APART, config, Session(tmp_path / "whole"))
+    assert done.finished
+    folder, sessions = tmp_path / "parts", 0
+    shutil.copytree(tmp_path / "whole" / TRACK, folder / TRACK)
+    done = None
+    while done is None or not done.finished:
+        parts, done = fit_teacher(frames, gaussians(), APART, config, Session(folder, max_seconds=ONE_STEP))
+        sessions += 1
+        assert done.iterations == (2 if sessions == 1 else 1)
+    assert sessions == 3
+    assert same_state(whole.state_dict(), parts.state_dict())
+
+
+def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tmp_path):
+    config: BakeConfig = replace(BAKE, iterations=1, evaluations=1, imagined=2, pretrain=replace(CONFIG, iterations=2))
+    ends = []
+    for folder, seconds in ((tmp_path / "whole", float("inf")), (tmp_path / "parts", ONE_STEP)):
+        done = None
+        while done is None or not done.finished:
+            session = Session(folder, max_seconds=seconds)
+            teacher = make_teacher(frames, moved=0.05)
+            student, done = bake(frames, gaussians(), STUDENT, config, session, teacher=teacher)
+        assert read_metrics(folder / PRETRAIN / METRICS_FILE)[-1]["iteration"] == 2
+        ends.append(student.state_dict())
+    assert same_state(*ends)
+
+
+def test_a_bake_without_a_teacher_has_nothing_to_pretrain_on(frames, tmp_path):
+    config = replace(BAKE, iterations=1, evaluations=1, pretrain=CONFIG)
+    _, done = bake(frames, gaussians(), STUDENT, config, Session(tmp_path), teacher=None)
+    assert done.finished and not (tmp_path / PRETRAIN).exists()
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_nothing_is_measured_as_reports_expect_it(kind, frames, track):
+    assert make(kind, frames, track).evaluate(0) == {"mean": {}}
+
+
+def test_a_share_of_the_steps():
+    assert CONFIG.shortened(0.25) == replace(CONFIG, iterations=10)
+    assert CONFIG.shortened(1e-9).iterations == 1
+
+
+@pytest.mark.parametrize("change", [{"iterations": 0}, {"batch": 0}, {"warmup": -1}])
+def test_senseless_choices_are_refused(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(CONFIG, **change)
