@@ -77,7 +77,8 @@ def adopt_trained(
             break
         if ablation.record(stage.piece) is None:
             numbers = manifest["numbers"]
-            seconds = numbers["seconds_of_steps"] + numbers.get("seconds_of_tracking", 0.0)
+            spent = ("seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining")
+            seconds = sum(numbers.get(name, 0.0) for name in spent)
             ablation.adopt(stage.piece, path, seconds=seconds, iterations=numbers["iterations"])
             taken.append(stage.piece)
     if taken:

@@ -20,6 +20,7 @@ from avatar.training.machine import peak_memory
 from avatar.training.metrics_log import read_metrics
 from avatar.training.quality import CONVENTION
 from avatar.training.sequence import AvatarSequence
+from avatar.training.train import PRETRAIN, TRACK
 from avatar.training.views import read_view
 from pipelines.build_config import COMPACT_STUDENT, STUDENT
 from pipelines.fit_pictures import write_strip
@@ -27,7 +28,8 @@ from pipelines.train_names import KINDS, kind_name
 from smplxpp.capture import Capture
 from smplxpp.core.artifact import Check, StageOutput
 
-TRACK_METRICS = "track_metrics.jsonl"
+BEFORE = {TRACK: "track_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
+"""Logs of what comes before a training, by its folder."""
 
 
 def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
@@ -44,11 +46,12 @@ def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.
 
 
 def keep_logs(work: Path, folder: Path) -> None:
-    """Copy what a training has logged and shown into its stage; a tracking that came first has its own metrics."""
+    """Copy what a training has logged and shown into its stage; what came before it has metrics of its own."""
     for name in ("previews", TENSORBOARD_FOLDER):
         if (work / name).is_dir():
             shutil.copytree(work / name, folder / name)
-    for source, name in ((work / METRICS_FILE, METRICS_FILE), (work / "track" / METRICS_FILE, TRACK_METRICS)):
+    for part, name in (("", METRICS_FILE), *BEFORE.items()):
+        source = work / part / METRICS_FILE
         if source.is_file():
             shutil.copyfile(source, folder / name)
 
@@ -100,9 +103,10 @@ def stage_output(
         overlap: of the template and the masks.
     """
     evaluations = [line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation"]
-    # None while a tracking is under way: nothing of the training itself has been measured.
+    # None while tracking or pretraining: nothing of the training itself has been measured.
     start, end = (evaluations[0], evaluations[-1]) if evaluations else ({}, {})
-    tracked = read_metrics(folder / TRACK_METRICS)
+    before = {part: read_metrics(folder / name) for part, name in BEFORE.items()}
+    seconds = {part: lines[-1]["seconds"] if lines else 0.0 for part, lines in before.items()}
     held_out = bool(sequence.capture.splits.novel_view_cameras)
     found = {kind: end[kind] for kind in KINDS if kind in end}
     everything = {
@@ -119,7 +123,8 @@ def stage_output(
         "training_cameras": len(sequence.train_cameras),
         "held_out_cameras": held_out,
         "convention": CONVENTION,
-        "seconds_of_tracking": tracked[-1]["seconds"] if tracked else 0.0,
+        "seconds_of_tracking": seconds[TRACK],
+        "seconds_of_pretraining": seconds[PRETRAIN],
         "measured_at": end.get("iteration"),
         "start": {kind: start[kind] for kind in KINDS if kind in start},
         **found,

@@ -232,14 +232,17 @@ def _bake(training: Training) -> StageRecord:
 def _compensate(training: Training) -> StageRecord:
     config, preset = training.config, training.config.preset
     shapes = config.shapes(training.scene.template.expression_basis.shape[2])
-    path = _require(training, BAKED)
+    needs = (BAKED, TEACHER) if config.teacher and preset.compensate.seeded else (BAKED,)
+    path, *teachers = (_require(training, file) for file in needs)
     max_bytes = 1e6 * config.max_megabytes if config.blend_shapes == "pruned" else None
 
     def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
-        return compensate(sequence, load_avatar(path, sequence.rig), shapes, preset.compensate, session)
+        teacher = load_avatar(teachers[0], sequence.rig) if teachers else None
+        student = load_avatar(path, sequence.rig)
+        return compensate(sequence, student, shapes, preset.compensate, session, teacher=teacher)
 
     return _stage(
-        training, COMPENSATE_STAGE, preset.compensate, {"blend_shapes": shapes, "max_bytes": max_bytes}, (BAKED,), work,
+        training, COMPENSATE_STAGE, preset.compensate, {"blend_shapes": shapes, "max_bytes": max_bytes}, needs, work,
         lambda folder, model, sequence, session: write_student(
             folder, model, sequence, preset.compensate, max_bytes=max_bytes, options=session.options
         ),

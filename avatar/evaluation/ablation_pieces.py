@@ -174,19 +174,25 @@ class BakePiece(Piece):
 
 @dataclass(frozen=True, kw_only=True)
 class CompensatePiece(Piece):
-    """A baked student with trained blend shapes."""
+    """A baked student with trained blend shapes.
+
+    Attributes:
+        teacher: whose followed surface seeds them; none without a name.
+    """
 
     student: str
+    teacher: str = ""
     shapes: BlendShapeConfig
     config: CompensateConfig
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (self.student,)
+        return (self.student, self.teacher) if self.teacher else (self.student,)
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Student, Progress]:
         sequence = shop.sequence(self.ground)
-        return compensate(sequence, get(self.student), fitting(self.shapes, sequence.rig), self.config, session)
+        shapes, teacher = fitting(self.shapes, sequence.rig), get(self.teacher) if self.teacher else None
+        return compensate(sequence, get(self.student), shapes, self.config, session, teacher=teacher)
 
 
 @dataclass(frozen=True, kw_only=True)

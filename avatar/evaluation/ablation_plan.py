@@ -119,10 +119,13 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     def bake(name: str, *, student: StudentConfig = student, source: str = "teacher", **changes: float) -> None:
         pieces[name] = BakePiece(source=source, student=student, config=replace(preset.bake, **changes))
 
-    def compensate(name: str, baked: str, *, ground: str = CLOTHED, null: float = 0.0, **shapes: int) -> None:
+    def compensate(
+        name: str, baked: str, *, ground: str = CLOTHED, teacher: str = "teacher", null: float = 0.0, **shapes: int
+    ) -> None:
         pieces[name] = CompensatePiece(
             ground=ground,
             student=baked,
+            teacher=teacher if preset.compensate.seeded else "",
             shapes=replace(preset.blend_shapes, **shapes),
             config=replace(preset.compensate, null_share=max(preset.compensate.null_share, null)),
         )
@@ -140,11 +143,11 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
             ground=ground, source=f"{prefix}teacher", student=student, config=preset.bake
         )
     compensate("full", "bake")
-    compensate("naked", "naked_bake", ground=NAKED)
+    compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
     bake("no_field_bake", student=replace(student, field=None, control_points=0))
     compensate("no_field", "no_field_bake")
     bake("no_teacher_bake", source="gaussians")
-    compensate("no_teacher", "no_teacher_bake")
+    compensate("no_teacher", "no_teacher_bake", teacher="")
 
     if teacher.track is None:
         pieces["untracked"] = SamePiece(student="full")
@@ -152,7 +155,7 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
         from_zero = replace(teacher, track=None, pretrain=None)
         pieces["untracked_teacher"] = replace(pieces["teacher"], config=from_zero)
         bake("untracked_bake", source="untracked_teacher")
-        compensate("untracked", "untracked_bake")
+        compensate("untracked", "untracked_bake", teacher="")
     compensate("local", "bake", **LOCAL)
     compensate("gated", "bake", gated=True)
     pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE, max_bytes=1e6 * PRUNED_MEGABYTES)

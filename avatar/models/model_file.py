@@ -20,6 +20,7 @@ from avatar.models.rig import Rig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher import TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import ControlCage, Track
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 
@@ -73,6 +74,10 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
     gaussians = _gaussians(tensors, about)
     if about["kind"] == "teacher":
         model: TeacherAvatar | Student = TeacherAvatar(config_from_dict(TeacherConfig, about["config"]), rig, gaussians)
+        if "track_controls" in tensors:
+            frames, controls = tensors["track_frames"].tolist(), tensors["track_controls"]
+            row = {frame: k for k, frame in enumerate(frames)}
+            model.remember(Track(row, controls, ControlCage(rig, controls.shape[1])))
     else:
         model = _student(about, tensors, rig, gaussians)
     _load(model, tensors, path)

@@ -18,6 +18,7 @@ from avatar.models.map_sides import map_sides
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion, Rig
 from avatar.models.teacher import Residuals, Teacher, TeacherConfig, local_offsets
+from avatar.models.tracked import Track
 from avatar.render.mesh_maps import front_back_maps, vertex_normals
 
 HALF_EXTENT = 1.0
@@ -75,7 +76,14 @@ class TeacherAvatar(nn.Module):
         if config.centred:
             self.register_buffer("mean_positions", torch.zeros(2, config.in_size, config.in_size, 3))
             self.register_buffer("deviation", torch.ones(()))
+        self.track: Track | None = None
         self.to(rig.device)
+
+    def remember(self, track: Track) -> None:
+        """Keep the surface that was followed through the training frames; it is saved with the teacher."""
+        self.track = track
+        self.register_buffer("track_frames", torch.tensor(list(track.row), device=self.rig.device))
+        self.register_buffer("track_controls", track.controls.to(self.rig.device))
 
     def centre(self, motions: Iterable[Motion]) -> None:
         """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""

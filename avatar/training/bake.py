@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
+from avatar.models.config import require_choice
 from avatar.models.rig import Motion
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -29,6 +30,7 @@ class BakeConfig(ViewConfig):
         iterations: 30k in the paper. attributes: the paper refines them.
         pretrain: `L_non` alone before the iterations, without rendering; None in the paper.
         imagined: poses between those of the training frames that the pretraining asks the teacher about.
+        images: what renderings are compared with: the "teacher"'s, or "photographs".
         nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
         tau: radians a metre, of the semantic labels.
         code_rate: Adam's step of the frame codes, as a multiple of `rate`.
@@ -38,6 +40,7 @@ class BakeConfig(ViewConfig):
 
     iterations: int = 30_000
     attributes: float = 0.5
+    images: str = "teacher"
     pretrain: PretrainConfig | None = None
     imagined: int = 0
     nonrigid: float = 0.1
@@ -49,6 +52,7 @@ class BakeConfig(ViewConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_choice("bake: images", self.images, ("teacher", "photographs"))
         for name in ("imagined", "nonrigid", "semantic", "code_rate", "pose_noise"):
             if not getattr(self, name) >= 0.0:
                 raise InputError(f"bake: {name}", expected="at least 0", received=repr(getattr(self, name)))
@@ -99,11 +103,10 @@ class BakeTask(ViewTask):
         if self.source is None:
             total, terms, _ = self.compared(posed, views)
             return total, {"loss": float(total.detach()), **terms}
-        lessons = self.source.lessons(item.frame, views)
-        semantic = bool(self.config.semantic)
-        total, terms, renderings = self.compared(
-            posed, views, [lesson.target for lesson in lessons], extra=self.labels if semantic else None
-        )
+        semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
+        lessons = self.source.lessons(item.frame, views) if semantic or imitates else []
+        targets = [lesson.target for lesson in lessons] if imitates else None
+        total, terms, renderings = self.compared(posed, views, targets, extra=self.labels if semantic else None)
         if semantic:
             pairs = zip(renderings, lessons, strict=True)
             differences = [(drawn.extra - lesson.labels).abs().mean() for drawn, lesson in pairs]

@@ -23,6 +23,8 @@ class CompensateConfig(ViewConfig):
         iterations: 100k, and items: 4, in the paper.
         rate: of the mapping networks. position_rate: of U, pixels. color_rate: of C, colours in [0, 1].
         null_share: of the poses that are shown with the null code.
+        seeded: the blend shapes start from what the field left over of the surface that the teacher followed, see
+            `seed_blend_shapes`; False: from zero, as in the paper.
     """
 
     iterations: int = 100_000
@@ -30,6 +32,7 @@ class CompensateConfig(ViewConfig):
     position_rate: float = 0.02
     color_rate: float = 1e-3
     null_share: float = 0.0
+    seeded: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -95,8 +95,12 @@ class _Size:
 
 
 def _lean(name: str, size: _Size) -> TrainingPreset:
-    """Presets for two cores: the surface is followed first, networks learn what was found before they see photographs,
-    several views a step, attributes that learn in every stage, no perceptual term."""
+    """Presets for two cores: the surface is followed first, networks learn what was found before they see photographs.
+
+    A teacher of minutes draws worse than the photographs are: the bake compares with those, and takes from the teacher
+    the followed surface and its answers about imagined poses. Several views a step, attributes that learn in every
+    stage, no perceptual term.
+    """
     pretrain = PretrainConfig(iterations=size.pretrain, batch=8, rate=1e-2, final=0.02, warmup=20, betas=(0.9, 0.99))
     return TrainingPreset(
         networks=network_preset(name),
@@ -112,16 +116,19 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake,
-            pretrain=replace(pretrain, rate=5e-3),
-            imagined=96,
+            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, rate=5e-3),
+            images="photographs",
+            semantic=0.0,
+            attributes=1.0,
+            imagined=48,
             code_rate=5.0,
-            views=2,
+            views=3,
             rate=1e-3,
             null_share=0.2,
             weights=_LEAN_WEIGHTS,
         ),
         compensate=CompensateConfig(
-            iterations=size.compensate, items=1, views=2, rate=1e-3, null_share=0.2, attributes=0.5,
+            iterations=size.compensate, items=1, views=3, rate=1e-3, null_share=0.2, attributes=1.0, seeded=True,
             weights=_LEAN_WEIGHTS,
         ),
         blend_shapes=BlendShapeConfig(jaw=True),
@@ -152,11 +159,11 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             gaussians=50_000,
             control_points=2400,
             track=TrackConfig().levels,
-            pretrain=600,
+            pretrain=500,
             fit=600,
-            teacher=600,
-            bake=600,
-            compensate=1200,
+            teacher=500,
+            bake=900,
+            compensate=2000,
         ),
     ),
     "demo": _lean(

@@ -141,9 +141,10 @@ class PretrainTeacherTask(_PretrainTask):
 
 
 class PretrainFieldTask(_PretrainTask):
-    """`L_non` where the field is evaluated: its displacements against the teacher's maps at the same points.
+    """`L_non` where the field is evaluated: its displacements against the teacher's at the same points.
 
-    The teacher can be asked about any pose. Imagined ones, on the lines between the poses of two training frames and a
+    Those of a training frame are the surface that was followed, where there is one, else the teacher's maps. The
+    teacher can be asked about any pose. Imagined ones, on the lines between the poses of two training frames and a
     little beyond, are shown with the null code, which so learns what lies between the frames.
 
     Args:
@@ -194,7 +195,9 @@ class PretrainFieldTask(_PretrainTask):
         """theta (63,), and the teacher's displacements (K, 3) metres at the field's points."""
 
         def make() -> tuple[Tensor, ...]:
-            motion = self._motion(number)
+            motion, track = self._motion(number), self.teacher.track
+            if motion.frame is not None and track is not None:
+                return motion.pose, track.displacements(motion.frame)[self.student.field.points]
             return motion.pose, self._lookup(self.teacher.displacement_maps([motion]))[0]
 
         return self._known.get(number, make)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from avatar.losses.deformation import semantic_labels
 from avatar.losses.reconstruction import Target
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.avatar_view import render_view
+from avatar.render.mesh_maps import MeshMapsTensor, front_back_maps
 from avatar.training.byte_cache import ByteCache
 from avatar.training.sequence import AvatarSequence, eyes_of
 from avatar.training.views import View
@@ -52,12 +54,20 @@ class TeacherSource:
         self._kept = ByteCache(max_bytes)
 
     def displacements(self, frame: int) -> Tensor:
-        """(2, R, R, 3) metres, the teacher's position maps dU of a frame."""
+        """(2, R, R, 3) metres, the teacher's position maps dU of a frame; the surface itself where it was followed."""
 
         def make() -> tuple[Tensor, ...]:
+            if self.teacher.track is not None:
+                return (self._maps().interpolate(self.teacher.track.displacements(frame)).half(),)
             return (self.teacher.displacement_maps([self.sequence.motion(frame)])[0].half(),)
 
         return self._kept.get(("maps", frame), make)[0].float()
+
+    @cache  # noqa: B019  as long-lived as the source
+    def _maps(self) -> MeshMapsTensor:
+        """The T-pose's, as large as the teacher's."""
+        rig, teacher = self.sequence.rig, self.teacher
+        return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
 
     def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
         """What the teacher shows in views of a frame."""

@@ -22,6 +22,7 @@ from avatar.training.gradient_task import GradientTask
 from avatar.training.loop import LoopConfig, Progress, run_training
 from avatar.training.machine import seeded
 from avatar.training.pretrain import PretrainConfig, PretrainFieldTask, PretrainTeacherTask
+from avatar.training.seed_shapes import seed_blend_shapes
 from avatar.training.sequence import AvatarSequence, evenly
 from avatar.training.track import TrackConfig, TrackTask
 from avatar.training.view_task import Preview, ViewConfig
@@ -99,6 +100,7 @@ def fit_teacher(
         track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))
         if not progress.finished:
             return teacher.eval(), progress
+        teacher.remember(track)
         session = session.after(progress)
     # Networks whose output is zero know zero residuals already.
     if config.pretrain is not None and (track is not None or not networks.zero_output):
@@ -162,9 +164,17 @@ def compensate(
     shapes: BlendShapeConfig,
     config: CompensateConfig,
     session: Session,
+    *,
+    teacher: TeacherAvatar | None = None,
 ) -> tuple[Student, Progress]:
-    """Give a baked student blend shapes and train them."""
+    """Give a baked student blend shapes and train them.
+
+    Args:
+        teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so.
+    """
     with seeded(config.seed):
         made = student.with_blend_shapes(shapes)
+        if config.seeded and teacher is not None and teacher.track is not None:
+            seed_blend_shapes(made, sequence, teacher.track)
     progress = session.run(lambda: CompensateTask(sequence, made, config, **session.options), config)
     return made.eval(), progress
