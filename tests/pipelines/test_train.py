@@ -61,7 +61,8 @@ def test_files_and_figures_of_every_stage(trained, stage):
     folder = trained / stage
     previews = {f"previews/Held0_{frame:06d}.png" for frame in (1, 3, 4, 5)}
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-    logs = {"metrics.jsonl", *(["track_metrics.jsonl"] if stage == "80_teacher" else [])}
+    before = {"80_teacher": {"track_metrics.jsonl", "pretrain_metrics.jsonl"}, "85_bake": {"pretrain_metrics.jsonl"}}
+    logs = {"metrics.jsonl", *before.get(stage, ())}
     assert files == {"manifest.json", *logs, *previews, *MODELS[stage]}
     manifest = read_manifest(folder)
     numbers = manifest["numbers"]
@@ -71,6 +72,7 @@ def test_files_and_figures_of_every_stage(trained, stage):
     assert numbers["gaussians"] == 300 and numbers["parameters"]["total"] > 300 * 20
     assert numbers["peak_memory"]["host"] > 50e6
     assert (numbers["seconds_of_tracking"] > 0) == (stage == "80_teacher")
+    assert (numbers["seconds_of_pretraining"] > 0) == (stage in before)
     for kind in ("novel_view", "novel_pose"):
         assert 3 < numbers[kind]["psnr"] < 60 and 3 < numbers["start"][kind]["psnr"] < 60
     assert {c["name"] for c in manifest["checks"]} >= {
