@@ -25,6 +25,8 @@ class FieldConfig:
         pose_size: length of theta (21 body joints, axis-angle).
         code_size: length of a frame's code z_t.
         width, hidden_layers: of both MLPs; one more layer gives the displacement.
+        local_pose: a point sees the joints of theta within as many steps along the skeleton of one that carries it
+            (`seen_joints`), the others as zero; 0: all of them, as published.
     """
 
     frequencies: int = 6
@@ -32,9 +34,11 @@ class FieldConfig:
     code_size: int = 32
     width: int = 64
     hidden_layers: int = 5
+    local_pose: int = 0
 
     def __post_init__(self) -> None:
-        require_at_least("field frequencies", self.frequencies, 0)
+        for name in ("frequencies", "local_pose"):
+            require_at_least(f"field {name}", getattr(self, name), 0)
         for name in ("pose_size", "code_size", "width", "hidden_layers"):
             require_at_least(f"field {name}", getattr(self, name), 1)
 
@@ -62,7 +66,8 @@ def positional_encoding(points: Tensor, frequencies: int) -> Tensor:
 class _FieldNetwork(nn.Module):
     """MLP on `phi(v) + theta + z`; the last layer starts at zero.
 
-    The first layer is linear in its parts: that of pose and code is computed once a frame, not once a vertex.
+    The first layer is linear in its parts: that of pose and code is computed once a frame (and once for every set of
+    joints that points see), not once a vertex.
     """
 
     def __init__(self, config: FieldConfig) -> None:
@@ -78,9 +83,10 @@ class _FieldNetwork(nn.Module):
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
-    def forward(self, encodings: Tensor, frames: Tensor) -> Tensor:
-        """(V, E) encodings and (B, pose + code) -> (B, V, 3)."""
-        x = F.relu(self.of_point(encodings) + self.of_frame(frames)[:, None])
+    def forward(self, encodings: Tensor, frames: Tensor, member: Tensor | None) -> Tensor:
+        """(V, E) encodings, (B, U, pose + code) and (V, U) one-hot, or None where U is 1 -> (B, V, 3)."""
+        of_frame = self.of_frame(frames)
+        x = F.relu(self.of_point(encodings) + (of_frame if member is None else member @ of_frame))
         for layer in self.hidden:
             x = F.relu(layer(x))
         return self.last(x)
@@ -97,13 +103,20 @@ class DeformationField(nn.Module):
         vertices: (V, 3) canonical vertices, metres.
         cloth_mask: (V,) bool, m.
         control: control points of the same vertices, or None to evaluate the field on every vertex.
+        seen: (V, pose_size / 3) bool, the joints of theta that each vertex sees, where the configuration asks for it.
 
     Raises:
-        InputError: a mask or control points of another number of vertices.
+        InputError: a mask, control points or seen joints of another number of vertices or joints.
     """
 
     def __init__(
-        self, config: FieldConfig, vertices: Tensor, cloth_mask: Tensor, *, control: ControlPoints | None = None
+        self,
+        config: FieldConfig,
+        vertices: Tensor,
+        cloth_mask: Tensor,
+        *,
+        control: ControlPoints | None = None,
+        seen: Tensor | None = None,
     ) -> None:
         super().__init__()
         if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
@@ -117,6 +130,13 @@ class DeformationField(nn.Module):
                 "control points",
                 expected=f"those of {len(vertices)} vertices",
                 received=f"those of {len(control.neighbours)}",
+            )
+        expected = (len(vertices), config.pose_size // 3) if config.local_pose else None
+        if expected != (None if seen is None else tuple(seen.shape)):
+            raise InputError(
+                "joints that the vertices see",
+                expected="none without local_pose" if expected is None else f"shape {expected}",
+                received="none" if seen is None else f"shape {tuple(seen.shape)}",
             )
         self.config = config
         self.body = _FieldNetwork(config)
@@ -133,6 +153,14 @@ class DeformationField(nn.Module):
         self.register_buffer("points", where, persistent=False)
         self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
         self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
+        sets = member = None
+        if seen is not None:
+            sets, group = torch.unique(seen[where], dim=0, return_inverse=True)
+            sets = sets.to(vertices.dtype).repeat_interleave(3, dim=1)
+            # A product with one-hot rows: its gradient is a product too, where a gather's is slow on a CPU.
+            member = F.one_hot(group, len(sets)).to(vertices.dtype)
+        self.register_buffer("sets", sets, persistent=False)
+        self.register_buffer("member", member, persistent=False)
 
     def forward(self, pose: Tensor, code: Tensor) -> Tensor:
         """(B, V, 3) metres, displacements of all vertices along the canonical axes; see `at_points`."""
@@ -163,9 +191,12 @@ class DeformationField(nn.Module):
                 expected=f"shapes (B, {expected[0]}) and (B, {expected[1]})",
                 received=f"shapes {tuple(pose.shape)} and {tuple(code.shape)}",
             )
-        frames = torch.cat([pose, code], dim=1)
-        moved = self.body(self.encodings, frames)
-        return moved.index_add(1, self.cloth_index, self.cloth(self.encodings[self.cloth_index], frames))
+        local = pose[:, None] if self.sets is None else pose[:, None] * self.sets
+        frames = torch.cat([local, code[:, None].expand(-1, local.shape[1], -1)], dim=2)
+        moved = self.body(self.encodings, frames, self.member)
+        clothes = self.cloth_index
+        member = None if self.member is None else self.member[clothes]
+        return moved.index_add(1, clothes, self.cloth(self.encodings[clothes], frames, member))
 
 
 class FrameCodes(nn.Module):

@@ -34,12 +34,15 @@ _TEACHERS = {
         in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
     ),
     "cpu": TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN),
-    "demo": TeacherConfig(in_size=64, out_size=128, channel_base=512, channel_max=32, style_size=16, **_LEAN),
+    "demo": TeacherConfig(in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16, **_LEAN),
 }
 
+# Short trainings see few poses.
+_FIELDS = {name: FieldConfig(local_pose=3) for name in ("cpu", "demo")}
+
 NETWORK_PRESETS = {
-    # The student is the paper's in all of them: it is small already.
-    name: NetworkPreset(teacher, FieldConfig(), BlendShapeConfig())
+    # The student has the paper's sizes in all of them: it is small already.
+    name: NetworkPreset(teacher, _FIELDS.get(name, FieldConfig()), BlendShapeConfig())
     for name, teacher in _TEACHERS.items()
 }
 

@@ -17,6 +17,7 @@ from avatar.models.config import require_at_least
 from avatar.models.control_points import choose_control_points, template_control_points
 from avatar.models.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.local_pose import seen_joints
 from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion, Rig
 
@@ -120,7 +121,9 @@ class Student(nn.Module):
 
 def _make_field(config: StudentConfig, rig: Rig) -> DeformationField:
     control = template_control_points(rig.template, config.control_points) if config.control_points else None
-    return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control)
+    steps = config.field.local_pose
+    seen = torch.tensor(seen_joints(rig.template, steps)) if steps else None
+    return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control, seen=seen)
 
 
 def make_blend_shapes(config: BlendShapeConfig, rig: Rig, gaussians: BoundGaussians) -> BlendShapes:

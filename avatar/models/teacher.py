@@ -28,9 +28,10 @@ class TeacherConfig:
         semantics: how the semantic colours join the positions: "sum" (6 input channels) or "concatenate" (12).
         sees_view: colour depends on the viewing direction.
         position_scale: metres of displacement for an output of 1.
-        position_size: side in pixels of the output of a smaller network for the position alone, which sees the input at
-            half that size and is enlarged to `out_size`; 0: the position is one of the others' outputs. Displacements
-            are smoother than colours, and the smaller network learns them many times faster.
+        position_size: side in pixels of the output of a smaller network for the position alone, which has half the
+            channels, sees the input at half that size and is enlarged to `out_size`; 0: the position is one of the
+            others' outputs. Displacements are smoother than colours, and the smaller network learns them many times
+            faster.
         centred: show the networks by how much a pose's map differs from the mean of the training frames, in units of
             the differences' standard deviation; False: the map itself, in metres.
         in_size, out_size, bottleneck, channel_base, channel_max, style_size, style_layers, noise, zero_output: of each
@@ -77,8 +78,10 @@ class TeacherConfig:
             heads = {"all": (Head(POSITION + OTHER), colour)}
         configs = {name: self._network_config(its_heads) for name, its_heads in heads.items()}
         if self.position_size:
-            size = self.position_size
-            configs["position"] = replace(configs["position"], in_size=size // 2, out_size=size)
+            configs["position"] = replace(
+                configs["position"], in_size=self.position_size // 2, out_size=self.position_size,
+                channel_base=max(1, self.channel_base // 2), channel_max=max(1, self.channel_max // 2),
+            )  # fmt: skip
         return configs
 
     def _network_config(self, heads: tuple[Head, ...]) -> StyleUNetConfig:

@@ -82,7 +82,7 @@ class TeacherAvatar(nn.Module):
     def remember(self, track: Track) -> None:
         """Keep the surface that was followed through the training frames; it is saved with the teacher."""
         self.track = track
-        self.register_buffer("track_frames", torch.tensor(list(track.row), device=self.rig.device))
+        self.register_buffer("track_frames", torch.tensor(sorted(track.row, key=track.row.get), device=self.rig.device))
         self.register_buffer("track_controls", track.controls.to(self.rig.device))
 
     def centre(self, motions: Iterable[Motion]) -> None:

@@ -52,7 +52,11 @@ def _components(shapes: BlendShapes, residuals: Tensor) -> Tensor:
     of_part = None if shapes.part is None else shapes.part[shapes.active]
     for part in range(shapes.config.parts):
         rows = slice(None) if of_part is None else torch.nonzero(of_part == part)[:, 0]
-        own = residuals[:, rows].flatten(1).double()
+        own = residuals[:, rows]
+        if shapes.head_weight is not None:
+            # Columns of the body do nothing where the head's act.
+            own = own * (1.0 - shapes.head_weight[shapes.active][rows, None])
+        own = own.flatten(1).double()
         # T is small beside 3 M: the eigenvectors of the frames' products are the coefficients.
         _, vectors = torch.linalg.eigh(own @ own.T)
         vectors = vectors[:, -count:].flip(1) * frames**0.5

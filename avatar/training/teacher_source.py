@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -58,12 +58,12 @@ class TeacherSource:
 
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
-                return (self._maps().interpolate(self.teacher.track.displacements(frame)).half(),)
+                return (self._maps.interpolate(self.teacher.track.displacements(frame)).half(),)
             return (self.teacher.displacement_maps([self.sequence.motion(frame)])[0].half(),)
 
         return self._kept.get(("maps", frame), make)[0].float()
 
-    @cache  # noqa: B019  as long-lived as the source
+    @cached_property
     def _maps(self) -> MeshMapsTensor:
         """The T-pose's, as large as the teacher's."""
         rig, teacher = self.sequence.rig, self.teacher

@@ -110,6 +110,41 @@ def test_control_points_keep_what_the_networks_say_there():
     assert bool((everywhere.amax(1) <= own.amax(1) + 1e-5).all() and (everywhere.amin(1) >= own.amin(1) - 1e-5).all())
 
 
+LOCAL = FieldConfig(width=16, hidden_layers=2, local_pose=1)
+
+
+def some_joints(vertices: int = 30) -> torch.Tensor:
+    return torch.rand(vertices, 21, generator=torch.Generator().manual_seed(5)).gt(0.5)[torch.arange(vertices) // 4]
+
+
+def test_a_vertex_does_not_notice_joints_that_it_does_not_see():
+    seen = some_joints()
+    field = random_field(LOCAL, seen=seen)
+    pose, code = drive(1)
+    before = field(pose, code)[0]
+    for joint in (0, 7, 20):
+        turned = pose.clone()
+        turned[0, 3 * joint : 3 * joint + 3] += 1.0
+        moved = (field(turned, code)[0] - before).abs().amax(1) > 1e-6
+        assert torch.equal(moved, seen[:, joint])
+
+
+def test_seeing_all_joints_is_the_plain_field():
+    plain, local = random_field(), random_field(LOCAL, seen=torch.ones(30, 21, dtype=torch.bool))
+    assert plain.state_dict().keys() == local.state_dict().keys()
+    torch.testing.assert_close(local(*drive()), plain(*drive()), rtol=1e-5, atol=1e-6)
+
+
+def test_control_points_see_what_their_vertices_see():
+    torch.manual_seed(0)
+    points = torch.rand(30, 3) - 0.5
+    control = choose_control_points(points.numpy(), torch.arange(30).numpy() % 3 == 0, count=12)
+    whole = random_field(LOCAL, seen=some_joints())
+    controlled = random_field(LOCAL, seen=some_joints(), control=control)
+    at_points = controlled.at_points(*drive())
+    torch.testing.assert_close(at_points, whole(*drive())[:, controlled.points], rtol=1e-4, atol=1e-5)
+
+
 def test_without_control_points_the_points_are_all_vertices():
     field = random_field()
     assert torch.equal(field.points, torch.arange(30))
@@ -146,3 +181,8 @@ def test_refused_input():
         FrameCodes((1, 1), 4)
     with pytest.raises(InputError, match="null code"):
         FrameCodes((1, 2), 4)((5,))
+    for config, options in ((LOCAL, {}), (CONFIG, {"seen": some_joints(5)}), (LOCAL, {"seen": some_joints(4)})):
+        with pytest.raises(InputError, match="joints that the vertices see"):
+            DeformationField(config, torch.rand(5, 3), torch.ones(5, dtype=torch.bool), **options)
+    with pytest.raises(InputError, match="local_pose"):
+        FieldConfig(local_pose=-1)

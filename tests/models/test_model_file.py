@@ -15,12 +15,13 @@ from avatar.models.model_file import HEADER, SCHEMA, load_avatar, save_avatar
 from avatar.models.rig import Rig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import ControlCage, Track
 from smplxpp.core.errors import InputError
 from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
 
 EYES = torch.tensor([[0.0, 0.8, 2.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8)
-KINDS = ("teacher", "centred", "student", "no field", "control points", "shapes", "local", "gated", "pruned")
+KINDS = ("teacher", "centred", "tracked", "student", "no field", "control points", "shapes", "local", "gated", "pruned")
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +29,18 @@ def rig() -> Rig:
     return Rig(template())
 
 
+def followed(rig: Rig) -> Track:
+    """A surface in frames that do not follow each other."""
+    controls = 0.05 * torch.randn(3, 24, 3, generator=torch.Generator().manual_seed(4))
+    return Track({1: 0, 4: 1, 7: 2}, controls, ControlCage(rig, 24))
+
+
 def make(kind: str, rig: Rig):
     torch.manual_seed(0)
-    if kind == "teacher":
+    if kind in ("teacher", "tracked"):
         model = TeacherAvatar(replace(TINY_TEACHER, noise=True), rig, varied(gaussians()))
+        if kind == "tracked":
+            model.remember(followed(rig))
     elif kind == "centred":
         model = TeacherAvatar(
             replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True), rig, varied(gaussians())
@@ -93,6 +102,32 @@ def test_a_compact_file_is_within_half_precision_and_half_the_size(kind, rig, tm
 def test_frames_that_have_a_code_are_remembered(rig, tmp_path):
     save_avatar(tmp_path / "a", make("student", rig))
     assert load_avatar(tmp_path / "a", rig).frames == (0, 2, 3)
+
+
+def test_a_teacher_comes_back_with_the_surface_that_it_remembers(rig, tmp_path):
+    own = followed(rig)
+    save_avatar(tmp_path / "whole", make("tracked", rig))
+    save_avatar(tmp_path / "compact", make("tracked", rig), compact=True)
+    whole, compact = (load_avatar(tmp_path / name, rig).track for name in ("whole", "compact"))
+    assert whole.row == compact.row == own.row
+    for frame in own.row:
+        assert own.displacements(frame).abs().max() > 0.01
+        assert torch.equal(whole.displacements(frame), own.displacements(frame))
+        torch.testing.assert_close(compact.displacements(frame), own.displacements(frame), rtol=0, atol=0.05 * 2.0**-8)
+
+
+def test_a_teacher_that_followed_no_surface_comes_back_without(rig, tmp_path):
+    for kind in ("teacher", "centred"):
+        save_avatar(tmp_path / kind, make(kind, rig))
+        assert load_avatar(tmp_path / kind, rig).track is None
+
+
+def test_what_is_remembered_last_is_saved(rig, tmp_path):
+    teacher, own = make("tracked", rig), followed(rig)
+    teacher.remember(Track({5: 0}, own.controls[1:2], own.cage))
+    save_avatar(tmp_path / "a", teacher)
+    track = load_avatar(tmp_path / "a", rig).track
+    assert track.row == {5: 0} and torch.equal(track.displacements(5), own.displacements(4))
 
 
 def changed(path, *, about=None, tensors=None, header=HEADER) -> None:

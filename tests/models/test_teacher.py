@@ -82,12 +82,11 @@ def test_the_position_alone_is_that_of_all_residuals(changes):
     torch.testing.assert_close(alone, teacher(positions, semantics[:1], views).shape[..., :3])
 
 
-def test_a_network_of_the_others_size_is_the_separate_one():
-    results = []
-    for size in (0, TINY.out_size):
-        torch.manual_seed(0)
-        results.append(Teacher(replace(TINY, position_size=size))(*inputs(1, 1)))
-    assert torch.equal(results[0].shape, results[1].shape) and torch.equal(results[0].colour, results[1].colour)
+def test_its_own_network_is_one_of_half_the_sizes():
+    smaller = replace(SMALL, position_size=0, in_size=8, out_size=16, channel_base=32, channel_max=4)
+    own, without = SMALL.network_configs(), replace(SMALL, position_size=0).network_configs()
+    assert own.pop("position") == smaller.network_configs()["position"]
+    assert own == {name: without[name] for name in ("colour", "other")}
 
 
 def test_enlarged_maps_have_the_small_ones_values_between_their_pixels():

@@ -14,10 +14,12 @@ from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.learned_gaussians import LEARNED
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked import ControlCage, Track
 from avatar.training.bake import BakeConfig, BakeTask
 from avatar.training.compensate import CompensateConfig, CompensateTask
 from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.loop import LoopConfig, run_training
+from avatar.training.teacher_source import TeacherSource
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from avatar.training.view_task import pixel_size
 from smplxpp.core.errors import InputError
@@ -112,6 +114,61 @@ def test_the_bakes_semantic_term_is_zero_for_equal_geometry(frames):
     assert terms["nonrigid"] < 1e-5 and terms["l1"] < 2e-3
 
 
+STILL = {"null_share": 0.0, "pose_noise": 0.0}
+"""A bake without noise."""
+
+
+def bake_of(frames, teacher, **changes) -> BakeTask:
+    """The bake of a student that has the Gaussians of `taught`."""
+    bound = taught(frames).gaussians.snapshot()
+    student = Student(STUDENT, frames.rig, bound, frames.train_frames)
+    return BakeTask(frames, student, replace(BAKE, **STILL, **changes), teacher=teacher)
+
+
+def test_the_bake_compares_with_the_teachers_images_or_with_photographs(frames):
+    """At zero residuals teacher and student are the same: their images agree, and the photographs show another."""
+    teacher = TeacherAvatar(TINY_TEACHER, frames.rig, taught(frames).gaussians.snapshot())
+    terms = {}
+    for name, source, changes in (
+        ("by default", teacher, {}),
+        ("teacher", teacher, {"images": "teacher"}),
+        ("photographs", teacher, {"images": "photographs"}),
+        ("alone", None, {}),
+    ):
+        task = bake_of(frames, source, **changes)
+        terms[name] = task.loss(task.items(0)[0])[1]
+    assert terms["by default"] == terms["teacher"] and terms["teacher"]["l1"] < 2e-3
+    assert terms["photographs"]["l1"] > 0.02
+    # Maps and labels are the teacher's still.
+    assert {"semantic", "nonrigid"} <= terms["photographs"].keys()
+    shared = ("l1", "dssim", "alpha", "psnr_crop")
+    assert [terms["photographs"][name] for name in shared] == [terms["alone"][name] for name in shared]
+
+
+def test_a_bake_on_photographs_without_labels_has_nothing_rendered_by_the_teacher(frames, monkeypatch):
+    monkeypatch.setattr(TeacherSource, "_draw", None)
+    task = bake_of(frames, taught(frames), images="photographs", semantic=0.0)
+    _, terms = task.loss(task.items(0)[0])
+    assert "semantic" not in terms and terms["nonrigid"] > 0
+    for changes in ({"images": "photographs"}, {"semantic": 0.0}):
+        asking = bake_of(frames, taught(frames), **changes)
+        with pytest.raises(TypeError):
+            asking.loss(asking.items(0)[0])
+
+
+def test_the_bakes_maps_are_the_surface_that_its_teacher_remembers(frames):
+    """The same everywhere, so that its difference from a field at zero is known; the networks say something else."""
+    teacher = taught(frames)
+    swing = torch.tensor([[0.03, 0.0, 0.0], [0.03, -0.01, 0.0], [0.04, 0.0, 0.0], [0.03, 0.0, 0.02]])
+    row = {frame: number for number, frame in enumerate(frames.train_frames)}
+    teacher.remember(Track(row, swing[:, None].expand(-1, 24, -1), ControlCage(frames.rig, 24)))
+    task = bake_of(frames, teacher, images="photographs", semantic=0.0)
+    for number in range(4):
+        (item,) = task.items(number)
+        expected = float(swing[row[item.frame]].abs().sum()) / TINY_TEACHER.position_scale
+        assert task.loss(item)[1]["nonrigid"] == pytest.approx(expected, rel=1e-3)
+
+
 def test_the_bake_does_not_change_its_teacher(frames):
     teacher = taught(frames)
     before = copied(teacher.state_dict())
@@ -197,7 +254,7 @@ def test_what_cannot_be_trained_is_refused(frames):
     for change in ({"iterations": 0}, {"items": 0}, {"coarse": -0.1}, {"seed": -1}, {"attributes": float("nan")}):
         with pytest.raises(InputError, match=next(iter(change))):
             replace(TEACHER, **change)
-    for change in ({"null_share": 1.5}, {"semantic": -1.0}, {"pose_noise": float("nan")}):
+    for change in ({"null_share": 1.5}, {"semantic": -1.0}, {"pose_noise": float("nan")}, {"images": "drawings"}):
         with pytest.raises(InputError, match=next(iter(change))):
             replace(BAKE, **change)
     with pytest.raises(InputError, match="null_share"):
