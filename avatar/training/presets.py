@@ -171,12 +171,12 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
         _Size(
             gaussians=15_000,
             control_points=800,
-            track=(Level(1, 8, 5e-3), Level(0, 8, 2e-3)),
+            track=(Level(1, 12, 5e-3), Level(0, 12, 2e-3)),
             pretrain=100,
             fit=100,
             teacher=60,
             bake=60,
-            compensate=200,
+            compensate=500,
         ),
     ),
 }
