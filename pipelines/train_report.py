@@ -92,8 +92,11 @@ def _how(numbers: Mapping[str, Any]) -> str:
     memory = ", ".join(f"{size / 1e9:.1f} GB {where}" for where, size in (
         (name, numbers["peak_memory"].get(key)) for key, name in (("host", "of memory"), ("device", "on the GPU"))
     ) if size)  # fmt: skip
-    processes, tracking = numbers["processes"], numbers["seconds_of_tracking"]
+    processes, tracking, pretraining = (
+        numbers[name] for name in ("processes", "seconds_of_tracking", "seconds_of_pretraining")
+    )
     before = f" The surface was followed through the frames first, in {tracking:.0f} s." if tracking else ""
+    before += f" The networks were pretrained without rendering, in {pretraining:.0f} s." if pretraining else ""
     return (
         f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations on "
         f"{numbers['training_frames']} frames of {numbers['training_cameras']} cameras in "

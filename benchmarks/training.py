@@ -1,0 +1,188 @@
+"""A training from its run: minutes, steps a second, memory and quality of each stage, and where their time goes.
+
+    python -m benchmarks.training --run RUN --capture DIR
+
+reads what `smplxpp train` and `smplxpp evaluate` left in RUN, and takes a few steps of every stage again under a
+profiler. Times are of the process alone on the machine or they mean little.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from torch.profiler import ProfilerActivity, profile
+
+from avatar.gaussians.bound_file import load_bound
+from avatar.models.model_file import load_avatar
+from avatar.models.tracked import TrackedAvatar
+from avatar.training.bake import BakeTask
+from avatar.training.compensate import CompensateTask
+from avatar.training.fit_teacher import TeacherTask
+from avatar.training.presets import TrainingPreset, training_preset
+from avatar.training.pretrain import PretrainFieldTask, PretrainTeacherTask
+from avatar.training.sequence import AvatarSequence
+from avatar.training.track import TrackTask
+from benchmarks.machine import store_results
+from smplxpp.capture import open_capture
+from smplxpp.core.artifact import read_manifest
+from smplxpp.core.errors import InputError
+from smplxpp.core.template import Template
+
+STAGES = ("70_bind", "80_teacher", "85_bake", "90_compensate")
+WARM_UP, TIMED = 3, 14
+KINDS = {
+    "rasteriser": ("_Rasterize",),
+    "image loss": ("_Ssim", "l1_loss", "smooth_l1"),
+    "networks": ("conv", "mkldnn", "mm", "addmm", "bmm", "linear", "relu", "_SymmetricFilter"),
+    "maps and control points": ("_Bags", "embedding_bag", "InterpolateFunction", "BarycentricFunction"),
+    "skinning and Gaussians": ("FramesFunction", "WorldFunction", "ColorsFunction"),
+    "optimiser": ("_fused", "_foreach", "Optimizer"),
+}
+"""Of torch's operations, by what their names contain; the first kind that fits."""
+
+
+@dataclass(frozen=True)
+class TrainingBenchmark:
+    """Store a training's figures and where its time goes."""
+
+    run_folder: Path
+    """Run that was trained and evaluated."""
+    capture: Path
+    """Folder of its capture."""
+    preset: Literal["cpu", "demo"] = "cpu"
+    """That it was trained with."""
+
+    def run(self) -> None:
+        """Read, profile, print, store."""
+        figures = {
+            "preset": self.preset,
+            "threads": torch.get_num_threads(),
+            "stages": {name: stage_figures(self.run_folder / name) for name in STAGES},
+            "evaluation": evaluation_figures(self.run_folder / "95_evaluate" / "metrics.json"),
+            "share_of_a_step": profiles(self.run_folder, self.capture, training_preset(self.preset)),
+        }
+        figures["minutes"] = round(sum(stage["seconds"] for stage in figures["stages"].values()) / 60.0, 2)
+        print(json.dumps(figures, indent=1))
+        name = f"training_{open_capture(self.capture).name}_{self.preset}"
+        command = f"smplxpp train --run RUN --capture DIR --preset {self.preset}; smplxpp evaluate RUN --capture DIR; "
+        path = store_results(name, command + "python -m benchmarks.training --run RUN --capture DIR", figures)
+        print(f"stored {path.name}")
+
+
+def stage_figures(folder: Path) -> dict[str, Any]:
+    """Of one training.
+
+    Raises:
+        InputError: it has not been finished.
+    """
+    manifest = read_manifest(folder) if folder.is_dir() else None
+    if manifest is None or not manifest["numbers"].get("finished"):
+        raise InputError(f"training {folder.name}", expected="a finished one", received=str(folder),
+                         remedy="train with `smplxpp train --run RUN --capture DIR`")  # fmt: skip
+    numbers = manifest["numbers"]
+    kept = ("iterations", "iterations_per_second", "seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining",
+            "gaussians", "bytes", "start", "novel_view", "novel_pose")  # fmt: skip
+    found = {"seconds": manifest["seconds"], **{name: numbers[name] for name in kept if name in numbers}}
+    if "parameters" in numbers:
+        found["parameters"] = numbers["parameters"]["total"]
+    if "peak_memory" in numbers:
+        found["peak_memory_gib"] = numbers["peak_memory"]["host"] / 2**30
+    return _rounded(found)
+
+
+def evaluation_figures(path: Path) -> dict[str, Any]:
+    """Of every model: images, surfaces by label, speed, bytes.
+
+    Raises:
+        InputError: the run has not been evaluated.
+    """
+    if not path.is_file():
+        raise InputError("evaluation of the run", expected=str(path), received="no such file",
+                         remedy="make it with `smplxpp evaluate RUN --capture DIR`")  # fmt: skip
+    stored = json.loads(path.read_text())
+    figures = {
+        name: {"views": model["mean"], "surfaces": _surfaces(model["surfaces"]), "speed": model["speed"],
+               "bytes": model["bytes"]}
+        for name, model in stored["models"].items()
+    }  # fmt: skip
+    figures["skinning alone"] = {"surfaces": _surfaces(stored["skinning_alone"])}
+    return _rounded(figures)
+
+
+def _surfaces(surfaces: Mapping[str, Any]) -> dict[str, Any]:
+    out = {}
+    for part, found in surfaces.items():
+        mean = found["mean"]
+        out[part] = {"p2s": mean["p2s"], "chamfer": mean["chamfer"]}
+        out[part] |= {f"p2s {label}": figures["p2s"] for label, figures in mean["labels"].items()}
+    return out
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _rounded(each) for key, each in value.items()}
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict[str, float]]:
+    """Milliseconds of a step of every training, and the shares of each kind of work in it."""
+    sequence = AvatarSequence(open_capture(capture), Template.load(run / "60_assemble" / "smplxpp.npz"))
+    rig = sequence.rig
+    teacher = load_avatar(run / "80_teacher" / "teacher.safetensors", rig)
+    baked = load_avatar(run / "85_bake" / "student.safetensors", rig)
+    student = load_avatar(run / "90_compensate" / "student.safetensors", rig)
+    followed = TrackedAvatar(
+        rig, load_bound(run / "70_bind" / "gaussians.safetensors"), preset.teacher.track.control_points
+    )
+    steps, bake = preset.teacher.track.steps, preset.bake
+
+    def tracking(task: TrackTask) -> Callable[[int], Any]:
+        # A frame's steps are on images of several sizes: as many of each as in a whole frame.
+        return lambda k: task.step(steps * (k // TIMED) + k % TIMED * steps // TIMED)
+
+    tasks = {
+        "tracking": tracking(TrackTask(sequence, followed, preset.teacher.track)),
+        "teacher's pretraining": PretrainTeacherTask(sequence, teacher, preset.teacher.pretrain, 0, teacher.track).step,
+        "teacher": TeacherTask(sequence, teacher.train(), preset.teacher).step,
+        "bake's pretraining": PretrainFieldTask(
+            sequence,
+            baked,
+            teacher,
+            bake.pretrain,
+            0,
+            code_rate=bake.code_rate,
+            null_share=bake.null_share,
+            imagined=bake.imagined,
+        ).step,
+        "bake": BakeTask(sequence, baked.train(), bake, teacher=teacher).step,
+        "compensation": CompensateTask(sequence, student.train(), preset.compensate).step,
+    }
+    return {name: _profile(step) for name, step in tasks.items()}
+
+
+def _profile(step: Callable[[int], Any]) -> dict[str, float]:
+    for k in range(WARM_UP):
+        step(k)
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+        for k in range(TIMED):
+            step(k)
+    events = profiler.key_averages()
+    # Backward passes run in a thread of their own while the first waits: self times of both add up to the wall's.
+    times = dict.fromkeys((*KINDS, "other tensors"), 0.0)
+    for event in events:
+        kind = next((kind for kind, names in KINDS.items() if any(n in event.key for n in names)), "other tensors")
+        times[kind] += event.self_cpu_time_total
+    wall = max(event.time_range.end for event in profiler.events()) - min(e.time_range.start for e in profiler.events())
+    times["Python, poses, reading"] = max(0.0, wall - sum(times.values()))
+    shares = {name: round(value / wall, 3) for name, value in times.items()}
+    return {"milliseconds": round(wall / TIMED / 1e3, 2), **shares}
+
+
+if __name__ == "__main__":
+    tyro.cli(TrainingBenchmark, prog="python -m benchmarks.training").run()
