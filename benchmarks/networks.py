@@ -3,7 +3,8 @@
     python -m benchmarks.networks [--presets cpu demo] [--device cpu]
 
 A step is forward and backward of one frame, with the lookup of the Gaussians; the median and the fastest of `--repeats`
-are stored. A large preset on a CPU takes minutes a step: it is left out unless asked for.
+are stored. A large preset on a CPU takes minutes a step: it is left out unless asked for. What a step of the teacher
+holds in memory is counted for all presets, without running it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.control_points import choose_control_points
 from avatar.models.deformation_field import DeformationField, FieldConfig
 from avatar.models.map_sampling import MapFrame, MapSampler
-from avatar.models.presets import network_preset
+from avatar.models.presets import NETWORK_PRESETS, network_preset
 from avatar.models.teacher import Teacher
 from benchmarks.machine import store_results
 
@@ -58,6 +59,32 @@ def body_points(count: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Points with normals on a body-sized ellipsoid."""
     normals = torch.nn.functional.normalize(torch.randn(count, 3, device=device), dim=1)
     return normals * torch.tensor([0.4, 0.9, 0.2], device=device), normals
+
+
+def teacher_memory(name: str) -> dict[str, float]:
+    """GiB in float32 of one frame's step: weights, gradients and Adam's moments; and what the backward pass needs.
+
+    Counted on torch's meta device. Images, Gaussians, the perceptual metric and temporary buffers come on top.
+    """
+    config = network_preset(name).teacher
+    held: dict[int, torch.UntypedStorage] = {}
+
+    def keep(tensor: torch.Tensor) -> torch.Tensor:
+        storage = tensor.untyped_storage()
+        held[storage._cdata] = storage
+        return tensor
+
+    with torch.device("meta"):
+        teacher = Teacher(config)
+        positions, semantics = torch.rand(2, 1, 2, config.in_size, config.in_size, 3)
+        views = torch.rand(1, 2, config.in_size, config.in_size)
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            maps = teacher(positions, semantics, views)
+    own = {parameter.untyped_storage()._cdata for parameter in teacher.parameters()}
+    weights = sum(parameter.numel() * 4 for parameter in teacher.parameters())
+    outputs = maps.shape.numel() * 4 + maps.colour.numel() * 4
+    saved = sum(storage.nbytes() for key, storage in held.items() if key not in own)
+    return {"weights_and_adam_gib": 4 * weights / 2**30, "backward_gib": (saved + outputs) / 2**30}
 
 
 def teacher_steps(name: str, options: Options) -> dict[str, dict]:
@@ -148,9 +175,11 @@ def main(options: Options) -> None:
     Console(width=110).print(table)
     device = torch.cuda.get_device_name() if options.device != "cpu" else f"CPU, {options.threads} threads"
     name = "networks" if options.device == "cpu" else "networks_gpu"
-    store_results(
-        name, f"python -m benchmarks.networks --presets {' '.join(options.presets)}", {"device": device} | rows
-    )
+    memory = {f"teacher {preset}, memory of a step": teacher_memory(preset) for preset in NETWORK_PRESETS}
+    for title, held in memory.items():
+        print(f"{title}: {', '.join(f'{key} {value:.2f}' for key, value in held.items())}")
+    command = f"python -m benchmarks.networks --presets {' '.join(options.presets)}"
+    store_results(name, command, {"device": device} | rows | memory)
 
 
 if __name__ == "__main__":
