@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from typing import Annotated
 
 import torch
 import tyro
@@ -40,7 +41,7 @@ SAMPLES = 20_000
 class ClothFromPose:
     """Fit and measure predictors."""
 
-    run_folder: Path
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
     """Trained run whose teacher followed the surface."""
     capture: Path
     """Folder of its capture, with true surfaces of held-out frames."""

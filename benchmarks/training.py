@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -51,7 +51,7 @@ KINDS = {
 class TrainingBenchmark:
     """Store a training's figures and where its time goes."""
 
-    run_folder: Path
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
     """Run that was trained and evaluated."""
     capture: Path
     """Folder of its capture."""
@@ -146,24 +146,21 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.
         return lambda k: task.step(steps * (k // TIMED) + k % TIMED * steps // TIMED)
 
+    # Made one after the other: the bake's task freezes the teacher.
     tasks = {
-        "tracking": tracking(TrackTask(sequence, followed, preset.teacher.track)),
-        "teacher's pretraining": PretrainTeacherTask(sequence, teacher, preset.teacher.pretrain, 0, teacher.track).step,
-        "teacher": TeacherTask(sequence, teacher.train(), preset.teacher).step,
-        "bake's pretraining": PretrainFieldTask(
-            sequence,
-            baked,
-            teacher,
-            bake.pretrain,
-            0,
-            code_rate=bake.code_rate,
-            null_share=bake.null_share,
-            imagined=bake.imagined,
+        "tracking": lambda: tracking(TrackTask(sequence, followed, preset.teacher.track)),
+        "teacher's pretraining": lambda: PretrainTeacherTask(
+            sequence, teacher, preset.teacher.pretrain, 0, teacher.track
         ).step,
-        "bake": BakeTask(sequence, baked.train(), bake, teacher=teacher).step,
-        "compensation": CompensateTask(sequence, student.train(), preset.compensate).step,
-    }
-    return {name: _profile(step) for name, step in tasks.items()}
+        "teacher": lambda: TeacherTask(sequence, teacher.train(), preset.teacher).step,
+        "bake's pretraining": lambda: PretrainFieldTask(
+            sequence, baked, teacher, bake.pretrain, 0,
+            code_rate=bake.code_rate, null_share=bake.null_share, imagined=bake.imagined,
+        ).step,
+        "bake": lambda: BakeTask(sequence, baked.train(), bake, teacher=teacher).step,
+        "compensation": lambda: CompensateTask(sequence, student.train(), preset.compensate).step,
+    }  # fmt: skip
+    return {name: _profile(task()) for name, task in tasks.items()}
 
 
 def _profile(step: Callable[[int], Any]) -> dict[str, float]:
