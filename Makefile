@@ -18,8 +18,9 @@ $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/nativ
 demo: $(STAMP)
 	$(BIN)/python -m pipelines.demo --out $(RUN)
 
+# One thread a process: two processes of two threads each take twice as long on two cores.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
