@@ -6,10 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.binding import BoundGaussians, corner_weights, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.deformation_field import FrameCodes
@@ -60,7 +59,7 @@ class ResidualBaseline(Baseline):
         self.gaussians.normalise_quats()
         self.codes = FrameCodes(frames, code_size)
         canonical = triangle_frames(rig.vertices, rig.faces)
-        self.register_buffer("corner_weights", corner_weights(gaussians), persistent=False)
+        self.register_buffer("corner_weights", corner_weights(gaussians.barycentric), persistent=False)
         self.register_buffer("canonical_from_local", canonical.rotations[gaussians.face_index], persistent=False)
         points = (self.corner_weights[..., None] * canonical.corners[gaussians.face_index]).sum(1)
         self.register_buffer("points", points, persistent=False)
@@ -90,9 +89,3 @@ class ResidualBaseline(Baseline):
         """Networks and codes."""
         own = {name: p for name, p in self.named_parameters() if not name.startswith("gaussians.")}
         return [ParameterGroup("networks", own, rate, final)]
-
-
-def corner_weights(gaussians: BoundGaussians) -> Tensor:
-    """(N, 3) weights of the corners of each Gaussian's triangle."""
-    u, v = gaussians.barycentric.unbind(-1)
-    return torch.stack([u, v, 1.0 - u - v], dim=-1)

@@ -18,8 +18,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avatar.baselines.avatar_base import Baseline, corner_weights
-from avatar.gaussians.binding import BoundGaussians
+from avatar.baselines.avatar_base import Baseline
+from avatar.gaussians.binding import BoundGaussians, corner_weights
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.deformation_field import FieldConfig
 from avatar.models.learned_gaussians import LearnedGaussians
@@ -82,7 +82,7 @@ def _nearest_colors(rig: Rig, texels: BoundGaussians, gaussians: BoundGaussians)
     triangles = rig.template.mesh.triangles
 
     def places(bound: BoundGaussians) -> np.ndarray:
-        weights = corner_weights(bound).double().cpu().numpy()
+        weights = corner_weights(bound.barycentric).double().cpu().numpy()
         return (weights[..., None] * triangles[bound.face_index.cpu().numpy()]).sum(axis=1)
 
     nearest = cKDTree(places(gaussians)).query(places(texels))[1]

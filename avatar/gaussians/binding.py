@@ -183,14 +183,24 @@ def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -
     """`world_from_frames` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
-    u, v = bound.barycentric.unbind(-1)
-    weights = torch.stack([u, v, 1 - u - v], -1)
+    weights = corner_weights(bound.barycentric)
     normal, median, binormal = bound.offset.unbind(-1)
     local = torch.stack([normal + bound.normal_offset, median, binormal], -1)
     means = (weights[:, :, None] * corners).sum(-2) + (rotations * local[:, None, :]).sum(-1)
     quats = multiply_quats(frames.quats[..., bound.face_index, :], bound.quats)
     scales = frames.lengths[..., bound.face_index, None] * bound.scales
     return WorldGaussians(means, quats, scales, bound.opacities, _first_axes(quats))
+
+
+def corner_weights(barycentric: Tensor) -> Tensor:
+    """(N, 3) weights of the corners of a triangle from the (N, 2) of the first two."""
+    u, v = barycentric.unbind(-1)
+    return torch.stack([u, v, 1.0 - u - v], dim=-1)
+
+
+def on_triangles(corners: Tensor, barycentric: Tensor) -> Tensor:
+    """(N, 3, C) values at the corners of triangles -> (N, C) at points in them."""
+    return (corner_weights(barycentric)[..., None] * corners).sum(1)
 
 
 def _first_axes(quats: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.binding import BoundGaussians, on_triangles
 from avatar.models.map_sampling import MapFrame
 from avatar.models.rig import Rig
 from avatar.render.mesh_maps import front_back_maps
@@ -49,5 +49,4 @@ def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) ->
     """
     labels = rig.semantic_colors + torch.sin(tau * rig.vertices)
     corners = labels[rig.faces[gaussians.face_index]]
-    u, v = gaussians.barycentric.unbind(-1)
-    return (torch.stack([u, v, 1.0 - u - v], dim=-1)[..., None] * corners).sum(1)
+    return on_triangles(corners, gaussians.barycentric)

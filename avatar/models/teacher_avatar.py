@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.learned_gaussians import LearnedGaussians
@@ -23,7 +23,6 @@ from avatar.render.mesh_maps import front_back_maps, vertex_normals
 
 HALF_EXTENT = 1.0
 """Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""
-
 
 STILL = 1e-3
 """Metres: poses that differ less are not told apart more than that."""
@@ -65,9 +64,8 @@ class TeacherAvatar(nn.Module):
         self.frame = map_frame(rig)
         canonical = triangle_frames(rig.vertices, rig.faces)
         # Where the triangles have them, without the offsets, which are learned: one lookup for all of the training.
-        face, (u, v) = gaussians.face_index.to(rig.device), gaussians.barycentric.to(rig.device).unbind(-1)
-        weights = torch.stack([u, v, 1.0 - u - v], dim=-1)
-        points = (weights[..., None] * canonical.corners[face]).sum(1)
+        face = gaussians.face_index.to(rig.device)
+        points = on_triangles(canonical.corners[face], gaussians.barycentric.to(rig.device))
         sides = map_sides(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
         self.sampler = MapSampler(self.frame, config.out_size, points, sides.front)
         self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avatar.gaussians.binding import on_triangles
 from avatar.models.map_sampling import MapSampler
 from avatar.models.map_sides import map_sides
 from avatar.models.rig import Motion
@@ -126,10 +127,8 @@ class PretrainTeacherTask(_PretrainTask):
 
         def make() -> tuple[Tensor, ...]:
             corners = self.track.displacements(frame)[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
-            u, v = self.teacher.gaussians.barycentric.unbind(-1)
-            weights = torch.stack([u, v, 1.0 - u - v], dim=-1)
             inputs = self.teacher.position_input(self.sequence.motion(frame))
-            return inputs, (weights[..., None] * corners).sum(1)
+            return inputs, on_triangles(corners, self.teacher.gaussians.barycentric)
 
         return self._known.get(frame, make)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avatar.gaussians.binding import on_triangles
 from avatar.gaussians.frames import triangle_frames
 from avatar.models.blend_shapes import BlendShapes
 from avatar.models.student import Student
@@ -27,8 +28,6 @@ def seed_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     shapes, rig = student.blend_shapes, sequence.rig
     bound = student.gaussians()
     local = triangle_frames(rig.vertices, rig.faces).rotations[bound.face_index]
-    u, v = bound.barycentric.unbind(-1)
-    weights = torch.stack([u, v, 1.0 - u - v], dim=-1)[..., None]
     residuals, poses = [], []
     with torch.no_grad():
         for frame in evenly(sequence.train_frames, FRAMES):
@@ -36,7 +35,7 @@ def seed_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
             left = track.displacements(frame)
             if student.field is not None:
                 left = left - student.displacements(motion)
-            at_gaussians = (left[rig.faces[bound.face_index]] * weights).sum(1)
+            at_gaussians = on_triangles(left[rig.faces[bound.face_index]], bound.barycentric)
             residuals.append(torch.einsum("nij,ni->nj", local, at_gaussians)[shapes.active])
             poses.append(motion.pose)
         r, pose = torch.stack(residuals), torch.stack(poses)

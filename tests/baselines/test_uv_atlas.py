@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar.baselines.avatar_base import corner_weights
 from avatar.baselines.uv_atlas import REACH, _unrolled, cylinder_atlas
+from avatar.gaussians.binding import corner_weights
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from tests.baselines.moving_doll import template
 
@@ -17,7 +17,7 @@ SIZE = 64
 def unwrapped():
     bound = sample_on_mesh(template(), SamplingConfig(count=4000, hidden_density=1.0))
     corners = template().mesh.triangles[bound.face_index.numpy()]
-    points = (corner_weights(bound).double().numpy()[..., None] * corners).sum(axis=1)
+    points = (corner_weights(bound.barycentric).double().numpy()[..., None] * corners).sum(axis=1)
     return cylinder_atlas(template(), points, bound.face_index.numpy(), size=SIZE), points
 
 
