@@ -21,7 +21,7 @@ from avatar.evaluation.ablation import (
     row_figures,
     unfinished,
 )
-from avatar.evaluation.ablation_pieces import Workshop
+from avatar.evaluation.ablation_pieces import CLOTHED, Workshop
 from avatar.evaluation.ablation_plan import Row, ablation_pieces
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig
 from avatar.evaluation.image import load_metric
@@ -94,10 +94,11 @@ def ablate(
     folder = run / ABLATION
     weights = (preset.teacher.weights, preset.bake.weights, preset.compensate.weights)
     perceptual = load_metric(config.metric, device=how.device) if any(w.perceptual for w in weights) else None
+    shop = Workshop(scene.capture, scene.template, how.device)
     with own_run_folder(folder, (RESULTS_FILE,)):
         ablation = Ablation(
-            Workshop(scene.capture, scene.template, how.device),
-            ablation_pieces(preset, frame=scene.frame),
+            shop,
+            ablation_pieces(preset, frame=scene.frame, training_frames=len(shop.sequence(CLOTHED).train_frames)),
             folder,
             inputs=scene.digests,
             perceptual=perceptual,

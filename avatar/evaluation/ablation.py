@@ -1,7 +1,8 @@
 """The ablation: variants of the system trained on one capture, measured by one protocol, in one table.
 
     rows = ablation_rows(("paper",))
-    ablation = Ablation(Workshop(capture, template), ablation_pieces(preset, frame=0), Path("work"), inputs={})
+    pieces = ablation_pieces(preset, frame=0, training_frames=len(capture.splits.train_frames))
+    ablation = Ablation(Workshop(capture, template), pieces, Path("work"), inputs={})
     result = ablation.run(rows, EvaluationConfig())
     print(ablation_table(result).text())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -55,7 +56,7 @@ PAPER_ROWS: Mapping[str, Row] = {
         "no field: the mesh follows its joints alone, Gaussians learn from the teacher",
     ),
     "no-gaussians": Row("w/o Gau Non.", "bake", "the baked student without blend shapes"),
-    "no-teacher": Row("w/o Teacher", "no_teacher", "field and attributes learn from photographs by L_rec alone"),
+    "no-teacher": Row("w/o Teacher", "no_teacher", "field and attributes learn from photographs alone, by L_rec"),
     "full": Row("Full", "full", "teacher, bake, blend shapes"),
 }
 OPTION_ROWS: Mapping[str, Row] = {
@@ -107,11 +108,11 @@ def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
     return {name: row for name, row in ROWS.items() if name in chosen}
 
 
-def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
+def ablation_pieces(preset: TrainingPreset, *, frame: int, training_frames: int) -> dict[str, Piece]:
     """Every piece that rows may need, by name; a preset decides all sizes and iterations.
 
     Args:
-        frame: that Gaussians are fitted to.
+        frame: that Gaussians are fitted to. training_frames: number of them.
     """
     pieces: dict[str, Piece] = {}
     student = preset.student()
@@ -146,7 +147,7 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
     compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
     bake("no_field_bake", student=replace(student, field=None, control_points=0))
     compensate("no_field", "no_field_bake")
-    bake("no_teacher_bake", source="gaussians")
+    bake("no_teacher_bake", source="gaussians", iterations=_without_teacher(preset, training_frames))
     compensate("no_teacher", "no_teacher_bake", teacher="")
 
     if teacher.track is None:
@@ -167,6 +168,19 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int) -> dict[str, Piece]:
         bake("null_code_bake", null_share=max(preset.bake.null_share, NULL_SHARE))
         compensate("null_code", "null_code_bake", null=NULL_SHARE)
     return pieces | _baseline_pieces(preset, pieces)
+
+
+def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
+    """Steps of the bake from photographs alone.
+
+    Where the teacher's stage follows the surface, and rows with a teacher so compare with photographs in three
+    trainings, as many views as those three together; otherwise the bake's own, as in the paper.
+    """
+    teacher, bake = preset.teacher, preset.bake
+    if teacher.track is None:
+        return bake.iterations
+    seen = teacher.iterations * teacher.views + training_frames * teacher.track.steps * teacher.track.views
+    return bake.iterations + math.ceil(seen / bake.views)
 
 
 def _baseline_pieces(preset: TrainingPreset, pieces: Mapping[str, Piece]) -> dict[str, Piece]:

@@ -23,6 +23,8 @@ MEASURED = EvaluationConfig(
     protocol=ProtocolConfig(every=2, sets=("novel_view", "novel_pose")), metric="none", samples=0, speed_pictures=0,
     shown=1,
 )  # fmt: skip
+FRAMES = 4
+"""To train on."""
 SURFACE = replace(MEASURED, protocol=ProtocolConfig(every=9, sets=("novel_view",)), samples=500)
 """One frame: what can be seen of a mesh is found in many renderings."""
 
@@ -33,7 +35,7 @@ def shop(tmp_path_factory):
 
 
 def planned(shop: Workshop, folder, iterations: int = 3) -> Ablation:
-    return Ablation(shop, ablation_pieces(tiny_preset(iterations), frame=0), folder, inputs={})
+    return Ablation(shop, ablation_pieces(tiny_preset(iterations), frame=0, training_frames=FRAMES), folder, inputs={})
 
 
 @pytest.fixture(scope="module")
@@ -74,33 +76,48 @@ def test_what_the_papers_rows_leave_out(shop, tmp_path):
     assert all(pieces[name].ground == "naked" for name in closures["naked"])
     # Nothing else differs.
     assert pieces["no_field"] == replace(pieces["full"], student="no_field_bake")
-    assert pieces["no_teacher_bake"] == replace(pieces["bake"], source="gaussians")
+    alone = pieces["no_teacher_bake"]
+    assert alone == replace(pieces["bake"], source="gaussians", config=alone.config)
+    assert alone.config == replace(pieces["bake"].config, iterations=alone.config.iterations)
     assert pieces["naked"] == replace(pieces["full"], student="naked_bake", ground="naked")
+
+
+def test_the_row_without_a_teacher_sees_as_many_photographs():
+    preset = tiny_preset()
+    pieces = ablation_pieces(preset, frame=0, training_frames=FRAMES)
+    track, teacher, bake, alone = (
+        preset.teacher.track, preset.teacher, preset.bake, pieces["no_teacher_bake"].config,
+    )  # fmt: skip
+    seen = FRAMES * track.steps * track.views + teacher.iterations * teacher.views + bake.iterations * bake.views
+    assert seen <= alone.iterations * alone.views < seen + alone.views
+    # A preset like the paper's: its own bake.
+    paper = replace(preset, teacher=replace(teacher, track=None))
+    assert ablation_pieces(paper, frame=0, training_frames=FRAMES)["no_teacher_bake"].config == paper.bake
 
 
 def test_the_null_code_is_trained_only_where_the_preset_does_not(tmp_path):
     preset = tiny_preset()
-    assert ablation_pieces(preset, frame=0)["null_code"] == SamePiece(student="full")
+    assert ablation_pieces(preset, frame=0, training_frames=FRAMES)["null_code"] == SamePiece(student="full")
     without = replace(preset, bake=replace(preset.bake, null_share=0.0))
-    pieces = ablation_pieces(without, frame=0)
+    pieces = ablation_pieces(without, frame=0, training_frames=FRAMES)
     assert pieces["null_code_bake"].config.null_share > 0 and isinstance(pieces["bake"], BakePiece)
     assert pieces["bake"].config.null_share == 0
 
 
 def test_tracking_is_left_out_of_the_row_that_says_so(tmp_path):
     preset = tiny_preset()
-    pieces = ablation_pieces(preset, frame=2)
+    pieces = ablation_pieces(preset, frame=2, training_frames=FRAMES)
     assert pieces["teacher"].config.track.reference == 2 and pieces["untracked_teacher"].config.track is None
     assert pieces["untracked_bake"] == replace(pieces["bake"], source="untracked_teacher")
     without = replace(preset, teacher=replace(preset.teacher, track=None))
-    assert ablation_pieces(without, frame=2)["untracked"] == SamePiece(student="full")
+    assert ablation_pieces(without, frame=2, training_frames=FRAMES)["untracked"] == SamePiece(student="full")
 
 
 def test_a_change_makes_anew_what_depends_on_it_and_nothing_else(shop, tmp_path):
     old = planned(shop, tmp_path)
     preset = tiny_preset()
     changed = replace(preset, bake=replace(preset.bake, rate=1e-3))
-    new = Ablation(shop, ablation_pieces(changed, frame=0), tmp_path, inputs={})
+    new = Ablation(shop, ablation_pieces(changed, frame=0, training_frames=FRAMES), tmp_path, inputs={})
     for name in ("gaussians", "teacher", "naked_teacher", "outer_teacher"):
         assert new.key(name) == old.key(name)
     for name in ("bake", "full", "pruned", "no_teacher", "mlp"):

@@ -29,7 +29,9 @@ def trained(tmp_path_factory):
 
 def ablation_of(scene, folder, preset, *, digests=None) -> Ablation:
     shop = Workshop(scene.capture, scene.template)
-    return Ablation(shop, ablation_pieces(preset, frame=scene.frame), folder, inputs=digests or scene.digests)
+    return Ablation(
+        shop, ablation_pieces(preset, frame=scene.frame, training_frames=1), folder, inputs=digests or scene.digests
+    )
 
 
 def test_the_same_choices_are_taken_over_and_equal_what_would_be_trained(trained, tmp_path):
