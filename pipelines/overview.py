@@ -1,4 +1,4 @@
-"""The picture at the head of the README: one run from scan to driven template and fitted Gaussians.
+"""The picture at the head of the README: one run from scan to driven template and trained student.
 
 python -m pipelines.overview RUN --out docs/images/overview.png
 """
@@ -13,12 +13,14 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from pipelines.build_config import FIT_STAGE
-from pipelines.fit_pictures import read_strip
+from pipelines.evaluate_config import EVALUATE_STAGE
+from pipelines.evaluate_pictures import read_tiles
 from pipelines.pictures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
 from pipelines.scan_stages import load_params_of_run, load_scan
 from smplxpp.body.hard_poses import HARD_POSES, hard_poses
+from smplxpp.core.artifact import read_manifest
 from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.template import Template
@@ -31,9 +33,7 @@ class Overview:
     """Draw a finished run in one row."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` and `smplxpp fit-reference` wrote."""
-    view: str = "Cam004"
-    """Camera of the fit's previews to show."""
+    """Folder that `smplxpp build`, `smplxpp train` and `smplxpp evaluate` wrote."""
     out: Path = Path("docs/images/overview.png")
     """The picture."""
 
@@ -55,10 +55,27 @@ class Overview:
             ("high step", step, looks),
         ]
         pictures = [caption(_front(mesh, options), name) for name, mesh, options in cells]
-        strip = read_strip(self.run_folder / FIT_STAGE / "previews" / f"{self.view}.png")
-        photograph, rendered = _cut(strip[:2])
-        pictures += [caption(photograph, "photograph, held out"), caption(rendered, "Gaussians")]
+        photograph, skinned, student = _cut(_held_out_view(self.run_folder))
+        pictures += [caption(photograph, "held-out view")]
+        pictures += [caption(skinned, "Gaussians, skinned"), caption(student, "student")]
         atomic_write_bytes(self.out, encode_png(row(pictures, gap=4)))
+
+
+def _held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
+    manifest = read_manifest(run / EVALUATE_STAGE)
+    numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]
+    views = [shown for shown in numbers["views"] if shown["set"] == "novel_view"]
+    models = list(numbers["models"])
+    if not views or not {"reference-fit", "student"} <= set(models):
+        raise InputError(
+            "evaluation of the run",
+            expected="a reference fit and a student, measured on novel views",
+            received=f"{', '.join(models) or 'none'}, {len(views)} novel views",
+            remedy="run `smplxpp train` and `smplxpp evaluate`",
+        )
+    photograph, rendered = read_tiles(run / EVALUATE_STAGE / views[-1]["file"], len(models))
+    return photograph, rendered[models.index("reference-fit")], rendered[models.index("student")]
 
 
 def _cut(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:

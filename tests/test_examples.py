@@ -6,13 +6,19 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from avatar.export.splats import read_splat_ply
+from pipelines.build_template import build
+from pipelines.commands.build import Build
 from smplxpp import Template
+from smplxpp.core.errors import GeometryWarning
 
 ROOT = Path(__file__).resolve().parents[1]
 # What each must write into its folder.
@@ -22,14 +28,29 @@ FILES = {
     "03_metrics": {"comparison.json"},
     "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
     "05_fit_reference": {"run", "metrics.jsonl", "splats.ply", "Cam004.png"},
+    "06_train_a_student": {"fit", "teacher", "bake", "shapes", "student.safetensors", "new_pose.png"},
 }
 
+OF_A_RUN = ("06_train_a_student",)
+"""Take a run as their first argument."""
 
-def run_example(name: str, out: Path) -> str:
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with the embedded person's template."""
+    run = tmp_path_factory.mktemp("built") / "run"
+    command = Build(out=run, capture=ROOT / "data" / "fixtures" / "person")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # the small scan is repaired here and there
+        build(run, command.inputs(), command.config(), last="60_assemble")
+    return run
+
+
+def run_example(name: str, out: Path, *arguments: str) -> str:
     """Run an example from the repository's root; its output."""
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
     done = subprocess.run(
-        [sys.executable, "-W", "error", f"examples/{name}.py", "--out", str(out)],
+        [sys.executable, "-W", "error", f"examples/{name}.py", *arguments, "--out", str(out)],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -48,8 +69,9 @@ def test_every_example_is_listed_and_short() -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> None:
-    text = run_example(name, tmp_path / "out")
+def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    run = [str(request.getfixturevalue("built"))] if name in OF_A_RUN else []
+    text = run_example(name, tmp_path / "out", *run)
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
     check = {
         "01": check_build,
@@ -57,6 +79,7 @@ def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> No
         "03": check_metrics,
         "04": check_animate,
         "05": check_fit_reference,
+        "06": check_train,
     }[name[:2]]
     check(text, tmp_path / "out")
 
@@ -95,3 +118,13 @@ def check_fit_reference(text: str, out: Path) -> None:
     psnr, ssim = numbers(r"PSNR (\S+) dB, SSIM (\S+)", text)
     assert psnr > 19.0 and ssim > 0.93
     assert len(read_splat_ply(out / "splats.ply")) == 50_000
+
+
+def check_train(text: str, out: Path) -> None:
+    count, megabytes = numbers(r"(\d+) Gaussians, (\S+) MB", text)
+    assert count == 15_000 and (out / "student.safetensors").stat().st_size == pytest.approx(1e6 * megabytes, abs=1e5)
+    with Image.open(out / "new_pose.png") as image:
+        photograph, drawn = np.split(np.asarray(image, dtype=float), 2, axis=1)
+    person = photograph.max(-1) > 16
+    mean_square = np.square(drawn - photograph)[person].mean()
+    assert 10 * np.log10(255**2 / mean_square) > 15.0  # a twentieth of the steps

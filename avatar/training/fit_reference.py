@@ -46,14 +46,14 @@ class FitScene:
 
     Attributes:
         template: the clothed body. vertices: (V, 3) of it in the frame's pose, metres.
-        train, held_out: whole views; `held_out` may be empty.
+        train, held_out: whole views; `held_out` are measured.
         background: (3,) sRGB in [0, 1] behind the person.
     """
 
     template: Template
     vertices: np.ndarray
     train: Sequence[View]
-    held_out: Sequence[View]
+    held_out: Sequence[View] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:

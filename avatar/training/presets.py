@@ -59,10 +59,12 @@ class TrainingPreset:
         def fewer(iterations: int) -> int:
             return max(1, round(share * iterations))
 
+        track = self.teacher.track
+        teacher = replace(self.teacher, track=track and track.shortened(share))
         return replace(
             self,
             fit=replace(self.fit, iterations=fewer(self.fit.iterations)),
-            teacher=with_iterations(self.teacher, fewer(self.teacher.iterations)),
+            teacher=with_iterations(teacher, fewer(teacher.iterations)),
             bake=with_iterations(self.bake, fewer(self.bake.iterations)),
             compensate=replace(self.compensate, iterations=fewer(self.compensate.iterations)),
         )

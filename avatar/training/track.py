@@ -7,7 +7,7 @@ all frames at once into the wrong stripe. From one frame to the next the way is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -74,6 +74,11 @@ class TrackConfig:
     def steps(self) -> int:
         """Of one frame."""
         return sum(level.steps for level in self.levels)
+
+    def shortened(self, share: float) -> TrackConfig:
+        """With `share` of the steps of every level."""
+        levels = tuple(replace(level, steps=max(1, round(share * level.steps))) for level in self.levels)
+        return replace(self, levels=levels)
 
 
 class TrackTask(ViewTask):

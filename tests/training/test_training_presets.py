@@ -39,12 +39,16 @@ def test_a_share_is_one_of_the_iterations_alone(name):
     for stage in STAGES:
         own, short = getattr(preset, stage), getattr(tenth, stage)
         assert short.iterations == round(0.1 * own.iterations)
-        same = {"iterations": own.iterations} | ({"pretrain": own.pretrain} if hasattr(own, "pretrain") else {})
+        same = {"iterations": own.iterations}
+        same |= {name: getattr(own, name) for name in ("pretrain", "track") if hasattr(own, name)}
         assert replace(short, **same) == own
     for stage in ("teacher", "bake"):
         own, short = getattr(preset, stage), getattr(tenth, stage)
         share = short.iterations / own.iterations
         assert short.pretrain == (None if own.pretrain is None else own.pretrain.shortened(share))
+    track, short = preset.teacher.track, tenth.teacher.track
+    assert short == (None if track is None else track.shortened(0.1))
+    assert track is None or [level.steps for level in short.levels] == [round(0.1 * x.steps) for x in track.levels]
     assert all(getattr(preset.shortened(1e-9), stage).iterations == 1 for stage in STAGES)
 
 

@@ -1,0 +1,60 @@
+"""From a template and photographs to a student, and the student in a pose it has not seen: `smplxpp train`, in Python.
+
+smplxpp build --capture data/fixtures/person --out RUN
+python examples/06_train_a_student.py RUN --share 1
+"""
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import smplxpp
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.models.rig import Rig
+from avatar.render.avatar_view import render_view
+from avatar.training import FitScene, fit_reference, read_views
+from avatar.training.presets import training_preset
+from avatar.training.sequence import AvatarSequence
+from avatar.training.train import Session, bake, compensate, fit_teacher
+from smplxpp.capture import open_capture
+
+PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of `smplxpp build --capture data/fixtures/person`")
+    parser.add_argument("--share", type=float, default=0.1, help="of the steps of the preset demo")
+    parser.add_argument("--out", type=Path, help="folder of the result; by default a new temporary one")
+    options = parser.parse_args()
+    out = options.out or Path(tempfile.mkdtemp(prefix="smplxpp_"))
+    capture = open_capture(PERSON)
+    template = smplxpp.Template.load(options.run / "60_assemble" / "smplxpp.npz")
+    preset = training_preset("demo").shortened(options.share)
+    sequence = AvatarSequence(capture, template)
+    scene = FitScene(template, template.pose(capture.params(0))[0], read_views(capture, 0, sequence.train_cameras))
+    fitted = fit_reference(scene, preset.fit, out / "fit").gaussians
+    teacher, _ = fit_teacher(sequence, fitted, preset.networks.teacher, preset.teacher, Session(out / "teacher"))
+    start = teacher.gaussians.snapshot()
+    baked, _ = bake(sequence, start, preset.student(), preset.bake, Session(out / "bake"), teacher=teacher)
+    shapes = replace(preset.blend_shapes, expression_size=sequence.rig.expression_size)
+    student, _ = compensate(sequence, baked, shapes, preset.compensate, Session(out / "shapes"), teacher=teacher)
+    size = save_avatar(out / "student.safetensors", student, compact=True)  # with the template, all a player needs
+    player = load_avatar(out / "student.safetensors", Rig(template))
+    frame = capture.splits.novel_pose_frames[0]
+    (view,) = read_views(capture, frame, capture.splits.novel_view_cameras[:1])
+    with torch.no_grad():
+        avatar = player(player.rig.motion(capture.params(frame)), view.position[None])
+        drawn = render_view(avatar, 0, view, torch.zeros(3)).image.clamp(0, 1)
+    pair = np.hstack([view.photograph((0.0, 0.0, 0.0)), (255 * drawn).round().byte().numpy()])
+    Image.fromarray(pair).save(out / "new_pose.png")
+    print(f"{len(avatar.bound)} Gaussians, {size / 1e6:.1f} MB; written {out}/student.safetensors and new_pose.png")
+
+
+if __name__ == "__main__":
+    main()
