@@ -48,7 +48,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_example(name: str, out: Path, *arguments: str) -> str:
     """Run an example from the repository's root; its output."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-W", "error", f"examples/{name}.py", *arguments, "--out", str(out)],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False,
