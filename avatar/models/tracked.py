@@ -16,6 +16,9 @@ from avatar.models.posed import PosedAvatar
 from avatar.models.rig import Motion, Rig
 from avatar.models.sparse_rows import SparseRows
 
+STILL = 1e-3
+"""Metres: motion off the clothes much below this costs nearly nothing."""
+
 
 class ControlCage(nn.Module):
     """Interpolates displacements of K control points of a template to its vertices, part by part.
@@ -31,6 +34,7 @@ class ControlCage(nn.Module):
         self.count = len(control.vertices)
         weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
         self.rows = SparseRows(neighbours, weights, self.count)
+        self.register_buffer("off_clothes", ~rig.cloth_mask[torch.as_tensor(control.vertices, device=rig.device)])
         # Two control points are neighbours if some vertex has them as its two nearest.
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
@@ -42,6 +46,11 @@ class ControlCage(nn.Module):
     def roughness(self, controls: Tensor) -> Tensor:
         """Mean squared difference of neighbours, square metres."""
         return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
+
+    def motion_off_clothes(self, controls: Tensor) -> Tensor:
+        """Mean distance, metres, by which points of body, hair and shoes leave skinning; 0 where there are none."""
+        moved = controls[self.off_clothes].square().sum(-1)
+        return ((moved + STILL**2).sqrt() - STILL).sum() / max(len(moved), 1)
 
 
 class TrackedAvatar(nn.Module):
@@ -77,7 +86,8 @@ class Track:
     """A surface followed through frames.
 
     Attributes:
-        row: of every frame. controls: (T, K, 3) metres. cage: interpolates them.
+        row: of every frame. cage: interpolates the controls.
+        controls: (T, K, 3) metres, 0 in the frame whose surface the template is.
     """
 
     row: dict[int, int]

@@ -84,11 +84,12 @@ _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 
 @dataclass(frozen=True)
 class _Size:
-    """What tells one preset for two cores from another: Gaussians, control points, iterations of every training."""
+    """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations."""
 
     gaussians: int
     control_points: int
     track: tuple[Level, ...]
+    still: float
     pretrain: int
     fit: int
     teacher: int
@@ -114,7 +115,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             rate=2e-3,
             attributes=1.0,
             weights=_LEAN_WEIGHTS,
-            track=TrackConfig(levels=size.track, control_points=size.control_points),
+            track=TrackConfig(levels=size.track, control_points=size.control_points, still=size.still),
         ),
         bake=BakeConfig(
             iterations=size.bake,
@@ -161,6 +162,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             gaussians=50_000,
             control_points=2400,
             track=TrackConfig().levels,
+            still=0.0,
             pretrain=500,
             fit=600,
             teacher=500,
@@ -174,6 +176,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             gaussians=15_000,
             control_points=800,
             track=(Level(1, 12, 5e-3), Level(0, 12, 2e-3)),
+            still=2.0,
             pretrain=100,
             fit=100,
             teacher=60,

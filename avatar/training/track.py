@@ -46,9 +46,12 @@ class TrackConfig:
         levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
         control_points: on the template. views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
+        still: weight of the mean distance that control points off the clothes move, a metre: parameters say where the
+            body is, and few pixels cannot tell better. Not applied to a template without clothes.
         extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
-        reference: frame to begin with, where the Gaussians were fitted; None: the first training frame.
+        reference: frame to begin with, whose surface the template is and where the Gaussians were fitted; None: the
+            first training frame.
         seed: of the order of views.
     """
 
@@ -56,6 +59,7 @@ class TrackConfig:
     control_points: int = 2400
     views: int = 4
     smoothness: float = 80.0
+    still: float = 0.0
     extrapolation: float = 1.0
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
@@ -66,7 +70,7 @@ class TrackConfig:
     def __post_init__(self) -> None:
         if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.rate <= 0 for level in self.levels):
             raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
-        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("extrapolation", 0)):
+        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("still", 0), ("extrapolation", 0)):
             if not getattr(self, name) >= least:
                 raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
 
@@ -133,11 +137,14 @@ class TrackTask(ViewTask):
         return views
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """`L_rec` and the roughness of the displacements."""
+        """`L_rec`, the roughness of the displacements, and how far the body moves."""
         views = self.views(item)
         posed = self.avatar(self.sequence.motion(item.frame), eyes_of(views))
         total, terms, _ = self.compared(posed, views)
-        total = total + self.track_config.smoothness * self.avatar.cage.roughness(self.avatar.controls)
+        cage, controls = self.avatar.cage, self.avatar.controls
+        total = total + self.track_config.smoothness * cage.roughness(controls)
+        if self.track_config.still and not cage.off_clothes.all():
+            total = total + self.track_config.still * cage.motion_off_clothes(controls)
         return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
@@ -180,5 +187,8 @@ class TrackTask(ViewTask):
         self.solved.copy_(tensors["solved"])
 
     def track(self) -> Track:
-        """What was found."""
-        return Track(self.row, self.solved.clone(), self.avatar.cage)
+        """What was found, less what was found in the first frame.
+
+        There the template is the surface: what images ask of it is an error of the Gaussians, in all frames alike.
+        """
+        return Track(self.row, self.solved - self.solved[self.row[self.order[0]]], self.avatar.cage)

@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from avatar.gaussians.binding import world_from_local
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked import Track, TrackedAvatar
 from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.pretrain import PretrainConfig, PretrainTeacherTask
+from avatar.training.sequence import AvatarSequence
 from avatar.training.track import Level, TrackConfig, TrackTask
 from avatar.training.train import Session, fit_teacher, follow_surface
 from smplxpp.core.errors import InputError
@@ -65,6 +67,31 @@ def test_the_swing_is_found(frames, track):
         assert error(frames, frame, track.displacements(frame)) < 0.5 * error(frames, frame)
 
 
+def test_the_template_is_the_surface_of_the_first_frame(frames, tmp_path):
+    found, _ = follow_surface(frames, painted(), replace(CONFIG, reference=2), Session(tmp_path))
+    assert not found.displacements(2).any() and found.displacements(1).any()
+
+
+def test_with_a_prior_the_body_stays_and_the_dress_swings(frames, track, tmp_path):
+    found, _ = follow_surface(frames, painted(), replace(CONFIG, still=2.0), Session(tmp_path))
+    body = ~torch.tensor(template().cloth_mask)
+    for frame in (1, 3):
+        free, held = (one.displacements(frame)[body].norm(dim=-1).mean() for one in (track, found))
+        assert held < 0.5 * free
+        assert error(frames, frame, found.displacements(frame)) < 0.5 * error(frames, frame)
+
+
+def test_without_clothes_there_is_no_prior(frames):
+    naked = AvatarSequence(frames.capture, template().naked())
+    bound = sample_on_mesh(naked.rig.template, SamplingConfig(count=300, sh_degree=1))
+    losses = []
+    for still in (0.0, 2.0):
+        made = TrackTask(naked, TrackedAvatar(naked.rig, bound, 8), replace(CONFIG, still=still))
+        made.avatar.controls.data.fill_(0.01)
+        losses.append(made.loss(made.items(0)[0])[0])
+    assert torch.equal(*losses)
+
+
 def test_frames_are_taken_from_the_reference_outwards(frames):
     made = TrackTask(
         frames, TrackedAvatar(frames.rig, gaussians(), CONFIG.control_points), replace(CONFIG, reference=2)
@@ -108,9 +135,10 @@ def test_resumed_in_the_middle_of_a_frame_bit_for_bit(frames):
 def test_networks_learn_what_was_followed_before_they_render(frames, track):
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
-    learning = PretrainTeacherTask(frames, teacher, PretrainConfig(iterations=60, batch=2, rate=1e-2), 0, track)
-    losses = [learning.step(k)["loss"] for k in range(60)]
-    assert np.mean(losses[-6:]) < 0.85 * np.mean(losses[:6])
+    learning = PretrainTeacherTask(frames, teacher, PretrainConfig(iterations=120, batch=2, rate=1e-2), 0, track)
+    losses = [learning.step(k)["loss"] for k in range(120)]
+    # Two steps see all frames; networks as small as these take up a tenth.
+    assert np.mean(losses[-2:]) < 0.93 * np.mean(losses[:2])
 
 
 def test_the_teacher_follows_first_within_its_time(frames, tmp_path):
@@ -131,7 +159,9 @@ def test_what_was_found_is_taken_up_without_a_step(frames, track, tmp_path):
     assert progress.finished and progress.session_seconds == 0.0
 
 
-@pytest.mark.parametrize("change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}])
+@pytest.mark.parametrize(
+    "change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}, {"still": -1.0}]
+)
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError):
         TrackConfig(**change)
