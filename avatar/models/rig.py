@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -75,11 +77,13 @@ class Rig:
         """
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
-        posed = self.template.posed_body(params)
+        # A BLAS thread that has done its part spins on; torch's threads, which come next, would wait for its core.
+        with _thread_pools().limit(limits=1, user_api="blas"):
+            posed = self.template.posed_body(params)
+            transforms = posed.posed_from_rest[0]
+            blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
         rest = self.template.vertices.astype(np.float32)
         rest[: self.template.body_vertex_count] = posed.rest_vertices[0]
-        transforms = posed.posed_from_rest[0]
-        blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
         expression = np.zeros(self.expression_size)
         expression[: params.expression.shape[1]] = params.expression[0]
         return Motion(
@@ -106,6 +110,11 @@ class Rig:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=self.device)
+
+
+@cache
+def _thread_pools() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 class _Skinning(torch.autograd.Function):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import ThreadpoolController
 
 from avatar.models.rig import Rig
 from smplxpp.core.errors import InputError
@@ -80,6 +81,17 @@ def test_the_null_code_changes_the_frame_alone():
     null = motion.without_code()
     assert (motion.frame, null.frame) == (2, None)
     assert replace(null, frame=2).pose is motion.pose and null.rest is motion.rest
+
+
+def test_blas_works_on_one_thread_and_has_the_others_back(monkeypatch):
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in ThreadpoolController().info() if pool["user_api"] == "blas"}
+
+    it, within, before = template(), [], threads()
+    posed_body = type(it).posed_body
+    monkeypatch.setattr(type(it), "posed_body", lambda *given: within.append(threads()) or posed_body(*given))
+    Rig(it).motion(dance().frame(0))
+    assert within == [{1}] and threads() == before
 
 
 def test_several_frames_are_refused():
