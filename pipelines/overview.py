@@ -55,13 +55,13 @@ class Overview:
             ("high step", step, looks),
         ]
         pictures = [caption(_front(mesh, options), name) for name, mesh, options in cells]
-        photograph, skinned, student = _cut(_held_out_view(self.run_folder))
+        photograph, skinned, student = _cut(held_out_view(self.run_folder))
         pictures += [caption(photograph, "held-out view")]
         pictures += [caption(skinned, "Gaussians, skinned"), caption(student, "student")]
         atomic_write_bytes(self.out, encode_png(row(pictures, gap=4)))
 
 
-def _held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
     manifest = read_manifest(run / EVALUATE_STAGE)
     numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]

@@ -24,8 +24,10 @@ from pipelines.commands import evaluate as command
 from pipelines.evaluate_config import MODEL_FILES
 from pipelines.evaluate_pictures import read_tiles, surface_picture, write_tiles
 from pipelines.evaluate_report import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.overview import held_out_view
 from pipelines.report import Report, write_report
 from smplxpp.core.artifact import read_manifest, sha256_file
+from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.template import Template
 from tests.evaluation.standing_doll import FRAMES, dressed, write_frames
@@ -241,3 +243,16 @@ def test_the_fixture_from_its_build_to_the_page(tmp_path, capsys):
     assert fit["psnr"] > 12.0 and fit["psnr"] > student["psnr"]
     html = (run / "report.html").read_text()
     assert "Avatar: figures" in html and "Avatar: side by side" in html
+
+
+def test_the_overview_shows_the_last_novel_view(evaluated, tmp_path):
+    photograph, skinned, student = held_out_view(evaluated)
+    assert photograph.shape == skinned.shape == student.shape and photograph.dtype == np.uint8
+    shown = [one for one in read_manifest(evaluated / "95_evaluate")["numbers"]["views"] if one["set"] == "novel_view"][
+        -1
+    ]
+    truth, rendered = read_tiles(evaluated / "95_evaluate" / shown["file"], 2)
+    for found, expected in ((photograph, truth), (skinned, rendered[0]), (student, rendered[1])):
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(InputError, match="Run `smplxpp train` and `smplxpp evaluate`"):
+        held_out_view(write_dressed(tmp_path / "bare"))
