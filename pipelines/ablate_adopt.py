@@ -79,7 +79,8 @@ def adopt_trained(
             numbers = manifest["numbers"]
             spent = ("seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining")
             seconds = sum(numbers.get(name, 0.0) for name in spent)
-            ablation.adopt(stage.piece, path, seconds=seconds, iterations=numbers["iterations"])
+            iterations = numbers["iterations"] + numbers.get("iterations_before", 0)
+            ablation.adopt(stage.piece, path, seconds=seconds, iterations=iterations)
             taken.append(stage.piece)
     if taken:
         log.info("ablation: taken from the run: %s", ", ".join(taken))

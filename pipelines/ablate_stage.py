@@ -98,7 +98,12 @@ def ablate(
     with own_run_folder(folder, (RESULTS_FILE,)):
         ablation = Ablation(
             shop,
-            ablation_pieces(preset, frame=scene.frame, training_frames=len(shop.sequence(CLOTHED).train_frames)),
+            ablation_pieces(
+                preset,
+                frame=scene.frame,
+                training_frames=len(shop.sequence(CLOTHED).train_frames),
+                built_frame=scene.built_frame,
+            ),
             folder,
             inputs=scene.digests,
             perceptual=perceptual,

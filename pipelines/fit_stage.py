@@ -173,8 +173,11 @@ def open_cameras(inputs: FitInputs) -> tuple[Capture, tuple[str, ...], tuple[str
         raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
     if inputs.scale != 1.0:
         capture = capture.resized(inputs.scale)
-    held_out = inputs.hold_out or capture.splits.novel_view_cameras
-    train = tuple(name for name in capture.cameras if name not in held_out)
+    splits = capture.splits
+    held_out = inputs.hold_out or splits.novel_view_cameras
+    # Cameras that the splits hold out and the option does not are trained on; those of neither are not.
+    known = {*splits.train_cameras, *splits.novel_view_cameras}
+    train = tuple(name for name in capture.cameras if name in known and name not in held_out)
     if not train:
         raise InputError("cameras", expected="at least one to train on", received="all held out")
     return capture, train, tuple(held_out)

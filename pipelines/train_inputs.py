@@ -58,6 +58,7 @@ class TrainScene:
         template: of the run.
         capture: its splits are what is trained on and held out; unusable frames and views are left out.
         frame: the reference frame of the fit.
+        built_frame: the one that the template was built from, if it is trained on; then both are one.
         overlap: mean IoU of silhouettes and masks in `CHECKED_FRAMES` training frames.
         digests: SHA-256 by name of everything that is read.
     """
@@ -65,6 +66,7 @@ class TrainScene:
     template: Template
     capture: Capture
     frame: int
+    built_frame: int | None
     overlap: float
     digests: dict[str, str]
 
@@ -92,14 +94,15 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)
-    frame = built[0].frame if built is not None and built[0].frame in frames else frames[0]
+    built_frame = built[0].frame if built is not None and built[0].frame in frames else None
+    frame = frames[0] if built_frame is None else built_frame
     for name in capture.splits.train_cameras:
         if capture.file(name, frame) is not None:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
     digests = {TEMPLATE: sha256_file(path), **_digests(capture, params)}
-    return TrainScene(template, capture, frame, overlap, digests)
+    return TrainScene(template, capture, frame, built_frame, overlap, digests)
 
 
 def _opened(inputs: TrainInputs) -> Capture:

@@ -125,6 +125,7 @@ def stage_output(
         "convention": CONVENTION,
         "seconds_of_tracking": seconds[TRACK],
         "seconds_of_pretraining": seconds[PRETRAIN],
+        "iterations_before": sum(lines[-1]["iteration"] for lines in before.values() if lines),
         "measured_at": end.get("iteration"),
         "start": {kind: start[kind] for kind in KINDS if kind in start},
         **found,

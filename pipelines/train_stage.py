@@ -21,7 +21,7 @@ from avatar.models.model_file import load_avatar
 from avatar.models.posed import AvatarModel
 from avatar.training.distributed import Distributed
 from avatar.training.loop import Progress
-from avatar.training.presets import TrainingPreset
+from avatar.training.presets import LOCAL, TrainingPreset
 from avatar.training.sequence import AvatarSequence
 from avatar.training.shortage import explain_shortage
 from avatar.training.train import Session, bake, compensate, fit_teacher
@@ -58,7 +58,6 @@ OWN_FIT = "train.json"
 ONE_STEP = 1e-9
 """Seconds: a training that is begun takes a step."""
 Shapes = Literal["full", "local", "pruned"]
-LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
 Bar = Callable[[str, int], AbstractContextManager[Callable[[Progress], None]]]
 
 
@@ -200,7 +199,7 @@ def _teacher(training: Training) -> StageRecord:
     gaussians = load_bound(_require(training, *needs), faces=training.scene.template.faces)
     config = preset.teacher
     if config.track is not None:
-        config = replace(config, track=replace(config.track, reference=training.scene.frame, seed=config.seed))
+        config = replace(config, track=replace(config.track, reference=training.scene.built_frame, seed=config.seed))
 
     def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
         return fit_teacher(sequence, gaussians, preset.networks.teacher, config, session)

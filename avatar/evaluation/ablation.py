@@ -194,7 +194,8 @@ class Ablation:
         log.info("ablation: training %s", name)
         piece, folder = self.pieces[name], self.folder / name
         if (folder / RECORD_FILE).is_file():
-            for stale in folder.rglob(METRICS_FILE):  # of a finished piece that no longer stands
+            # Of a finished piece that no longer stands; a training that is resumed keeps its own.
+            for stale in (*folder.rglob(METRICS_FILE), folder / RECORD_FILE):
                 stale.unlink()
         session = Session(
             folder, key=self.key(name), perceptual=self.perceptual, max_seconds=end - time.monotonic(),

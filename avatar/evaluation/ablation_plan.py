@@ -24,10 +24,9 @@ from avatar.evaluation.ablation_pieces import (
     TeacherPiece,
 )
 from avatar.models.student import StudentConfig
-from avatar.training.presets import TrainingPreset
+from avatar.training.presets import LOCAL, TrainingPreset
 from smplxpp.core.errors import InputError
 
-LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
 PRUNED_SHARE, PRUNED_MEGABYTES = 0.3, 20.0
 CONTROL_POINTS = 400
 NULL_SHARE = 0.2
@@ -108,11 +107,14 @@ def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
     return {name: row for name, row in ROWS.items() if name in chosen}
 
 
-def ablation_pieces(preset: TrainingPreset, *, frame: int, training_frames: int) -> dict[str, Piece]:
+def ablation_pieces(
+    preset: TrainingPreset, *, frame: int, training_frames: int, built_frame: int | None = None
+) -> dict[str, Piece]:
     """Every piece that rows may need, by name; a preset decides all sizes and iterations.
 
     Args:
         frame: that Gaussians are fitted to. training_frames: number of them.
+        built_frame: the training frame whose surface the template is, if any.
     """
     pieces: dict[str, Piece] = {}
     student = preset.student()
@@ -133,7 +135,7 @@ def ablation_pieces(preset: TrainingPreset, *, frame: int, training_frames: int)
 
     teacher = preset.teacher
     if teacher.track is not None:
-        teacher = replace(teacher, track=replace(teacher.track, reference=frame, seed=teacher.seed))
+        teacher = replace(teacher, track=replace(teacher.track, reference=built_frame, seed=teacher.seed))
     for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
         fit = f"{prefix}gaussians"
         pieces[fit] = FitPiece(ground=ground, config=replace(preset.fit, evaluations=1), frame=frame)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.config import require_choice
 from avatar.models.deformation_field import FieldConfig
 from avatar.models.teacher import TeacherConfig
@@ -12,11 +11,10 @@ from avatar.models.teacher import TeacherConfig
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """Teacher and student of a preset."""
+    """Teacher and field of a preset."""
 
     teacher: TeacherConfig
     field: FieldConfig
-    blend_shapes: BlendShapeConfig
 
 
 _LEAN = {
@@ -41,8 +39,8 @@ _TEACHERS = {
 _FIELDS = {name: FieldConfig(local_pose=3) for name in ("cpu", "demo")}
 
 NETWORK_PRESETS = {
-    # The student has the paper's sizes in all of them: it is small already.
-    name: NetworkPreset(teacher, _FIELDS.get(name, FieldConfig()), BlendShapeConfig())
+    # The field has the paper's sizes in all of them: it is small already.
+    name: NetworkPreset(teacher, _FIELDS.get(name, FieldConfig()))
     for name, teacher in _TEACHERS.items()
 }
 

@@ -122,7 +122,7 @@ class Student(nn.Module):
 def _make_field(config: StudentConfig, rig: Rig) -> DeformationField:
     control = template_control_points(rig.template, config.control_points) if config.control_points else None
     steps = config.field.local_pose
-    seen = torch.tensor(seen_joints(rig.template, steps)) if steps else None
+    seen = torch.tensor(seen_joints(rig.template, steps), device=rig.device) if steps else None
     return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control, seen=seen)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -79,9 +80,9 @@ class TeacherAvatar(nn.Module):
 
     def remember(self, track: Track) -> None:
         """Keep the surface that was followed through the training frames; it is saved with the teacher."""
-        self.track = track
+        self.track = track = replace(track, controls=track.controls.to(self.rig.device))
         self.register_buffer("track_frames", torch.tensor(sorted(track.row, key=track.row.get), device=self.rig.device))
-        self.register_buffer("track_controls", track.controls.to(self.rig.device))
+        self.register_buffer("track_controls", track.controls)
 
     def centre(self, motions: Iterable[Motion]) -> None:
         """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""
@@ -96,9 +97,15 @@ class TeacherAvatar(nn.Module):
         self.mean_positions.copy_(mean)
         self.deviation.copy_(variance.sqrt().clamp(min=STILL))
 
+    @contextmanager
+    def _exact(self) -> Iterator[None]:
+        """Without gradients and in full precision: half of it would round positions in the world to millimetres."""
+        with torch.no_grad(), torch.autocast(self.rig.device.type, enabled=False):
+            yield
+
     def _root_positions(self, motion: Motion) -> tuple[Tensor, Tensor]:
         """Skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
-        with torch.no_grad():
+        with self._exact():
             to_root = motion.root_from_world
             vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
             return vertices, self.maps.interpolate(vertices)
@@ -112,7 +119,7 @@ class TeacherAvatar(nn.Module):
 
     def inputs(self, motion: Motion, eyes: Tensor) -> TeacherMaps:
         """Maps of a pose and of C cameras at `eyes` (C, 3); constants for gradients."""
-        with torch.no_grad():
+        with self._exact():
             to_root = motion.root_from_world
             vertices, positions = self._root_positions(motion)
             if not self.config.sees_view:

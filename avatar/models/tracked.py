@@ -87,7 +87,7 @@ class Track:
 
     Attributes:
         row: of every frame. cage: interpolates the controls.
-        controls: (T, K, 3) metres, 0 in the frame whose surface the template is.
+        controls: (T, K, 3) metres, 0 in a frame whose surface the template is.
     """
 
     row: dict[int, int]

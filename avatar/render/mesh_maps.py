@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from avatar.gaussians.native_kernels import is_native
 from avatar.render.barycentrics import barycentrics_reference, interpolate_reference
-from avatar.render.native_maps import BarycentricFunction, InterpolateFunction, is_native
+from avatar.render.native_maps import BarycentricFunction, InterpolateFunction
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.raster import MeshMaps, rasterize_triangles

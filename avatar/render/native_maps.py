@@ -17,11 +17,6 @@ from smplxpp.native import native_library
 from smplxpp.raster import MeshMaps
 
 
-def is_native(*tensors: Tensor) -> bool:
-    """Whether the kernels take these tensors: all float32 on the CPU."""
-    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
-
-
 class BarycentricFunction(torch.autograd.Function):
     """(V, 3) vertices -> barycentrics (H, W, 3) and depth (H, W) as rasterised, with their gradient to the vertices."""
 

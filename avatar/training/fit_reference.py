@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from avatar.gaussians.regularizers import offset_penalty, scale_penalty
 from avatar.gaussians.sampling import sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.losses.ssim import ssim
+from avatar.models.learned_gaussians import LEARNED
 from avatar.render.api import rasterize
 from avatar.training.fit_config import FitConfig
 from avatar.training.gradient_task import GradientTask, OptimiserConfig, ParameterGroup
@@ -37,7 +40,7 @@ from avatar.training.views import View
 from smplxpp.core.errors import InputError
 from smplxpp.core.template import Template
 
-LEARNED = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +128,18 @@ def fit_reference(
 
 
 def choose_device(name: str) -> str:
-    """ "cpu" or "cuda" for "auto", "cpu" or "cuda".
+    """ "cpu" or "cuda" for "auto", "cpu" or "cuda"; auto takes CUDA where it is and gsplat, which draws there.
 
     Raises:
         InputError: CUDA where there is none.
     """
     if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        if not torch.cuda.is_available():
+            return "cpu"
+        if find_spec("gsplat") is None:
+            log.warning("there is a GPU, but gsplat is not installed: training on the CPU (smplxpp[cuda] has it)")
+            return "cpu"
+        return "cuda"
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("option device", expected="a CUDA device that torch can use", received="none")
     return name

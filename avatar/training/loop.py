@@ -177,11 +177,13 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float
         for left in (*state.parent.glob(f".{state.stem}.*"), *state.parent.glob(f".{metrics.stem}.*")):
             left.unlink()  # half a file of a session that was killed while it wrote
         checkpoint = load_checkpoint(state, key=key)
-        if checkpoint is not None:
+        if checkpoint is not None and checkpoint.iteration:
             truncate_metrics(metrics, checkpoint.iteration)
             return checkpoint
-        metrics.unlink(missing_ok=True)
-        return Checkpoint(0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()})
+        metrics.unlink(missing_ok=True)  # before the first step the start is measured again
+        return checkpoint or Checkpoint(
+            0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()}
+        )
 
     checkpoint = task.distributed.from_first(start)
     task.restore(checkpoint.tensors)

@@ -18,6 +18,9 @@ from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.pretrain import PretrainConfig
 from avatar.training.track import Level, TrackConfig
 
+LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
+"""Of `BlendShapeConfig`, for local blend shapes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPreset:

@@ -21,7 +21,7 @@ from avatar.models.tracked import Track
 from avatar.render.mesh_maps import vertex_normals
 from avatar.training.byte_cache import ByteCache
 from avatar.training.gradient_task import GradientTask, OptimiserConfig, ParameterGroup
-from avatar.training.sequence import AvatarSequence, eyes_of
+from avatar.training.sequence import AvatarSequence
 from smplxpp.core.errors import InputError
 
 KNOWN_BYTES = 1 << 30
@@ -133,8 +133,9 @@ class PretrainTeacherTask(_PretrainTask):
         return self._known.get(frame, make)
 
     def _all_residuals(self, frame: int) -> Residuals:
-        camera = self.sequence.cameras(frame, 0, 1, self.seed)
-        eyes = eyes_of([self.sequence.view(name, frame) for name in camera])
+        cameras = self.sequence.cameras(frame, 0, 1, self.seed)
+        eyes = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
+        eyes = torch.tensor(eyes, dtype=torch.float32, device=self.sequence.device)
         with self.autocast():
             return self.teacher.residual_maps(self.sequence.motion(frame), eyes)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -72,15 +72,17 @@ class TeacherSource:
     def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
         """What the teacher shows in views of a frame."""
         keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
-        missing = [k for k, key in enumerate(keys) if key not in self._kept]
-        drawn: dict[int, tuple[Tensor, ...]] = {}
+        # Taken before others are put in, which may push them out.
+        lessons = {k: self._kept.get(key, tuple) for k, key in enumerate(keys) if key in self._kept}
+        missing = [k for k in range(len(keys)) if k not in lessons]
         if missing:
             with torch.no_grad():
                 eyes = eyes_of([views[k] for k in missing])
                 posed = self.teacher(self.sequence.motion(frame), eyes)
                 for index, k in enumerate(missing):
-                    drawn[k] = self._draw(posed, index, views[k])
-        return [_lesson(self._kept.get(key, lambda k=k: drawn[k])) for k, key in enumerate(keys)]
+                    draw = partial(self._draw, posed, index, views[k])
+                    lessons[k] = self._kept.get(keys[k], draw)
+        return [_lesson(lessons[k]) for k in range(len(keys))]
 
     def _draw(self, posed, index: int, view: View) -> tuple[Tensor, ...]:
         seen = render_view(

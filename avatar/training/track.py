@@ -50,8 +50,8 @@ class TrackConfig:
             body is, and few pixels cannot tell better. Not applied to a template without clothes.
         extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
-        reference: frame to begin with, whose surface the template is and where the Gaussians were fitted; None: the
-            first training frame.
+        reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
+            comes first.
         seed: of the order of views.
     """
 
@@ -90,6 +90,10 @@ class TrackTask(ViewTask):
 
     def __init__(self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, **options: Any) -> None:
         frames = sequence.train_frames
+        if config.reference is not None and config.reference not in frames:
+            raise InputError(
+                "tracking: reference", expected="a training frame, or None", received=f"frame {config.reference}"
+            )
         first = frames[0] if config.reference is None else config.reference
         self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
         self.row = {frame: row for row, frame in enumerate(frames)}
@@ -187,8 +191,11 @@ class TrackTask(ViewTask):
         self.solved.copy_(tensors["solved"])
 
     def track(self) -> Track:
-        """What was found, less what was found in the first frame.
+        """What was found, less what was found in the reference frame.
 
         There the template is the surface: what images ask of it is an error of the Gaussians, in all frames alike.
         """
-        return Track(self.row, self.solved - self.solved[self.row[self.order[0]]], self.avatar.cage)
+        solved = self.solved.clone()
+        if self.track_config.reference is not None:
+            solved -= self.solved[self.row[self.track_config.reference]]
+        return Track(self.row, solved, self.avatar.cage)

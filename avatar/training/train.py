@@ -35,7 +35,7 @@ CENTRED_ON = 256
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Where and how a training runs; nothing in it changes what comes out.
+    """Where and how a training runs; of all this the perceptual distance alone changes what comes out of its steps.
 
     Attributes:
         folder: for metrics and the checkpoint. key: names configuration and inputs.

@@ -172,17 +172,17 @@ class ViewTask(GradientTask):
                 for camera in cameras:
                     if self.sequence.capture.file(camera, frame) is None:
                         continue
-                    name = f"{camera} {frame}"
-                    quality[name], images[name] = self.measure(camera, frame)
+                    view, name = self.sequence.whole_view(camera, frame), f"{camera} {frame}"
+                    if view.alpha.any():  # a view of nobody measures nothing
+                        quality[name], images[name] = self.measure(view, frame)
             if quality:
                 out[kind] = mean_quality(quality)
         out["mean"] = out.get("novel_view", {})
         self.preview(images)
         return out
 
-    def measure(self, camera: str, frame: int) -> tuple[Any, np.ndarray]:
+    def measure(self, view: View, frame: int) -> tuple[Any, np.ndarray]:
         """Figures and the rendered uint8 image of a whole view."""
-        view = self.sequence.whole_view(camera, frame)
         with torch.no_grad():
             posed = self.model(self.sequence.motion(frame), eyes_of([view]))
             seen = render_view(posed, 0, view, self.sequence.background, eps2d=self.config.eps2d)

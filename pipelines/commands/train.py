@@ -39,7 +39,7 @@ class Train:
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
-    """paper: every number as published, for a GPU; gpu: smaller and some hours; cpu: two cores and an hour or two;
+    """paper: every number as published, for a GPU; gpu: smaller and some hours; cpu: two cores, half an hour;
     demo: minutes, to see whether all fits together."""
     stage: Annotated[
         Literal["teacher", "bake", "compensate"] | None,
@@ -119,7 +119,10 @@ class Train:
             def bar(name: str, total: int) -> AbstractContextManager:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
-            options = TrainOptions(stages=self.stages(), max_seconds=60.0 * self.max_minutes, force=self.force, bar=bar)
+            options = TrainOptions(
+                stages=self.stages(), max_seconds=60.0 * self.max_minutes, force=self.force,
+                tensorboard=self.tensorboard, bar=bar,
+            )  # fmt: skip
             records = train(self.run_folder, inputs, scene, config, options, together)
             if not together.first:
                 return None

@@ -143,7 +143,7 @@ def tiny_preset(iterations: int = 3) -> TrainingPreset:
     shared = {"iterations": iterations, "evaluations": 1, "evaluated": 1, "null_share": 0.2,
               "weights": ReconstructionWeights(perceptual=0.0, alpha=0.1)}  # fmt: skip
     return TrainingPreset(
-        networks=NetworkPreset(teacher, FieldConfig(width=16, hidden_layers=2, code_size=4), BlendShapeConfig()),
+        networks=NetworkPreset(teacher, FieldConfig(width=16, hidden_layers=2, code_size=4)),
         fit=FitConfig(sampling=SamplingConfig(count=500), iterations=iterations, margin=4),
         teacher=FitTeacherConfig(
             **{k: v for k, v in shared.items() if k != "null_share"},

@@ -106,7 +106,7 @@ def test_the_null_code_is_trained_only_where_the_preset_does_not(tmp_path):
 
 def test_tracking_is_left_out_of_the_row_that_says_so(tmp_path):
     preset = tiny_preset()
-    pieces = ablation_pieces(preset, frame=2, training_frames=FRAMES)
+    pieces = ablation_pieces(preset, frame=2, training_frames=FRAMES, built_frame=2)
     assert pieces["teacher"].config.track.reference == 2 and pieces["untracked_teacher"].config.track is None
     assert pieces["untracked_bake"] == replace(pieces["bake"], source="untracked_teacher")
     without = replace(preset, teacher=replace(preset.teacher, track=None))
@@ -191,6 +191,17 @@ def test_what_stands_is_not_done_again(finished, monkeypatch):
     (ablation.folder / "full" / "avatar.safetensors").rename(ablation.folder / "moved")
     assert unfinished(ablation, PAPER_ROWS, tuple(PAPER_ROWS)) == ["full"]
     (ablation.folder / "moved").rename(ablation.folder / "full" / "avatar.safetensors")
+
+
+def test_a_piece_that_is_made_anew_may_be_interrupted(shop, tmp_path):
+    rows = ablation_rows(("no-gaussians",))
+    planned(shop, tmp_path, iterations=2).run(rows, MEASURED)
+    anew = planned(shop, tmp_path, iterations=3)
+    for _ in range(200):  # a step or little more a call
+        result = anew.run(rows, MEASURED, max_seconds=0.05)
+        if not result.waiting:
+            break
+    assert not result.waiting and anew.record("bake")["iterations"] >= 3
 
 
 def test_an_interrupted_ablation_ends_with_the_same_weights(finished, shop, tmp_path):

@@ -30,7 +30,10 @@ def trained(tmp_path_factory):
 def ablation_of(scene, folder, preset, *, digests=None) -> Ablation:
     shop = Workshop(scene.capture, scene.template)
     return Ablation(
-        shop, ablation_pieces(preset, frame=scene.frame, training_frames=1), folder, inputs=digests or scene.digests
+        shop,
+        ablation_pieces(preset, frame=scene.frame, training_frames=1, built_frame=scene.built_frame),
+        folder,
+        inputs=digests or scene.digests,
     )
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from avatar.export.splats import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
+from avatar.training.fit_reference import choose_device
 from pipelines.cli import main
 from pipelines.commands import fit_reference as command
 from pipelines.commands import inspect
@@ -215,3 +218,21 @@ def test_the_terminal_shows_figures_and_where_things_are(own, capture, capsys):
     assert main(["fit-reference", str(own), "--capture", str(capture), *options]) == 0
     out = capsys.readouterr().out
     assert "mean, held out" in out and "stands, not run again" in out and "splats.ply" in out
+
+
+def test_cameras_that_the_splits_leave_out_are_not_trained_on(tmp_path, capture, capsys):
+    mine = shutil.copytree(capture, tmp_path / "capture")
+    about = json.loads((mine / "capture.json").read_text())
+    (mine / "capture.json").write_text(json.dumps({**about, "train_views": list(TRAIN[:2])}))
+    assert fit(write_run(tmp_path / "run"), mine, "--iterations", "1", "--scale", "0.5") == 0
+    numbers = json.loads(capsys.readouterr().out)
+    assert set(numbers["train"]) == set(TRAIN[:2]) and set(numbers["held_out"]) == set(HELD_OUT)
+
+
+def test_the_gpu_is_taken_where_gsplat_is(monkeypatch, caplog):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for found, device in ((None, "cpu"), (object(), "cuda")):
+        module = sys.modules["avatar.training.fit_reference"]  # the package has a function of this name
+        monkeypatch.setattr(module, "find_spec", lambda name, found=found: found)
+        assert choose_device("auto") == device and choose_device("cuda") == "cuda"
+    assert "gsplat is not installed" in caplog.text

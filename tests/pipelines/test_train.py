@@ -15,9 +15,11 @@ from avatar.models.model_file import load_avatar
 from avatar.models.rig import Rig
 from avatar.training.bake import BakeTask
 from avatar.training.presets import TRAINING_PRESETS
+from pipelines import train_stage
 from pipelines.cli import main
 from pipelines.fit_pictures import read_strip
 from smplxpp.core.artifact import read_manifest
+from smplxpp.core.errors import InputError
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
 from tests.training.dancing_doll import HELD_OUT, template, write_dance, write_dance_run
 
@@ -215,3 +217,16 @@ def test_torchrun_trains_with_two_processes(fitted, capture):
     for stage in STAGES:
         manifest = read_manifest(fitted / stage)
         assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["items"] >= 2
+
+
+def test_the_option_for_tensorboard_reaches_the_training(fitted, capture, monkeypatch):
+    asked = []
+
+    def stop(run, inputs, scene, config, options, together):
+        asked.append(options.tensorboard)
+        raise InputError("training", expected="none", received="one")
+
+    monkeypatch.setattr(train_stage, "train", stop)
+    for options in ((), ("--tensorboard",)):
+        assert train(fitted, capture, *options) == 2
+    assert asked == [False, True]

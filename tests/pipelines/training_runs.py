@@ -20,7 +20,7 @@ SMALL = (
 )  # fmt: skip
 DEMO = TRAINING_PRESETS["demo"]
 QUICK = replace(
-    DEMO, networks=NetworkPreset(TINY_TEACHER, TINY_FIELD, DEMO.blend_shapes),
+    DEMO, networks=NetworkPreset(TINY_TEACHER, TINY_FIELD),
     teacher=replace(DEMO.teacher, track=TrackConfig(levels=(Level(1, 2, 2e-3),), control_points=24)),
 )  # fmt: skip
 

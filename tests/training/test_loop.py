@@ -219,3 +219,11 @@ def test_metrics_survive_a_line_that_was_cut_short(tmp_path):
     truncate_metrics(path, 2)
     assert [json.loads(line)["iteration"] for line in path.read_text().splitlines()] == [0, 1, 2]
     assert read_metrics(tmp_path / "none") == []
+
+
+def test_a_training_that_stopped_before_its_first_step_logs_the_start_once(tmp_path):
+    run_training(Walk(), config(max_seconds=0.0), tmp_path, key="k")
+    run_training(Walk(), config(), tmp_path, key="k")
+    run_training(Walk(), config(), tmp_path / "whole", key="k")
+    logs = [read_metrics(folder / "metrics.jsonl") for folder in (tmp_path, tmp_path / "whole")]
+    assert without_times(logs[0]) == without_times(logs[1])

@@ -63,3 +63,19 @@ def test_nothing_is_kept_without_memory_and_lessons_are_the_same(frames):
 def test_without_normals_a_lesson_has_none(frames):
     lesson = source(frames, normals=False).lessons(0, [frames.view("Ring0", 0)])[0]
     assert lesson.target.normals is None and lesson.labels.shape[-1] == 3
+
+
+def test_a_lesson_that_another_pushes_out_is_still_given(frames):
+    whole = source(frames)
+    views = [frames.view(name, 0) for name in ("Ring0", "Ring1")]
+    first, second = whole.lessons(0, views)
+    size = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring0", *sizes(views[0])), tuple))
+    other = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring1", *sizes(views[1])), tuple))
+    small = source(frames, max_bytes=size + other - 1)
+    small.lessons(0, views[:1])  # the one that the next call finds, and loses
+    for found, expected in zip(small.lessons(0, views), (first, second), strict=True):
+        torch.testing.assert_close(found.target.image, expected.target.image)
+
+
+def sizes(view) -> tuple[int, int]:
+    return view.camera.width, view.camera.height

@@ -67,7 +67,7 @@ def test_the_swing_is_found(frames, track):
         assert error(frames, frame, track.displacements(frame)) < 0.5 * error(frames, frame)
 
 
-def test_the_template_is_the_surface_of_the_first_frame(frames, tmp_path):
+def test_the_template_is_the_surface_of_its_own_frame(frames, tmp_path):
     found, _ = follow_surface(frames, painted(), replace(CONFIG, reference=2), Session(tmp_path))
     assert not found.displacements(2).any() and found.displacements(1).any()
 
@@ -165,3 +165,13 @@ def test_what_was_found_is_taken_up_without_a_step(frames, track, tmp_path):
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError):
         TrackConfig(**change)
+
+
+def test_without_a_frame_of_the_templates_nothing_is_subtracted(frames, tmp_path):
+    found, _ = follow_surface(frames, painted(), CONFIG, Session(tmp_path))
+    assert found.displacements(0).any()
+
+
+def test_a_reference_that_is_not_trained_on_is_refused(frames):
+    with pytest.raises(InputError, match="frame 99"):
+        TrackTask(frames, TrackedAvatar(frames.rig, gaussians(), 24), replace(CONFIG, reference=99))

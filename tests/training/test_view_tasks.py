@@ -234,7 +234,7 @@ def test_held_out_views_and_poses_are_measured_and_shown(frames):
     assert set(figures) == {"mean", "novel_view", "novel_pose"} and figures["mean"] == figures["novel_view"]
     assert set(shown) == {"Held0 2", "Held0 5"}
     assert all(image.dtype == np.uint8 and image.shape == (64, 48, 3) for image in shown.values())
-    quality, image = task.measure("Held0", 5)
+    quality, image = task.measure(task.sequence.whole_view("Held0", 5), 5)
     assert quality.psnr == pytest.approx(figures["novel_pose"]["psnr"])
     np.testing.assert_array_equal(image, shown["Held0 5"])
 
@@ -284,3 +284,27 @@ def test_the_functions_train_from_the_seed_and_hand_the_avatar_on(frames, tmp_pa
         assert done.finished and torch.equal(before, torch.random.get_rng_state())
         found.append({**teacher.state_dict(), **{f"s.{n}": v for n, v in student.state_dict().items()}})
     assert same_state(*found) and not student.training
+
+
+def test_a_held_out_view_of_nobody_measures_nothing(frames, monkeypatch):
+    task = CompensateTask(frames, make("compensate", frames).student, COMPENSATE)
+    whole_view = type(frames).whole_view
+
+    def empty_in_the_last_pose(self, camera, frame):
+        view = whole_view(self, camera, frame)
+        return replace(view, alpha=torch.zeros_like(view.alpha)) if frame == 5 else view
+
+    monkeypatch.setattr(type(frames), "whole_view", empty_in_the_last_pose)
+    assert set(task.evaluate(0)) == {"mean", "novel_view"}
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16])
+def test_half_precision_is_the_networks_alone(frames, dtype):
+    teacher, motion = taught(frames), frames.motion(1)
+    eyes = torch.tensor([[0.3, 0.7, 2.2]])
+    exact, centre = teacher.inputs(motion, eyes), teacher.position_input(motion)
+    with torch.autocast("cpu", dtype=dtype):
+        half, half_centre = teacher.inputs(motion, eyes), teacher.position_input(motion)
+    assert torch.equal(half.positions, exact.positions) and torch.equal(half_centre, centre)
+    assert (half.cosines is None) == (exact.cosines is None)
+    assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)
