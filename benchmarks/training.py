@@ -41,7 +41,7 @@ KINDS = {
     "image loss": ("_Ssim", "l1_loss", "smooth_l1"),
     "networks": ("conv", "mkldnn", "mm", "addmm", "bmm", "linear", "relu", "_SymmetricFilter"),
     "maps and control points": ("_Bags", "embedding_bag", "InterpolateFunction", "BarycentricFunction"),
-    "skinning and Gaussians": ("FramesFunction", "WorldFunction", "ColorsFunction"),
+    "skinning and Gaussians": ("_Skinning", "FramesFunction", "WorldFunction", "ColorsFunction"),
     "optimiser": ("_fused", "_foreach", "Optimizer"),
 }
 """Of torch's operations, by what their names contain; the first kind that fits."""
