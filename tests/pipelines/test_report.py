@@ -218,3 +218,9 @@ def test_timings_are_in_proportion():
     widths = [float(w) for w in re.findall(r'class="bar"[^>]* width="([\d.]+)"', timings_svg({"a": 4.0, "b": 1.0}))]
     assert widths[0] == pytest.approx(4 * widths[1], rel=1e-2)
     assert timings_svg({}) == ""
+
+
+def test_what_needs_a_look_says_which_stage_found_it(page):
+    wanted = [check for check in sample_report().checks if check.status != "pass"]
+    shown = page[1].read_text().split("What needs a look")[1].split("</section>")[0]
+    assert wanted and shown.count("<small>65_validate") == len(wanted)
