@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,8 +13,9 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalInt, OptionalPath
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.training import Progress as TrainingProgress
@@ -69,9 +69,7 @@ class Ablate:
 
     def run(self) -> dict[str, Any]:
         """Train, measure, write and print the table."""
-        for package in ("torch", "safetensors"):
-            if find_spec(package) is None:
-                raise MissingExtraError(package, extra="avatar", purpose="training avatars")
+        require_avatar("training avatars")
         from avatar.evaluation.ablation_plan import ablation_rows
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig

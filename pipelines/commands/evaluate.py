@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
 
+from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalPath
 from pipelines.progress import counted_progress
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -66,9 +66,7 @@ class Evaluate:
 
     def run(self) -> dict:
         """Measure, write the report, print the tables."""
-        for package in ("torch", "safetensors"):
-            if find_spec(package) is None:
-                raise MissingExtraError(package, extra="avatar", purpose="evaluating avatars")
+        require_avatar("evaluating avatars")
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig
         from avatar.evaluation.report import EvalReport

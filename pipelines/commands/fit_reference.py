@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,10 +12,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalInt, OptionalPath
 from pipelines.progress import training_progress
 from smplxpp.core.artifact import StageRecord
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.training import FitConfig
@@ -64,9 +64,7 @@ class FitReference:
 
     def run(self) -> dict:
         """Fit, write the report, print the figures."""
-        for package in ("torch", "safetensors"):
-            if find_spec(package) is None:
-                raise MissingExtraError(package, extra="avatar", purpose="fitting Gaussians")
+        require_avatar("fitting Gaussians")
         from avatar.training import choose_device
         from pipelines.build_report import rewrite_report
         from pipelines.fit_stage import FitInputs, fit

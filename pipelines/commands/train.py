@@ -16,10 +16,11 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.build_config import FIT_STAGE
+from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath
 from pipelines.progress import training_progress
 from smplxpp.core.artifact import StageRecord
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.training.presets import TrainingPreset
@@ -97,9 +98,7 @@ class Train:
 
     def run(self) -> dict[str, Any] | None:
         """Train, write the report, print the figures; None on all but the first of several processes."""
-        for package in ("torch", "safetensors"):
-            if find_spec(package) is None:
-                raise MissingExtraError(package, extra="avatar", purpose="training an avatar")
+        require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
             logging.disable(logging.WARNING)  # the first process says it
         from avatar.training import choose_device

@@ -15,8 +15,7 @@ from avatar.export.splats import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
 from avatar.training.fit_reference import choose_device
 from pipelines.cli import main
-from pipelines.commands import fit_reference as command
-from pipelines.commands import inspect
+from pipelines.commands import extras, inspect
 from pipelines.commands.inspect import summarise_run
 from pipelines.fit_pictures import read_strip
 from pipelines.progress import training_progress
@@ -208,7 +207,7 @@ def test_a_template_that_stands_elsewhere_than_the_images_is_refused(tmp_path, c
 
 
 def test_a_missing_extra_is_named(fitted, capture, capsys, monkeypatch):
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     assert fit(fitted, capture) == 2
     assert "smplxpp[avatar]" in json.loads(capsys.readouterr().out)["error"]["message"]
 

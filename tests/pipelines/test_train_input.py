@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipelines.commands import extras
 from pipelines.commands import train as command
 from pipelines.train_inputs import TrainInputs, open_scene
 from smplxpp.core.artifact import read_manifest
@@ -188,7 +189,7 @@ def test_options_that_make_no_sense(run, original, capsys, options, word):
 
 
 def test_a_missing_extra_is_named(run, original, capsys, monkeypatch):
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     assert "smplxpp[avatar]" in refused(capsys, run, original)
 
 
