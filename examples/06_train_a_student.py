@@ -23,8 +23,6 @@ from avatar.training.sequence import AvatarSequence
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from smplxpp.capture import open_capture
 
-PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -33,13 +31,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of the result; by default a new temporary one")
     options = parser.parse_args()
     out = options.out or Path(tempfile.mkdtemp(prefix="smplxpp_"))
-    capture = open_capture(PERSON)
+    capture = open_capture(Path(__file__).parents[1] / "data" / "fixtures" / "person")
     template = smplxpp.Template.load(options.run / "60_assemble" / "smplxpp.npz")
     preset = training_preset("demo").shortened(options.share)
     sequence = AvatarSequence(capture, template)
     scene = FitScene(template, template.pose(capture.params(0))[0], read_views(capture, 0, sequence.train_cameras))
     fitted = fit_reference(scene, preset.fit, out / "fit").gaussians
-    teacher, _ = fit_teacher(sequence, fitted, preset.networks.teacher, preset.teacher, Session(out / "teacher"))
+    config = replace(preset.teacher, track=replace(preset.teacher.track, reference=0))  # the template is of frame 0
+    teacher, _ = fit_teacher(sequence, fitted, preset.networks.teacher, config, Session(out / "teacher"))
     start = teacher.gaussians.snapshot()
     baked, _ = bake(sequence, start, preset.student(), preset.bake, Session(out / "bake"), teacher=teacher)
     shapes = replace(preset.blend_shapes, expression_size=sequence.rig.expression_size)

@@ -3,8 +3,7 @@
     rows = ablation_rows(("paper",))
     pieces = ablation_pieces(preset, frame=0, training_frames=len(capture.splits.train_frames))
     ablation = Ablation(Workshop(capture, template), pieces, Path("work"), inputs={})
-    result = ablation.run(rows, EvaluationConfig())
-    print(ablation_table(result).text())
+    table = ablation_table(ablation.run(rows, EvaluationConfig())).text()
 
 Every piece and every row is made once and kept; the same call goes on where it was interrupted.
 """

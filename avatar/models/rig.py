@@ -114,6 +114,7 @@ class Rig:
 
 @cache
 def _thread_pools() -> ThreadpoolController:
+    """Looks through all loaded libraries: once, not for every pose."""
     return ThreadpoolController()
 
 
