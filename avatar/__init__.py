@@ -1,1 +1,49 @@
-"""The trainer of the compact avatar: rasteriser, Gaussians on the template, losses, networks, training, export."""
+"""The avatar trained on an SMPLX++ template: Gaussians on its triangles, a teacher, a student, what measures them.
+
+The names below are loaded when they are first used, so that importing the package is quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_EXPORTS: dict[str, str] = {
+    "AvatarSequence": "avatar.data.sequence",
+    "BoundGaussians": "avatar.gaussians",
+    "EvaluationConfig": "avatar.evaluation.evaluate",
+    "FitConfig": "avatar.training.reference_fit.config",
+    "FitScene": "avatar.training.reference_fit.fit",
+    "ProtocolConfig": "avatar.evaluation.protocol",
+    "Rig": "avatar.rig.rig",
+    "SamplingConfig": "avatar.gaussians",
+    "Session": "avatar.training.train",
+    "Student": "avatar.models.student",
+    "TeacherAvatar": "avatar.models.teacher_avatar",
+    "bake": "avatar.training.train",
+    "compensate": "avatar.training.train",
+    "evaluate_models": "avatar.evaluation.evaluate",
+    "fit_reference": "avatar.training.reference_fit.fit",
+    "fit_teacher": "avatar.training.train",
+    "load_avatar": "avatar.models.model_file",
+    "mean_quality": "avatar.metrics.view_quality",
+    "rasterize": "avatar.render",
+    "read_views": "avatar.data.views",
+    "render_view": "avatar.render.avatar_view",
+    "sample_on_mesh": "avatar.gaussians",
+    "save_avatar": "avatar.models.model_file",
+    "training_preset": "avatar.training.presets",
+    "write_splat_ply": "avatar.export",
+}
+
+__all__ = [*_EXPORTS]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'avatar' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

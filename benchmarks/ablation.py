@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from benchmarks.machine import store_results
-from pipelines.ablate_stage import ABLATION, RESULTS_FILE
+from pipelines.ablation.stage import ABLATION, RESULTS_FILE
 from pipelines.commands.ablate import Ablate
 from pipelines.commands.options import OptionalPath
 from smplxpp.core.errors import InputError
@@ -59,10 +59,11 @@ def read_results(run: Path) -> dict[str, Any]:
     results = json.loads(path.read_text()) if path.is_file() else {}
     if not results.get("rows") or results["waiting"]:
         raise InputError(
-            f"ablation of {run}", expected="finished rows",
+            f"ablation of {run}",
+            expected="finished rows",
             received=f"still to train: {', '.join(results['waiting'])}" if results.get("waiting") else "none",
             remedy="make them with `smplxpp ablate --run RUN --capture DIR`",
-        )  # fmt: skip
+        )
     return results
 
 
@@ -72,11 +73,14 @@ def figures(results: dict[str, Any]) -> dict[str, Any]:
     rows = {
         row["title"]: {
             "what": row["note"],
-            **{key: value if value is None else float(f"{value:.5g}") for key, value in row["figures"].items()
-               if "." not in key or key.startswith("surface.") or key.split(".")[-1] in SHOWN},
+            **{
+                key: value if value is None else float(f"{value:.5g}")
+                for key, value in row["figures"].items()
+                if "." not in key or key.startswith("surface.") or key.split(".")[-1] in SHOWN
+            },
         }
         for row in results["rows"].values()
-    }  # fmt: skip
+    }
     return {
         "capture": results["evaluation"]["capture"],
         "scale": results["scale"],

@@ -27,7 +27,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors, view_colors_reference
 from benchmarks.machine import store_results
 from benchmarks.viewer_check import build_fixture
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 COUNTS = (50_000, 220_000)
 LEAVES = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")

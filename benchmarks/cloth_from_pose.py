@@ -19,15 +19,15 @@ import torch
 import tyro
 from torch import Tensor
 
-from avatar.evaluation.geometry import surface_quality
+from avatar.data.sequence import AvatarSequence
+from avatar.metrics.surface_quality import surface_quality
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
-from avatar.training.sequence import AvatarSequence
 from benchmarks.machine import store_results
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 JOINTS = {"hips": (1, 2), "legs and spine": (1, 2, 3, 4, 5, 6), "all joints": tuple(range(1, 22))}
 LAGS = {"now": (0,), "last third of a second": (0, 2, 4, 7)}
@@ -74,8 +74,12 @@ class _Scene:
         self.rig = self.sequence.rig
         teacher = load_avatar(run / "80_teacher" / "teacher.safetensors", self.rig)
         if teacher.track is None:
-            raise InputError("teacher", expected="one that followed the surface first", received="no followed surface",
-                             remedy="train with the preset cpu or demo")  # fmt: skip
+            raise InputError(
+                "teacher",
+                expected="one that followed the surface first",
+                received="no followed surface",
+                remedy="train with the preset cpu or demo",
+            )
         frames = self.capture.splits.novel_pose_frames[::every]
         meshes = {frame: self.capture.truth_mesh(frame) for frame in frames}
         self.held_out = {frame: mesh for frame, mesh in meshes.items() if mesh is not None}

@@ -24,14 +24,13 @@ from scipy.spatial import cKDTree
 from benchmarks.capture_truth import CaptureTruth, TruePart, find_captures, read_capture_truth
 from benchmarks.machine import store_results
 from benchmarks.rin23 import load_peer, run_peer
-from smplxpp.body import skin
-from smplxpp.body.hard_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.inverse_skinning import UnposeConfig, unpose
 from smplxpp.metrics import edge_stretch
+from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
 

@@ -18,17 +18,18 @@ from typing import Any
 import torch
 import tyro
 
+from avatar.data.views import read_views
 from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.sampling import SamplingConfig
-from avatar.training import PRESETS, FitConfig, FitScene, fit_reference, read_views
-from avatar.training.fit_reference import FitTask
-from avatar.training.loop import METRICS_FILE
-from avatar.training.metrics_log import read_metrics
+from avatar.training.engine.loop import METRICS_FILE
+from avatar.training.engine.metrics_log import read_metrics
+from avatar.training.reference_fit.config import PRESETS, FitConfig
+from avatar.training.reference_fit.fit import FitScene, FitTask, fit_reference
 from benchmarks.machine import store_results
-from pipelines.build_template import build
 from pipelines.commands.build import Build
+from pipelines.stages.build import build
 from smplxpp.capture import open_capture
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 WARM_UP, TIMED = 3, 24
 WORLD = ("means", "quats", "scales", "opacities")
@@ -82,9 +83,12 @@ def _scene(folder: Path, run: Path) -> FitScene:
     frame = capture.frames[0]
     train, held_out = capture.splits.train_cameras, capture.splits.novel_view_cameras
     return FitScene(
-        template, template.pose(capture.params(frame))[0], read_views(capture, frame, train),
-        read_views(capture, frame, held_out), capture.recording.background or (0.0, 0.0, 0.0),
-    )  # fmt: skip
+        template,
+        template.pose(capture.params(frame))[0],
+        read_views(capture, frame, train),
+        read_views(capture, frame, held_out),
+        capture.recording.background or (0.0, 0.0, 0.0),
+    )
 
 
 def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
@@ -110,8 +114,9 @@ def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
         placed = replace(world, **dict(zip(WORLD, leaves, strict=False)))
         drawn = timed("rasteriser, forward", lambda p=placed, c=leaves[-1], v=view: task.draw(p, c, v))
         loss = timed("loss, forward", lambda v=view, d=drawn: task.compare(v, *d)[0])
-        grads = timed("loss, backward", lambda x=loss, d=drawn: torch.autograd.grad(x, [*d, *parameters],
-                                                                                   allow_unused=True))  # fmt: skip
+        grads = timed(
+            "loss, backward", lambda x=loss, d=drawn: torch.autograd.grad(x, [*d, *parameters], allow_unused=True)
+        )
         pulled = timed("rasteriser, backward", lambda d=drawn, v=leaves, g=grads[:2]: torch.autograd.grad(d, v, g))
         timed("binding and colours, backward", lambda o=outputs, g=pulled: torch.autograd.grad(o, parameters, g))
         for value in parameters:
@@ -121,11 +126,15 @@ def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
 
 
 def _print(figures: dict[str, Any]) -> None:
-    print(f"{figures['capture']}: {figures['gaussians']:,} Gaussians, {figures['threads']} threads, "
-          f"{figures['iterations_per_second']:.1f} iterations a second")  # fmt: skip
+    print(
+        f"{figures['capture']}: {figures['gaussians']:,} Gaussians, {figures['threads']} threads, "
+        f"{figures['iterations_per_second']:.1f} iterations a second"
+    )
     for entry in figures["held_out_over_time"]:
-        print(f"  {entry['iteration']:6d} iterations {entry['seconds']:7.1f} s  PSNR {entry['psnr']:.2f} dB "
-              f"(image {entry['psnr_image']:.2f}, head {entry['psnr_head']:.2f}) SSIM {entry['ssim']:.4f}")  # fmt: skip
+        print(
+            f"  {entry['iteration']:6d} iterations {entry['seconds']:7.1f} s  PSNR {entry['psnr']:.2f} dB "
+            f"(image {entry['psnr_image']:.2f}, head {entry['psnr_head']:.2f}) SSIM {entry['ssim']:.4f}"
+        )
     total = sum(figures["milliseconds_of_a_step"].values())
     for name, value in figures["milliseconds_of_a_step"].items():
         print(f"  {name:32s}{value:8.2f} ms {value / total:6.1%}")

@@ -8,8 +8,9 @@ import os
 import platform
 from pathlib import Path
 
-from smplxpp.core.artifact import jsonable, versions
+from pipelines.runs.digests import versions
 from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.json_values import jsonable
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -21,12 +21,13 @@ from rich.console import Console
 from rich.table import Table
 
 from avatar.losses.perceptual import ShiftTolerantLPIPS
-from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.control_points import choose_control_points
-from avatar.models.deformation_field import DeformationField, FieldConfig
-from avatar.models.map_sampling import MapFrame, MapSampler
-from avatar.models.presets import NETWORK_PRESETS, network_preset
-from avatar.models.teacher import Teacher
+from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
+from avatar.models.networks.control_points import choose_control_points
+from avatar.models.networks.deformation_field import DeformationField, FieldConfig
+from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
+from avatar.models.networks.teacher import Teacher
+from avatar.render.map_frame import MapFrame
 from benchmarks.machine import store_results
 
 VERTICES, GAUSSIANS = 22_000, {"paper": 220_000, "gpu": 220_000, "cpu": 50_000, "demo": 20_000}

@@ -74,8 +74,10 @@ def main() -> None:
         ratio = times["torch"]["median_ms"] / times["fused"]["median_ms"]
         rows.append({"shape": shape, "times": times, "torch_over_fused": ratio, "gradient_error": errors})
         medians = [times[k]["median_ms"] for k in ("forward", "fused", "torch")]
-        print(f"{'x'.join(map(str, shape)):>14} {medians[0]:>9.2f} {medians[1]:>9.2f} {medians[2]:>14.2f} "
-              f"{ratio:>6.1f} {errors['fused']:>15.1e}")  # fmt: skip
+        print(
+            f"{'x'.join(map(str, shape)):>14} {medians[0]:>9.2f} {medians[1]:>9.2f} {medians[2]:>14.2f} "
+            f"{ratio:>6.1f} {errors['fused']:>15.1e}"
+        )
     figures = {"threads": torch.get_num_threads(), "rows": rows}
     print("stored", store_results("ssim", "python -m benchmarks.ssim", figures))
 

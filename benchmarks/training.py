@@ -18,21 +18,22 @@ import torch
 import tyro
 from torch.profiler import ProfilerActivity, profile
 
+from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.bound_file import load_bound
 from avatar.models.model_file import load_avatar
-from avatar.models.tracked import TrackedAvatar
-from avatar.training.bake import BakeTask
-from avatar.training.compensate import CompensateTask
-from avatar.training.fit_teacher import TeacherTask
+from avatar.models.tracked_surface import TrackedAvatar
 from avatar.training.presets import TrainingPreset, training_preset
-from avatar.training.pretrain import PretrainFieldTask, PretrainTeacherTask
-from avatar.training.sequence import AvatarSequence
-from avatar.training.track import TrackTask
+from avatar.training.student.bake import BakeTask
+from avatar.training.student.compensate import CompensateTask
+from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.teacher.fit_teacher import TeacherTask
+from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.track import TrackTask
 from benchmarks.machine import store_results
+from pipelines.runs.stage import read_manifest
 from smplxpp.capture import open_capture
-from smplxpp.core.artifact import read_manifest
 from smplxpp.core.errors import InputError
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 STAGES = ("70_bind", "80_teacher", "85_bake", "90_compensate")
 WARM_UP, TIMED = 3, 14
@@ -83,11 +84,25 @@ def stage_figures(folder: Path) -> dict[str, Any]:
     """
     manifest = read_manifest(folder) if folder.is_dir() else None
     if manifest is None or not manifest["numbers"].get("finished"):
-        raise InputError(f"training {folder.name}", expected="a finished one", received=str(folder),
-                         remedy="train with `smplxpp train --run RUN --capture DIR`")  # fmt: skip
+        raise InputError(
+            f"training {folder.name}",
+            expected="a finished one",
+            received=str(folder),
+            remedy="train with `smplxpp train --run RUN --capture DIR`",
+        )
     numbers = manifest["numbers"]
-    kept = ("iterations", "iterations_per_second", "seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining",
-            "gaussians", "bytes", "start", "novel_view", "novel_pose")  # fmt: skip
+    kept = (
+        "iterations",
+        "iterations_per_second",
+        "seconds_of_steps",
+        "seconds_of_tracking",
+        "seconds_of_pretraining",
+        "gaussians",
+        "bytes",
+        "start",
+        "novel_view",
+        "novel_pose",
+    )
     found = {"seconds": manifest["seconds"], **{name: numbers[name] for name in kept if name in numbers}}
     if "parameters" in numbers:
         found["parameters"] = numbers["parameters"]["total"]
@@ -103,14 +118,22 @@ def evaluation_figures(path: Path) -> dict[str, Any]:
         InputError: the run has not been evaluated.
     """
     if not path.is_file():
-        raise InputError("evaluation of the run", expected=str(path), received="no such file",
-                         remedy="make it with `smplxpp evaluate RUN --capture DIR`")  # fmt: skip
+        raise InputError(
+            "evaluation of the run",
+            expected=str(path),
+            received="no such file",
+            remedy="make it with `smplxpp evaluate RUN --capture DIR`",
+        )
     stored = json.loads(path.read_text())
     figures = {
-        name: {"views": model["mean"], "surfaces": _surfaces(model["surfaces"]), "speed": model["speed"],
-               "bytes": model["bytes"]}
+        name: {
+            "views": model["mean"],
+            "surfaces": _surfaces(model["surfaces"]),
+            "speed": model["speed"],
+            "bytes": model["bytes"],
+        }
         for name, model in stored["models"].items()
-    }  # fmt: skip
+    }
     figures["skinning alone"] = {"surfaces": _surfaces(stored["skinning_alone"])}
     return _rounded(figures)
 
@@ -149,17 +172,25 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
     # Made one after the other: the bake's task freezes the teacher.
     tasks = {
         "tracking": lambda: tracking(TrackTask(sequence, followed, preset.teacher.track)),
-        "teacher's pretraining": lambda: PretrainTeacherTask(
-            sequence, teacher, preset.teacher.pretrain, 0, teacher.track
-        ).step,
+        "teacher's pretraining": lambda: (
+            PretrainTeacherTask(sequence, teacher, preset.teacher.pretrain, 0, teacher.track).step
+        ),
         "teacher": lambda: TeacherTask(sequence, teacher.train(), preset.teacher).step,
-        "bake's pretraining": lambda: PretrainFieldTask(
-            sequence, baked, teacher, bake.pretrain, 0,
-            code_rate=bake.code_rate, null_share=bake.null_share, imagined=bake.imagined,
-        ).step,
+        "bake's pretraining": lambda: (
+            PretrainFieldTask(
+                sequence,
+                baked,
+                teacher,
+                bake.pretrain,
+                0,
+                code_rate=bake.code_rate,
+                null_share=bake.null_share,
+                imagined=bake.imagined,
+            ).step
+        ),
         "bake": lambda: BakeTask(sequence, baked.train(), bake, teacher=teacher).step,
         "compensation": lambda: CompensateTask(sequence, student.train(), preset.compensate).step,
-    }  # fmt: skip
+    }
     return {name: _profile(task()) for name, task in tasks.items()}
 
 

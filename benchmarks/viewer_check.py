@@ -40,16 +40,22 @@ from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
 from avatar.render import rasterize
 from benchmarks.build import FIXTURE
 from benchmarks.machine import store_results
-from smplxpp.body.hard_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.170.0")
 CHROMIUM_FLAGS = (
-    "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-dev-shm-usage", "--hide-scrollbars", "--force-device-scale-factor=1",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+    "--force-device-scale-factor=1",
+)
 PAGE = """<!doctype html><body style="margin:0"><script type="importmap">{"imports": {
 "three": "/node_modules/three/build/three.module.js",
 "splats": "/node_modules/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js"}}</script>

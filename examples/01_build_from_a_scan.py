@@ -8,8 +8,8 @@ import smplxpp
 from smplxpp.assemble import CanonicalPart, assemble_template
 from smplxpp.clean import PartsConfig, check_human_scale, clean_parts, sanitize
 from smplxpp.core.mesh_io import read_raw_mesh
-from smplxpp.inverse_skinning import unpose
 from smplxpp.segment import read_labels, segment_scan
+from smplxpp.skinning import unpose
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 BUDGETS = {"upper": 4_000, "lower": 4_000, "hair": 1_500, "shoe": 1_500}  # faces; the defaults are larger and slower
@@ -45,12 +45,12 @@ def main() -> None:
         rest = unpose(piece.mesh.vertices, weights, posed.posed_from_rest)
         mesh, source = piece.mesh.with_vertices(rest.vertices), clean.source_vertex[piece.source_vertex]
         parts[name] = CanonicalPart(mesh, weights, piece.label, piece.vertex_colors, source)
-        print(f"{name:8} {piece.mesh.face_count} faces, {weights.matched.mean():.0%} matched, "
-              f"round trip {rest.report.round_trip_max:.0e} m")  # fmt: skip
+        matched, error = weights.matched.mean(), rest.report.round_trip_max
+        print(f"{name:8} {piece.mesh.face_count} faces, {matched:.0%} matched, round trip {error:.0e} m")
 
     template, report = assemble_template(body, params, parts)
-    print(f"template {template.vertex_count} vertices; {report.penetrating_before} inside an inner layer before the "
-          f"repair, {report.penetrating_after} after")  # fmt: skip
+    before, after = report.penetrating_before, report.penetrating_after
+    print(f"template {template.vertex_count} vertices; {before} inside an inner layer before the repair, {after} after")
     template.save(out / "smplxpp.npz")
     smplxpp.write_glb(out / "template.glb", template)
     print(f"written {out}/smplxpp.npz, template.glb")

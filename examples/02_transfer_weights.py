@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 import smplxpp
-from smplxpp.body.hard_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
 from smplxpp.core.mesh_io import write_ply
-from smplxpp.inverse_skinning import pose, unpose
 from smplxpp.metrics import stretch_report, weight_report
+from smplxpp.skinning import pose, unpose
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 SETTINGS = {

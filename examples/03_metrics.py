@@ -29,8 +29,10 @@ def main() -> None:
     visible = metrics.CompareConfig(visible_only=True)
     for name, config in (("whole meshes", None), ("visible surface", visible)):
         result = metrics.compare(layers, scan, pred_labels=labels, samples=SAMPLES, config=config)
-        print(f"{name:16} P2S {result.p2s:.3f}, Chamfer {result.chamfer:.3f}, Hausdorff {result.hausdorff:.1f} mm, "
-              f"F(5 mm) {result.fscore:.3f}")  # fmt: skip
+        print(
+            f"{name:16} P2S {result.p2s:.3f}, Chamfer {result.chamfer:.3f}, Hausdorff {result.hausdorff:.1f} mm, "
+            f"F(5 mm) {result.fscore:.3f}"
+        )
     for label, part in result.labels.items():
         print(f"  {label:8} layers to scan {part.pred_to_gt.mean:.3f} mm, p95 {part.pred_to_gt.p95:.3f}")
     (out / "comparison.json").write_text(json.dumps(result.as_dict(), indent=1))

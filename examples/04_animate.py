@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import smplxpp
-from pipelines.pictures import VIEWS, encode_png, fit_cameras, render_shaded
+from pipelines.figures import VIEWS, encode_png, fit_cameras, render_shaded
 from smplxpp.assemble import CanonicalPart, assemble_template
-from smplxpp.body.hard_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
 from smplxpp.core.labels import LABEL_BY_NAME
 from smplxpp.core.mesh_io import write_ply
 

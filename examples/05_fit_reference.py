@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+import avatar
 import smplxpp
-from avatar.export.splats import write_splat_ply
-from avatar.gaussians.sampling import SamplingConfig
-from avatar.training import FitConfig, FitScene, fit_reference, mean_quality, read_views
-from pipelines.build_template import build
 from pipelines.commands.build import Build
+from pipelines.stages.build import build
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import GeometryWarning
 
@@ -33,17 +31,19 @@ def main() -> None:
     capture = open_capture(PERSON)
     splits = capture.splits
     template = smplxpp.Template.load((options.run or built(out / "run")) / "60_assemble" / "smplxpp.npz")
-    train, held_out = (read_views(capture, 0, names) for names in (splits.train_cameras, splits.novel_view_cameras))
-    scene = FitScene(template, template.pose(capture.params(0))[0], train, held_out)
+    train, held_out = (
+        avatar.read_views(capture, 0, names) for names in (splits.train_cameras, splits.novel_view_cameras)
+    )
+    scene = avatar.FitScene(template, template.pose(capture.params(0))[0], train, held_out)
 
     # A third of the default's Gaussians and a tenth of its steps: seconds instead of minutes.
-    config = FitConfig(sampling=SamplingConfig(count=50_000), iterations=60, evaluations=3)
-    result = fit_reference(scene, config, out)
-    write_splat_ply(out / "splats.ply", result.splats)
+    config = avatar.FitConfig(sampling=avatar.SamplingConfig(count=50_000), iterations=60, evaluations=3)
+    result = avatar.fit_reference(scene, config, out)
+    avatar.write_splat_ply(out / "splats.ply", result.splats)
     for view in held_out:
         pair = np.concatenate([view.photograph(scene.background), result.images[view.name]], axis=1)
         Image.fromarray(pair).save(out / f"{view.name}.png")
-    mean = mean_quality({view.name: result.quality[view.name] for view in held_out})
+    mean = avatar.mean_quality({view.name: result.quality[view.name] for view in held_out})
     print(f"held out: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f}\nwritten {out}/splats.ply and pictures")
 
 

@@ -13,14 +13,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+import avatar
 import smplxpp
-from avatar.models.model_file import load_avatar, save_avatar
-from avatar.models.rig import Rig
-from avatar.render.avatar_view import render_view
-from avatar.training import FitScene, fit_reference, read_views
-from avatar.training.presets import training_preset
-from avatar.training.sequence import AvatarSequence
-from avatar.training.train import Session, bake, compensate, fit_teacher
 from smplxpp.capture import open_capture
 
 
@@ -33,26 +27,33 @@ def main() -> None:
     out = options.out or Path(tempfile.mkdtemp(prefix="smplxpp_"))
     capture = open_capture(Path(__file__).parents[1] / "data" / "fixtures" / "person")
     template = smplxpp.Template.load(options.run / "60_assemble" / "smplxpp.npz")
-    preset = training_preset("demo").shortened(options.share)
-    sequence = AvatarSequence(capture, template)
-    scene = FitScene(template, template.pose(capture.params(0))[0], read_views(capture, 0, sequence.train_cameras))
-    fitted = fit_reference(scene, preset.fit, out / "fit").gaussians
+    preset = avatar.training_preset("demo").shortened(options.share)
+    sequence = avatar.AvatarSequence(capture, template)
+    views = avatar.read_views(capture, 0, sequence.train_cameras)
+    scene = avatar.FitScene(template, template.pose(capture.params(0))[0], views)
+    fitted = avatar.fit_reference(scene, preset.fit, out / "fit").gaussians
     config = replace(preset.teacher, track=replace(preset.teacher.track, reference=0))  # the template is of frame 0
-    teacher, _ = fit_teacher(sequence, fitted, preset.networks.teacher, config, Session(out / "teacher"))
+    teacher, _ = avatar.fit_teacher(sequence, fitted, preset.networks.teacher, config, avatar.Session(out / "teacher"))
     start = teacher.gaussians.snapshot()
-    baked, _ = bake(sequence, start, preset.student(), preset.bake, Session(out / "bake"), teacher=teacher)
+    baked, _ = avatar.bake(
+        sequence, start, preset.student(), preset.bake, avatar.Session(out / "bake"), teacher=teacher
+    )
     shapes = replace(preset.blend_shapes, expression_size=sequence.rig.expression_size)
-    student, _ = compensate(sequence, baked, shapes, preset.compensate, Session(out / "shapes"), teacher=teacher)
-    size = save_avatar(out / "student.safetensors", student, compact=True)  # with the template, all a player needs
-    player = load_avatar(out / "student.safetensors", Rig(template))
+    student, _ = avatar.compensate(
+        sequence, baked, shapes, preset.compensate, avatar.Session(out / "shapes"), teacher=teacher
+    )
+    size = avatar.save_avatar(
+        out / "student.safetensors", student, compact=True
+    )  # with the template, all a player needs
+    player = avatar.load_avatar(out / "student.safetensors", avatar.Rig(template))
     frame = capture.splits.novel_pose_frames[0]
-    (view,) = read_views(capture, frame, capture.splits.novel_view_cameras[:1])
+    (view,) = avatar.read_views(capture, frame, capture.splits.novel_view_cameras[:1])
     with torch.no_grad():
-        avatar = player(player.rig.motion(capture.params(frame)), view.position[None])
-        drawn = render_view(avatar, 0, view, torch.zeros(3)).image.clamp(0, 1)
+        posed = player(player.rig.motion(capture.params(frame)), view.position[None])
+        drawn = avatar.render_view(posed, 0, view, torch.zeros(3)).image.clamp(0, 1)
     pair = np.hstack([view.photograph((0.0, 0.0, 0.0)), (255 * drawn).round().byte().numpy()])
     Image.fromarray(pair).save(out / "new_pose.png")
-    print(f"{len(avatar.bound)} Gaussians, {size / 1e6:.1f} MB; written {out}/student.safetensors and new_pose.png")
+    print(f"{len(posed.bound)} Gaussians, {size / 1e6:.1f} MB; written {out}/student.safetensors and new_pose.png")
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ from rich.logging import RichHandler
 from rich.table import Table
 from rich.text import Text
 
-from smplxpp.core.artifact import jsonable
 from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.json_values import jsonable
 
 # command -> (module, dataclass, one line of help)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -114,9 +114,12 @@ def _run(name: str, args: list[str]) -> int:
 
     module, cls, description = COMMANDS[name]
     command = tyro.cli(
-        getattr(import_module(module), cls), prog=f"smplxpp {name}", description=description, args=args,
+        getattr(import_module(module), cls),
+        prog=f"smplxpp {name}",
+        description=description,
+        args=args,
         config=(tyro.conf.FlagCreatePairsOff,),
-    )  # fmt: skip
+    )
     result = command.run()
     if getattr(command, "json", False) and result is not None:
         sys.stdout.write(json.dumps(jsonable(result), indent=1) + "\n")

@@ -13,15 +13,15 @@ _EXPORTS: dict[str, str] = {
     "BodyParams": "smplxpp.core.params",
     "InputError": "smplxpp.core.errors",
     "SkinWeights": "smplxpp.core.skin_weights",
-    "Template": "smplxpp.core.template",
+    "Template": "smplxpp.template.template",
     "TransferConfig": "smplxpp.transfer",
     "TriangleMesh": "smplxpp.core.mesh",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",
-    "pose": "smplxpp.inverse_skinning",
+    "pose": "smplxpp.skinning",
     "read_mesh": "smplxpp.core.mesh_io",
     "transfer_weights": "smplxpp.transfer",
-    "unpose": "smplxpp.inverse_skinning",
+    "unpose": "smplxpp.skinning",
     "write_glb": "smplxpp.export",
 }
 _MODULES = ("metrics",)

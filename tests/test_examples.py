@@ -15,8 +15,8 @@ import trimesh
 from PIL import Image
 
 from avatar.export.splats import read_splat_ply
-from pipelines.build_template import build
 from pipelines.commands.build import Build
+from pipelines.stages.build import build
 from smplxpp import Template
 from smplxpp.core.errors import GeometryWarning
 
@@ -51,8 +51,13 @@ def run_example(name: str, out: Path, *arguments: str) -> str:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-W", "error", f"examples/{name}.py", *arguments, "--out", str(out)],
-        cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

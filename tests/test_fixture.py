@@ -9,17 +9,18 @@ import igl
 import numpy as np
 import pytest
 
-from pipelines.makers.synth.checks import free_edge_strain
-from pipelines.makers.synth.contact import depths
-from pipelines.makers.synth.person_file import load_person
-from pipelines.makers.synth.simulate import Take
-from smplxpp.body import load_body, skin
+from pipelines.synth.checks import free_edge_strain
+from pipelines.synth.contact import depths
+from pipelines.synth.person_file import load_person
+from pipelines.synth.simulate import Take
+from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import rasterize_mesh
+from smplxpp.skinning import skin
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 

@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+import pytest
+
+import avatar
 import smplxpp
 
 
-def test_functions_stay_functions_after_their_packages_are_loaded():
+@pytest.mark.parametrize("package", [smplxpp, avatar])
+def test_functions_stay_functions_after_their_packages_are_loaded(package):
     """A subpackage of the same name would take the function's place on first use."""
-    for name in smplxpp.__all__:
-        first = getattr(smplxpp, name)
-        assert getattr(smplxpp, name) is first
+    for name in package.__all__:
+        first = getattr(package, name)
+        assert getattr(package, name) is first
+        assert name in dir(package)
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = package.nonsense
     assert callable(smplxpp.pose)
     assert callable(smplxpp.unpose)
-    assert "transfer_weights" in dir(smplxpp)

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, corner_weights, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
-from avatar.models.deformation_field import FrameCodes
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.posed import PosedAvatar
-from avatar.models.rig import Motion, Rig
-from avatar.models.teacher import local_offsets
-from avatar.training.gradient_task import ParameterGroup
+from avatar.models.networks.deformation_field import FrameCodes
+from avatar.models.networks.teacher import local_offsets
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion, Rig
+from avatar.training.engine.optimization_task import ParameterGroup
 
 POSITION_SCALE = 0.05
 """Metres of displacement for an output of 1, as the teacher's."""

@@ -9,7 +9,7 @@ from avatar.baselines.point_mlp import PointMLPAvatar, PointMLPConfig
 from avatar.baselines.textured_mesh import TexturedMeshAvatar, TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetAvatar, UVUNetConfig
 from avatar.gaussians.binding import BoundGaussians
-from avatar.models.rig import Rig
+from avatar.rig.rig import Rig
 
 BaselineConfig = PointMLPConfig | UVUNetConfig | TexturedMeshConfig
 _KINDS = {PointMLPConfig: PointMLPAvatar, UVUNetConfig: UVUNetAvatar, TexturedMeshConfig: TexturedMeshAvatar}

@@ -9,7 +9,7 @@ import numpy as np
 from avatar.gaussians.sampling import seen_faces
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 
 def outer_template(template: Template) -> Template:

@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
-from avatar.training.sequence import AvatarSequence, Item, eyes_of
-from avatar.training.view_task import ViewConfig, ViewTask
+from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.training.engine.photometric_task import ViewConfig, ViewTask
 from smplxpp.core.errors import InputError
 
 

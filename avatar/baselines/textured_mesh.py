@@ -21,13 +21,13 @@ from torch import Tensor
 from avatar.baselines.avatar_base import Baseline
 from avatar.gaussians.binding import BoundGaussians, corner_weights
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.models.deformation_field import FieldConfig
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.posed import PosedAvatar
-from avatar.models.rig import Motion, Rig
+from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.training.fit_config import LearningRates
-from avatar.training.gradient_task import ParameterGroup
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion, Rig
+from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.optimization_task import ParameterGroup
 
 OPACITY = 0.99
 

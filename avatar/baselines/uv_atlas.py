@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 BODY_JOINTS = 22
 """Joints of SMPL-X's layout before face and hands: those hang on the nearest of these above them."""

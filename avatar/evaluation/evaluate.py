@@ -11,18 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.evaluation import geometry, speed
-from avatar.evaluation.geometry import SurfaceQuality, mean_surface, surface_quality
-from avatar.evaluation.image import load_metric
-from avatar.evaluation.posing import at_rest
+from avatar.data.sequence import AvatarSequence, eyes_of
+from avatar.data.views import View
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
-from avatar.evaluation.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
-from avatar.losses.perceptual import PerceptualDistance
-from avatar.models.posed import AvatarModel, PosedAvatar
-from avatar.models.rig import Motion, Rig
-from avatar.render.avatar_view import render_view
-from avatar.training.quality import (
+from avatar.losses.perceptual import PerceptualDistance, load_metric
+from avatar.metrics.speed import CONVENTION as SPEED_CONVENTION
+from avatar.metrics.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
+from avatar.metrics.surface_quality import CONVENTION as SURFACE_CONVENTION
+from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface, surface_quality
+from avatar.metrics.view_quality import (
     CONVENTION,
     PERCEPTUAL_CONVENTION,
     Box,
@@ -32,8 +30,9 @@ from avatar.training.quality import (
     head_vertices,
     view_quality,
 )
-from avatar.training.sequence import AvatarSequence, eyes_of
-from avatar.training.views import View
+from avatar.render.avatar_view import render_view
+from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
+from avatar.rig.rig import Motion, Rig
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
@@ -53,7 +52,7 @@ class EvaluationConfig:
 
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     metric: str = "st-lpips"
-    samples: int = geometry.SAMPLES
+    samples: int = SAMPLES
     seed: int = 0
     speed_size: tuple[int, int] = (512, 512)
     speed_pictures: int = 20
@@ -214,12 +213,10 @@ class _Run:
         conventions = {
             "images": CONVENTION,
             **({} if metric is None else {metric: PERCEPTUAL_CONVENTION}),
-            **({"surface": geometry.CONVENTION} if self.truths else {}),
-            **({"speed": speed.CONVENTION} if self.config.speed_pictures else {}),
+            **({"surface": SURFACE_CONVENTION} if self.truths else {}),
+            **({"speed": SPEED_CONVENTION} if self.config.speed_pictures else {}),
         }
-        report = EvalReport(
-            self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions
-        )  # fmt: skip
+        report = EvalReport(self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions)
         order = list(self.sets)
         shown = sorted(self.shown.values(), key=lambda one: (order.index(one.set), one.frame, one.camera))
         return Evaluation(report, tuple(shown), tuple(self.meshes[name] for name in self.truths))
@@ -254,9 +251,13 @@ class _Run:
             return None
         capture, first = self.sequence.capture, next(iter(self.sets.values()))
         return measure_speed(
-            model, [capture.params(frame) for frame in first.frames], capture.cameras[first.views[0][0]],
-            size=self.config.speed_size, pictures=self.config.speed_pictures, eps2d=self.config.eps2d,
-        )  # fmt: skip
+            model,
+            [capture.params(frame) for frame in first.frames],
+            capture.cameras[first.views[0][0]],
+            size=self.config.speed_size,
+            pictures=self.config.speed_pictures,
+            eps2d=self.config.eps2d,
+        )
 
 
 def _mesh(vertices: Tensor, rig: Rig) -> TriangleMesh:
@@ -274,9 +275,11 @@ def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
 def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -> None:
     if not models:
         raise InputError(
-            "models to evaluate", expected="at least one", received="none",
+            "models to evaluate",
+            expected="at least one",
+            received="none",
             remedy="train one with `smplxpp train --run RUN --capture DIR`",
-        )  # fmt: skip
+        )
     for name, model in models.items():
         if model.rig.device != torch.device(sequence.device):
             raise InputError(f"model {name}", expected=f"on {sequence.device}", received=f"on {model.rig.device}")

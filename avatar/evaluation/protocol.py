@@ -93,9 +93,11 @@ def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
     without = sorted({f for s in sets.values() for f in s.frames if capture.params(f) is None})
     if without:
         raise InputError(
-            f"capture {capture.name}", expected="body parameters of every frame that is measured",
-            received=f"none for {', '.join(map(str, without[:8]))}", remedy="name a file of parameters with --params",
-        )  # fmt: skip
+            f"capture {capture.name}",
+            expected="body parameters of every frame that is measured",
+            received=f"none for {', '.join(map(str, without[:8]))}",
+            remedy="name a file of parameters with --params",
+        )
     return sets
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from avatar.evaluation.geometry import SurfaceQuality
-from avatar.evaluation.speed import Speed
-from avatar.training.quality import ViewQuality, mean_quality
-from smplxpp.core.artifact import jsonable
+from avatar.metrics.speed import Speed
+from avatar.metrics.surface_quality import SurfaceQuality
+from avatar.metrics.view_quality import ViewQuality, mean_quality
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_values import jsonable
 
 SCHEMA = 1
 SKINNING_ALONE = "skinning alone"
@@ -89,9 +89,11 @@ class EvalReport:
         """
         if values.get("schema") != SCHEMA:
             raise InputError(
-                "evaluation report", expected=f"schema {SCHEMA}", received=str(values.get("schema")),
+                "evaluation report",
+                expected=f"schema {SCHEMA}",
+                received=str(values.get("schema")),
                 remedy="evaluate again with this version",
-            )  # fmt: skip
+            )
         return EvalReport(
             capture=values["capture"],
             metric=values["metric"],

@@ -12,8 +12,12 @@ from typing import Literal
 
 from smplxpp.core.errors import InputError
 
-_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-          **{char: f"\\{char}" for char in "&%$#_{}"}}  # fmt: skip
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{char: f"\\{char}" for char in "&%$#_{}"},
+}
 
 
 @dataclass(frozen=True)
@@ -127,8 +131,10 @@ class FigureTable:
         lines += [" & ".join(titles) + r" \\", r"\midrule"]
         best = [self.best(column) for column in self.columns]
         for name, *figures in self.cells():
-            cells = [rf"\textbf{{{f}}}" if name in b else ("--" if f == "-" else f)
-                     for f, b in zip(figures, best, strict=True)]  # fmt: skip
+            cells = [
+                rf"\textbf{{{f}}}" if name in b else ("--" if f == "-" else f)
+                for f, b in zip(figures, best, strict=True)
+            ]
             lines.append(" & ".join([escape_latex(name), *cells]) + r" \\")
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"]) + "\n"
 

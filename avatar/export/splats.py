@@ -55,9 +55,14 @@ class Splats:
             object.__setattr__(self, f.name, np.ascontiguousarray(getattr(self, f.name), dtype=np.float32))
         N, K = len(self.means), self.f_rest.shape[1] if self.f_rest.ndim == 3 else -1
         shapes = {
-            "means": (N, 3), "normals": (N, 3), "f_dc": (N, 3), "f_rest": (N, K, 3), "opacity_logits": (N,),
-            "log_scales": (N, 3), "quats": (N, 4),
-        }  # fmt: skip
+            "means": (N, 3),
+            "normals": (N, 3),
+            "f_dc": (N, 3),
+            "f_rest": (N, K, 3),
+            "opacity_logits": (N,),
+            "log_scales": (N, 3),
+            "quats": (N, 4),
+        }
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value.shape != shape:

@@ -54,9 +54,16 @@ class BoundGaussians:
     def __post_init__(self) -> None:
         N, K = len(self.face_index), self.sh.shape[1] if self.sh.ndim == 3 else -1
         shapes = {
-            "face_index": (N,), "barycentric": (N, 2), "normal_offset": (N,), "offset": (N, 3), "log_scales": (N, 2),
-            "quats": (N, 4), "opacity_logits": (N,), "dc": (N, 3), "sh": (N, K, 3),
-        }  # fmt: skip
+            "face_index": (N,),
+            "barycentric": (N, 2),
+            "normal_offset": (N,),
+            "offset": (N, 3),
+            "log_scales": (N, 2),
+            "quats": (N, 4),
+            "opacity_logits": (N,),
+            "dc": (N, 3),
+            "sh": (N, K, 3),
+        }
         for name, shape in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) != shape:

@@ -13,8 +13,8 @@ from avatar.gaussians.frames import MIN_EDGE
 from avatar.gaussians.spherical_harmonics import coefficient_count
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
-from smplxpp.core.template import Template
 from smplxpp.raster import outer_visible_faces
+from smplxpp.template.template import Template
 
 # Irrational steps of a Kronecker sequence: consecutive points of a face keep away from each other.
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0

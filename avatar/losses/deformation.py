@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians, on_triangles
-from avatar.models.map_sampling import MapFrame
-from avatar.models.rig import Rig
+from avatar.render.map_frame import MapFrame
 from avatar.render.mesh_maps import front_back_maps
+from avatar.rig.rig import Rig
 
 TAU = 8.0 * math.pi
 """Radians a metre of the semantic labels' waves: one every 25 cm."""

@@ -6,9 +6,11 @@ They are different metrics with different numbers: each carries its own name, wh
 from __future__ import annotations
 
 import importlib.util
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
@@ -198,3 +200,27 @@ def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
     except ImportError as error:
         raise MissingPackageError("lpips", command="pip install lpips torchvision", purpose="LPIPS") from error
     return PackagedLPIPS(lpips.LPIPS(net=backbone, verbose=False), backbone)
+
+
+log = logging.getLogger(__name__)
+
+
+MetricName = Literal["st-lpips", "lpips", "none"]
+
+
+def load_metric(name: str, *, device: str = "cpu") -> PerceptualDistance | None:
+    """The metric of a name; None for "none", and where its package is not installed, which is logged.
+
+    Raises:
+        InputError: another name.
+    """
+    if name not in get_args(MetricName):
+        raise InputError("perceptual metric", expected=f"one of {', '.join(get_args(MetricName))}", received=name)
+    if name == "none":
+        return None
+    try:
+        metric = load_st_lpips() if name == "st-lpips" else load_lpips()
+    except MissingExtraError as error:
+        log.warning("no perceptual distance is measured: %s", error)
+        return None
+    return metric.to(device)

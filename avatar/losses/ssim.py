@@ -137,9 +137,16 @@ class _SsimMap(torch.autograd.Function):
 
 
 def _call(
-    x: Tensor, y: Tensor, weight: Tensor | None, border: int, *,
-    scale: float = 1.0, map_: bool = False, grad_x: bool = False, grad_y: bool = False,
-) -> tuple[float, Tensor | None, Tensor | None, Tensor | None]:  # fmt: skip
+    x: Tensor,
+    y: Tensor,
+    weight: Tensor | None,
+    border: int,
+    *,
+    scale: float = 1.0,
+    map_: bool = False,
+    grad_x: bool = False,
+    grad_y: bool = False,
+) -> tuple[float, Tensor | None, Tensor | None, Tensor | None]:
     """The kernel: sum of scale * weight * SSIM, the map (B, H, W, C), the gradient of the sum by each image.
 
     `weight` is (H, W), (B, H, W) or (B, H, W, C).
@@ -155,11 +162,23 @@ def _call(
         return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
 
     native_library().smplxpp_ssim(
-        pointer(x), pointer(y), pointer(weight),
-        C if weight is not None and weight.dim() == 4 else 1, int(weight is not None and weight.dim() > 2),
-        ctypes.c_float(scale), B, H, W, C, border,
-        ctypes.byref(value), pointer(values), pointer(by_x), pointer(by_y), torch.get_num_threads(),
-    )  # fmt: skip
+        pointer(x),
+        pointer(y),
+        pointer(weight),
+        C if weight is not None and weight.dim() == 4 else 1,
+        int(weight is not None and weight.dim() > 2),
+        ctypes.c_float(scale),
+        B,
+        H,
+        W,
+        C,
+        border,
+        ctypes.byref(value),
+        pointer(values),
+        pointer(by_x),
+        pointer(by_y),
+        torch.get_num_threads(),
+    )
     return value.value, values, by_x, by_y
 
 

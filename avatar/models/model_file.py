@@ -13,14 +13,14 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
-from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.config import config_from_dict, config_to_dict
-from avatar.models.deformation_field import FieldConfig
-from avatar.models.rig import Rig
+from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
+from avatar.models.networks.config import config_from_dict, config_to_dict
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.models.teacher import TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.models.tracked import ControlCage, Track
+from avatar.models.tracked_surface import ControlCage, Track
+from avatar.rig.rig import Rig
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 
@@ -68,9 +68,11 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
     tensors = {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}
     if about["topology"] != topology_digest(rig.faces):
         raise InputError(
-            f"avatar {path}", expected="one of this template", received="Gaussians on other faces",
+            f"avatar {path}",
+            expected="one of this template",
+            received="Gaussians on other faces",
             remedy="train again: the template was built anew since",
-        )  # fmt: skip
+        )
     gaussians = _gaussians(tensors, about)
     if about["kind"] == "teacher":
         model: TeacherAvatar | Student = TeacherAvatar(config_from_dict(TeacherConfig, about["config"]), rig, gaussians)
@@ -89,8 +91,10 @@ def _student(about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, 
     shapes = None
     if about["blend_shapes"] is not None:
         extra = {name: tensors.get(SHAPES + name) for name in ("part", "head_weight", "active")}
-        extra = {name: value.long() if name != "head_weight" and value is not None else value
-                 for name, value in extra.items()}  # fmt: skip
+        extra = {
+            name: value.long() if name != "head_weight" and value is not None else value
+            for name, value in extra.items()
+        }
         shapes = BlendShapes(config_from_dict(BlendShapeConfig, about["blend_shapes"]), len(gaussians), **extra)
     config = StudentConfig(field, None if shapes is None else shapes.config, about["control_points"])
     return Student(config, rig, gaussians, tuple(about["frames"]), blend_shapes=shapes)
@@ -111,9 +115,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     if newer:
         raise InputError(
-            f"avatar {path}", expected=f"version {SCHEMA} or older", received=f"version {about['schema']}",
+            f"avatar {path}",
+            expected=f"version {SCHEMA} or older",
+            received=f"version {about['schema']}",
             remedy="update smplxpp to the version that wrote it",
-        )  # fmt: skip
+        )
     return about, tensors
 
 
@@ -128,9 +134,10 @@ def _load(model: nn.Module, tensors: Mapping[str, Tensor], path: str | Path) -> 
     for name, value in own.items():
         if name not in tensors or tensors[name].shape != value.shape:
             raise InputError(
-                f"avatar {path}", expected=f"{name} of shape {tuple(value.shape)}",
+                f"avatar {path}",
+                expected=f"{name} of shape {tuple(value.shape)}",
                 received="none" if name not in tensors else f"shape {tuple(tensors[name].shape)}",
-            )  # fmt: skip
+            )
     model.load_state_dict({name: tensors[name] for name in own})
 
 

@@ -12,14 +12,14 @@ from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import head_faces
 from avatar.gaussians.spherical_harmonics import view_colors
-from avatar.models.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.config import require_at_least
-from avatar.models.control_points import choose_control_points, template_control_points
-from avatar.models.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.local_pose import seen_joints
-from avatar.models.posed import PosedAvatar
-from avatar.models.rig import Motion, Rig
+from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
+from avatar.models.networks.config import require_at_least
+from avatar.models.networks.control_points import choose_control_points, template_control_points
+from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
+from avatar.models.networks.local_pose import seen_joints
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion, Rig
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,12 @@ class Student(nn.Module):
         given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
         shapes_config = given.config if given is not None else blend_shapes
         other = Student(
-            replace(self.config, blend_shapes=shapes_config), self.rig, self.gaussians(), self.frames,
+            replace(self.config, blend_shapes=shapes_config),
+            self.rig,
+            self.gaussians(),
+            self.frames,
             blend_shapes=given,
-        )  # fmt: skip
+        )
         if self.field is not None:
             other.field.load_state_dict(self.field.state_dict())
             other.codes.load_state_dict(self.codes.state_dict())

@@ -13,14 +13,15 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.front_back_assignment import map_sides
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.map_sampling import MapFrame, MapSampler
-from avatar.models.map_sides import map_sides
-from avatar.models.posed import PosedAvatar
-from avatar.models.rig import Motion, Rig
-from avatar.models.teacher import Residuals, Teacher, TeacherConfig, local_offsets
-from avatar.models.tracked import Track
+from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
+from avatar.models.tracked_surface import Track
+from avatar.render.map_frame import MapFrame
 from avatar.render.mesh_maps import front_back_maps, vertex_normals
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion, Rig
 
 HALF_EXTENT = 1.0
 """Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""

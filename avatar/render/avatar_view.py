@@ -11,8 +11,8 @@ from torch import Tensor
 from avatar.render.api import rasterize
 
 if TYPE_CHECKING:
-    from avatar.models.posed import PosedAvatar
-    from avatar.training.views import View
+    from avatar.data.views import View
+    from avatar.rig.posed import PosedAvatar
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,19 @@ def render_view(
     channels = torch.cat(features, dim=-1) if len(features) > 1 else features[0]
     behind = torch.nn.functional.pad(background, (0, channels.shape[-1] - 3))
     image, alpha, _ = rasterize(
-        world.means, world.quats, world.scales, world.opacities, channels[None], view.viewmat[None], view.K[None],
-        view.camera.width, view.camera.height, background=behind, eps2d=eps2d, check=False,
-    )  # fmt: skip
+        world.means,
+        world.quats,
+        world.scales,
+        world.opacities,
+        channels[None],
+        view.viewmat[None],
+        view.K[None],
+        view.camera.width,
+        view.camera.height,
+        background=behind,
+        eps2d=eps2d,
+        check=False,
+    )
     image = image[0]
     return Rendering(
         image[..., :3],

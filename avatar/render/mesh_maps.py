@@ -25,7 +25,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.raster import MeshMaps, rasterize_triangles
 
 if TYPE_CHECKING:
-    from avatar.models.map_sampling import MapFrame
+    from avatar.render.map_frame import MapFrame
 
 
 @dataclass(frozen=True)

@@ -57,9 +57,11 @@ class InterpolateFunction(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
         out = pooled_empty(*face_id.shape, values.shape[1])
         native_library().smplxpp_interpolate(
-            *map(_pointer, inputs), *map(ctypes.c_int64, (face_id.numel(), values.shape[1])), _pointer(out),
+            *map(_pointer, inputs),
+            *map(ctypes.c_int64, (face_id.numel(), values.shape[1])),
+            _pointer(out),
             torch.get_num_threads(),
-        )  # fmt: skip
+        )
         return out
 
     @staticmethod
@@ -70,9 +72,12 @@ class InterpolateFunction(torch.autograd.Function):
         grad_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
         grad_barycentric = pooled_empty(*barycentric.shape) if ctx.needs_input_grad[1] else None
         native_library().smplxpp_interpolate_backward(
-            *map(_pointer, (*inputs, grad.contiguous())), *map(ctypes.c_int64, (face_id.numel(), *values.shape)),
-            _pointer(grad_values), _pointer(grad_barycentric), torch.get_num_threads(),
-        )  # fmt: skip
+            *map(_pointer, (*inputs, grad.contiguous())),
+            *map(ctypes.c_int64, (face_id.numel(), *values.shape)),
+            _pointer(grad_values),
+            _pointer(grad_barycentric),
+            torch.get_num_threads(),
+        )
         return grad_values, grad_barycentric, None, None
 
 

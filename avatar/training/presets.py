@@ -7,16 +7,16 @@ from typing import TypeVar
 
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
-from avatar.models.blend_shapes import BlendShapeConfig
-from avatar.models.config import require_choice
-from avatar.models.presets import NetworkPreset, network_preset
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.config import require_choice
+from avatar.models.networks.presets import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
-from avatar.training.bake import BakeConfig
-from avatar.training.compensate import CompensateConfig
-from avatar.training.fit_config import PRESETS, FitConfig
-from avatar.training.fit_teacher import FitTeacherConfig
-from avatar.training.pretrain import PretrainConfig
-from avatar.training.track import Level, TrackConfig
+from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.reference_fit.config import PRESETS, FitConfig
+from avatar.training.student.bake import BakeConfig
+from avatar.training.student.compensate import CompensateConfig
+from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.tracking.track import Level, TrackConfig
 
 LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
 """Of `BlendShapeConfig`, for local blend shapes."""
@@ -134,12 +134,18 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             weights=_LEAN_WEIGHTS,
         ),
         compensate=CompensateConfig(
-            iterations=size.compensate, items=1, views=3, rate=1e-3, null_share=0.2, attributes=1.0, seeded=True,
+            iterations=size.compensate,
+            items=1,
+            views=3,
+            rate=1e-3,
+            null_share=0.2,
+            attributes=1.0,
+            seeded=True,
             weights=_LEAN_WEIGHTS,
         ),
         blend_shapes=BlendShapeConfig(jaw=True),
         control_points=size.control_points,
-    )  # fmt: skip
+    )
 
 
 TRAINING_PRESETS: dict[str, TrainingPreset] = {

@@ -7,25 +7,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from avatar.data.sequence import AvatarSequence, evenly
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
-from avatar.models.blend_shapes import BlendShapeConfig
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.models.teacher import TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.models.tracked import Track, TrackedAvatar
-from avatar.training.bake import BakeConfig, BakeTask
-from avatar.training.compensate import CompensateConfig, CompensateTask
-from avatar.training.distributed import Distributed
-from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
-from avatar.training.gradient_task import GradientTask
-from avatar.training.loop import LoopConfig, Progress, run_training
-from avatar.training.machine import seeded
-from avatar.training.pretrain import PretrainConfig, PretrainFieldTask, PretrainTeacherTask
-from avatar.training.seed_shapes import seed_blend_shapes
-from avatar.training.sequence import AvatarSequence, evenly
-from avatar.training.track import TrackConfig, TrackTask
-from avatar.training.view_task import Preview, ViewConfig
+from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.loop import LoopConfig, Progress, run_training
+from avatar.training.engine.optimization_task import GradientTask
+from avatar.training.engine.photometric_task import Preview, ViewConfig
+from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.processes import Distributed
+from avatar.training.engine.random_state import seeded
+from avatar.training.student.bake import BakeConfig, BakeTask
+from avatar.training.student.compensate import CompensateConfig, CompensateTask
+from avatar.training.student.init_blend_shapes import seed_blend_shapes
+from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
+from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.track import TrackConfig, TrackTask
 
 TRACK, PRETRAIN = "track", "pretrain"
 """Folders of what comes before a training."""
@@ -65,9 +67,12 @@ class Session:
     ) -> Progress:
         """Train what `make` gives."""
         loop = LoopConfig(
-            iterations=config.iterations, evaluate_every=config.evaluate_every, max_seconds=self.max_seconds,
-            keep_end=keep_end, tensorboard=self.tensorboard,
-        )  # fmt: skip
+            iterations=config.iterations,
+            evaluate_every=config.evaluate_every,
+            max_seconds=self.max_seconds,
+            keep_end=keep_end,
+            tensorboard=self.tensorboard,
+        )
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
     def run_alone(self, make: Callable[[], GradientTask], config: ViewConfig | PretrainConfig) -> Progress:
@@ -146,11 +151,17 @@ def bake(
         pretrain = config.pretrain
         progress = session.within(PRETRAIN).run_alone(
             lambda: PretrainFieldTask(
-                sequence, made, teacher, pretrain, config.seed,
-                code_rate=config.code_rate, null_share=config.null_share, imagined=config.imagined,
+                sequence,
+                made,
+                teacher,
+                pretrain,
+                config.seed,
+                code_rate=config.code_rate,
+                null_share=config.null_share,
+                imagined=config.imagined,
             ),
             pretrain,
-        )  # fmt: skip
+        )
         if not progress.finished:
             return made.eval(), progress
         session = session.after(progress)

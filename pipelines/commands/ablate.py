@@ -18,9 +18,9 @@ from pipelines.commands.options import OptionalInt, OptionalPath
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
-    from avatar.training import Progress as TrainingProgress
+    from avatar.training.engine.loop import Progress as TrainingProgress
     from avatar.training.presets import TrainingPreset
-    from pipelines.ablate_stage import AblationOutcome
+    from pipelines.ablation.stage import AblationOutcome
 
 
 UNTOLD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "force", "json")
@@ -70,12 +70,12 @@ class Ablate:
     def run(self) -> dict[str, Any]:
         """Train, measure, write and print the table."""
         require_avatar("training avatars")
-        from avatar.evaluation.ablation_plan import ablation_rows
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig
-        from avatar.training import choose_device
-        from pipelines.ablate_stage import AblationRun, ablate
-        from pipelines.train_inputs import TrainInputs
+        from avatar.training.engine.device import choose_device
+        from pipelines.ablation.rows import ablation_rows
+        from pipelines.ablation.stage import AblationRun, ablate
+        from pipelines.stages.train_inputs import TrainInputs
 
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:
@@ -88,11 +88,13 @@ class Ablate:
             outcome = ablate(
                 self.run_folder,
                 TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale),
-                rows, preset, config,
+                rows,
+                preset,
+                config,
                 AblationRun(
                     self.command(), choose_device(self.device), 60.0 * self.max_minutes, self.force, training, measuring
                 ),
-            )  # fmt: skip
+            )
         if not self.json:
             _print(outcome)
         return outcome.results
@@ -137,9 +139,14 @@ Measuring = Callable[[str, int, int], None]
 def _progress(*, enabled: bool) -> Iterator[tuple[Training, Measuring]]:
     """A bar a piece with loss, held-out PSNR and speed, and one while a row is measured."""
     columns = (
-        TextColumn("{task.description:<18}"), BarColumn(bar_width=10), MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description:<18}"),
+        BarColumn(bar_width=10),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     tasks: dict[str, Any] = {}
     quality: dict[str, str] = {}
     with Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0) as bar:

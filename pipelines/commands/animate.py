@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.progress import track
 
 from pipelines.commands.options import OptionalFloat, OptionalInt
-from pipelines.film import FRAME_FOLDER, SUFFIXES, write_film
-from pipelines.pictures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
+from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
+from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
 from smplxpp.core.params import BodyParams
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 TEMPLATE_FILE = Path("60_assemble") / "smplxpp.npz"
 DEFAULT_FPS = 20.0
@@ -127,9 +127,10 @@ class Animate:
         chosen = range(count)[self.start : self.stop : self.step]
         if not len(chosen):
             raise InputError(
-                "frames", expected=f"some of the {count} frames of {self.params.name}",
+                "frames",
+                expected=f"some of the {count} frames of {self.params.name}",
                 received=f"--start {self.start} --stop {self.stop} --step {self.step}",
-            )  # fmt: skip
+            )
         fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
         return replace(params.select(list(chosen)), fps=fps)
 

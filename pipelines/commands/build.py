@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pipelines.build_config import FIT_STAGE, STAGES, TRAIN_STAGES, BuildConfig, BuildInputs
 from pipelines.commands.options import OptionalPath
-from pipelines.evaluate_config import EVALUATE_STAGE
-from pipelines.progress import stage_progress
+from pipelines.commands.progress import stage_progress
+from pipelines.runs.stage import StageRecord
+from pipelines.stages.build_config import FIT_STAGE, STAGES, TRAIN_STAGES, BuildConfig, BuildInputs
+from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from smplxpp.capture import find_reference
-from smplxpp.core.artifact import StageRecord
 from smplxpp.core.errors import InputError
 
 StageName = Literal[STAGES]  # type: ignore[valid-type]
@@ -74,9 +74,9 @@ class Build:
 
     def run(self) -> dict:
         """Build, write metrics.json and the report, print the summary."""
-        from pipelines.build_report import write_build_report
-        from pipelines.build_template import build
         from pipelines.commands.inspect import Inspect
+        from pipelines.report.sections.build import write_build_report
+        from pipelines.stages.build import build
 
         config, inputs = self.config(), self.inputs()
         count = STAGES.index(self.until_stage) - STAGES.index(self.from_stage) + 1
@@ -109,31 +109,45 @@ class Build:
         """
         if (self.capture is None) == (self.scan is None):
             raise InputError(
-                "input", expected="either --capture, or --scan with --params",
+                "input",
+                expected="either --capture, or --scan with --params",
                 received="both" if self.capture else "neither",
-            )  # fmt: skip
+            )
         label_set = self.label_set
         if self.capture is not None:
             found = find_reference(self.capture, frame=self.frame, params=self.params)
             labels = self.labels or (found.scan_labels if self.label_source != "views" else None)
             if labels is None and not found.label_maps:
                 raise InputError(
-                    f"capture {found.subject}", expected="labels of the scan or label maps of its views",
-                    received="neither", remedy="name a file with --labels",
-                )  # fmt: skip
+                    f"capture {found.subject}",
+                    expected="labels of the scan or label maps of its views",
+                    received="neither",
+                    remedy="name a file with --labels",
+                )
             motion = self.capture / "params" / "params.npz"
             return BuildInputs(
-                subject=found.subject, scan=found.scan, params=found.params, frame=found.params_frame, labels=labels,
-                label_maps={} if labels else found.label_maps, cameras=None if labels else found.cameras_file,
+                subject=found.subject,
+                scan=found.scan,
+                params=found.params,
+                frame=found.params_frame,
+                labels=labels,
+                label_maps={} if labels else found.label_maps,
+                cameras=None if labels else found.cameras_file,
                 label_set="capture" if label_set == "auto" else label_set,
-                motion=motion if motion.is_file() else None, body=self.body,
-            )  # fmt: skip
+                motion=motion if motion.is_file() else None,
+                body=self.body,
+            )
         if self.params is None:
             raise InputError("input", expected="--params with --scan", received="no --params")
         return BuildInputs(
-            subject=self.scan.stem, scan=self.scan, params=self.params, frame=self.frame, labels=self.labels,
-            label_set="4ddress" if label_set == "auto" else label_set, body=self.body,
-        )  # fmt: skip
+            subject=self.scan.stem,
+            scan=self.scan,
+            params=self.params,
+            frame=self.frame,
+            labels=self.labels,
+            label_set="4ddress" if label_set == "auto" else label_set,
+            body=self.body,
+        )
 
     def config(self) -> BuildConfig:
         """The choices of this build.
@@ -148,10 +162,13 @@ class Build:
                 "option budgets", expected=f"parts among {', '.join(default.budgets)}", received=", ".join(unknown)
             )
         for name, value, least, most in (
-            ("clearance-mm", self.clearance_mm, 0.1, 10.0), ("max-influences", self.max_influences, 1, math.inf),
-            ("samples", self.samples, 1000, math.inf), ("seed", self.seed, 0, math.inf),
-            ("frame", self.frame, 0, math.inf), ("budgets", min(self.budgets.values(), default=100), 100, math.inf),
-        ):  # fmt: skip
+            ("clearance-mm", self.clearance_mm, 0.1, 10.0),
+            ("max-influences", self.max_influences, 1, math.inf),
+            ("samples", self.samples, 1000, math.inf),
+            ("seed", self.seed, 0, math.inf),
+            ("frame", self.frame, 0, math.inf),
+            ("budgets", min(self.budgets.values(), default=100), 100, math.inf),
+        ):
             if not (least <= value <= most and math.isfinite(value)):
                 limit = f" and at most {most:g}" if math.isfinite(most) else ""
                 raise InputError(

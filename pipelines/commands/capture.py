@@ -47,10 +47,10 @@ class CaptureCheckCommand:
 
     def run(self) -> dict:
         """Check; exit status 1 if something has to be corrected."""
-        from pipelines.capture_check import CheckConfig, check_capture, write_check_report
-        from pipelines.capture_check.report import check_as_dict
-        from pipelines.capture_check.terminal import print_check
-        from pipelines.progress import counted_progress
+        from pipelines.captures.check import CheckConfig, check_capture, write_check_report
+        from pipelines.captures.check.report import check_as_dict
+        from pipelines.captures.check.terminal import print_check
+        from pipelines.commands.progress import counted_progress
         from smplxpp.body import load_body
 
         body = load_body(self.body)
@@ -101,8 +101,8 @@ class CaptureConvertCommand:
 
     def run(self) -> dict:
         """Convert; exit status 1 if something had to be left out."""
-        from pipelines.capture_convert import ConvertConfig, convert_capture
-        from pipelines.progress import counted_progress
+        from pipelines.captures.convert import ConvertConfig, convert_capture
+        from pipelines.commands.progress import counted_progress
         from smplxpp.body import load_body
 
         body = None if self.body is None else load_body(self.body)
@@ -130,7 +130,7 @@ class CaptureConvertCommand:
 
     def _matte(self) -> None:
         """Run the model over every image that has no matte yet."""
-        from pipelines.progress import counted_progress
+        from pipelines.commands.progress import counted_progress
         from smplxpp.capture.matting import MattingModel, write_mattes
 
         if self.masks is None:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalPath
-from pipelines.progress import counted_progress
+from pipelines.commands.progress import counted_progress
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -71,25 +71,35 @@ class Evaluate:
         from avatar.evaluation.protocol import ProtocolConfig
         from avatar.evaluation.report import EvalReport
         from avatar.evaluation.summary import evaluation_tables
-        from avatar.training import choose_device
-        from pipelines.build_report import rewrite_report
-        from pipelines.evaluate_config import REPORT_FILE
-        from pipelines.evaluate_stage import evaluate
-        from pipelines.train_inputs import TrainInputs
+        from avatar.training.engine.device import choose_device
+        from pipelines.report.sections.build import rewrite_report
+        from pipelines.stages.evaluate import evaluate
+        from pipelines.stages.evaluate_config import REPORT_FILE
+        from pipelines.stages.train_inputs import TrainInputs
 
         protocol = ProtocolConfig(sets=self.sets, every=self.every, held_out_frames=self.hold_out_frames)
         if min(self.speed_size) < 1:
             raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
         config = EvaluationConfig(
-            protocol=protocol, metric=self.metric, samples=self.samples, seed=self.seed, speed_size=self.speed_size,
-            speed_pictures=self.speed_pictures, shown=self.shown,
-        )  # fmt: skip
+            protocol=protocol,
+            metric=self.metric,
+            samples=self.samples,
+            seed=self.seed,
+            speed_size=self.speed_size,
+            speed_pictures=self.speed_pictures,
+            shown=self.shown,
+        )
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
         with counted_progress("frames", enabled=not self.json) as progress:
             record = evaluate(
-                self.run_folder, inputs, config, models=self.models, device=choose_device(self.device),
-                force=self.force, progress=progress,
-            )  # fmt: skip
+                self.run_folder,
+                inputs,
+                config,
+                models=self.models,
+                device=choose_device(self.device),
+                force=self.force,
+                progress=progress,
+            )
         page = self.run_folder / "report.html"
         if not self.no_report and (record.ran or not page.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with it")
@@ -98,9 +108,12 @@ class Evaluate:
             console = Console()
             for table in evaluation_tables(report).values():
                 console.print(table.text(), highlight=False, soft_wrap=True)
-            console.print(f"{'' if record.ran else 'stands, not run again; '}tables  {record.folder / 'tables'}\n"
-                          f"views   {record.folder / 'pictures'}", soft_wrap=True, highlight=False)  # fmt: skip
+            console.print(
+                f"{'' if record.ran else 'stands, not run again; '}tables  {record.folder / 'tables'}\n"
+                f"views   {record.folder / 'pictures'}",
+                soft_wrap=True,
+                highlight=False,
+            )
             if page.is_file():
                 console.print(f"report  {page}", soft_wrap=True, highlight=False)
-        return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran,
-                "checks": record.manifest["checks"]}  # fmt: skip
+        return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}

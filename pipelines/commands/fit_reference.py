@@ -14,12 +14,12 @@ from rich.table import Table
 
 from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalInt, OptionalPath
-from pipelines.progress import training_progress
-from smplxpp.core.artifact import StageRecord
+from pipelines.commands.progress import training_progress
+from pipelines.runs.stage import StageRecord
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
-    from avatar.training import FitConfig
+    from avatar.training.reference_fit.config import FitConfig
 
 log = logging.getLogger(__name__)
 
@@ -65,9 +65,9 @@ class FitReference:
     def run(self) -> dict:
         """Fit, write the report, print the figures."""
         require_avatar("fitting Gaussians")
-        from avatar.training import choose_device
-        from pipelines.build_report import rewrite_report
-        from pipelines.fit_stage import FitInputs, fit
+        from avatar.training.engine.device import choose_device
+        from pipelines.report.sections.build import rewrite_report
+        from pipelines.stages.fit import FitInputs, fit
 
         inputs = FitInputs(self.capture, self.frame, self.params, self.body, self.hold_out, self.scale)
         if not self.max_minutes > 0:
@@ -75,9 +75,14 @@ class FitReference:
         config = self.config()
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:
             record = fit(
-                self.run_folder, inputs, config, device=choose_device(self.device),
-                max_seconds=60.0 * self.max_minutes, force=self.force, progress=progress,
-            )  # fmt: skip
+                self.run_folder,
+                inputs,
+                config,
+                device=choose_device(self.device),
+                max_seconds=60.0 * self.max_minutes,
+                force=self.force,
+                progress=progress,
+            )
         report = self.run_folder / "report.html"
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
@@ -94,7 +99,7 @@ class FitReference:
         """
         from dataclasses import replace
 
-        from avatar.training import PRESETS
+        from avatar.training.reference_fit.config import PRESETS
 
         config = PRESETS[self.preset]
         count = config.sampling.count if self.gaussians is None else self.gaussians
@@ -116,8 +121,10 @@ def _print(record: StageRecord, report: Path) -> None:
     keys = ("psnr", "psnr_image", "ssim", "psnr_head")
 
     def add(name: str, figures: dict[str, Any], **style: Any) -> None:
-        cells = [f"{figures[key]:.4f}" if key == "ssim" else "-" if figures.get(key) is None else f"{figures[key]:.2f}"
-                 for key in keys]  # fmt: skip
+        cells = [
+            f"{figures[key]:.4f}" if key == "ssim" else "-" if figures.get(key) is None else f"{figures[key]:.2f}"
+            for key in keys
+        ]
         table.add_row(name, *cells, **style)
 
     for name, figures in numbers["held_out"].items():
@@ -133,7 +140,10 @@ def _print(record: StageRecord, report: Path) -> None:
         f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}",
         soft_wrap=True,
     )
-    for name, path in (("splats", record.folder / "splats.ply"), ("views", record.folder / "previews"),
-                       ("report", report)):  # fmt: skip
+    for name, path in (
+        ("splats", record.folder / "splats.ply"),
+        ("views", record.folder / "previews"),
+        ("report", report),
+    ):
         if path.exists():
             console.print(f"{name}  {path}", soft_wrap=True, highlight=False)

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.build_config import FIT_STAGE, STAGES, TRAIN_STAGES
-from pipelines.evaluate_config import EVALUATE_STAGE
 from pipelines.report.model import CheckRow, count_statuses, worst_status
-from smplxpp.core.artifact import read_manifest
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.build_config import FIT_STAGE, STAGES, TRAIN_STAGES
+from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from smplxpp.core.errors import InputError
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
@@ -122,8 +122,9 @@ def _mark_outdated(stages: list[dict[str, Any]]) -> None:
     outdated: set[str] = set()
     for stage in stages:
         inputs, own = stage.pop("inputs"), stage.pop("digests")
-        changed = any(digests.get(file, digest) != digest or file.split("/")[0] in outdated
-                      for file, digest in inputs.items())  # fmt: skip
+        changed = any(
+            digests.get(file, digest) != digest or file.split("/")[0] in outdated for file, digest in inputs.items()
+        )
         if stage["state"] == "done" and changed:
             stage["state"] = "outdated"
         if changed:

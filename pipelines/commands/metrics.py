@@ -217,9 +217,11 @@ def _by_key(files: list[Path], key: Any, folder: Path) -> dict[str, Path]:
         other = keyed.setdefault(key(path), path)
         if other is not path:
             raise InputError(
-                f"folder {folder}", expected="one file a frame", received=f"{other.name} and {path.name}",
+                f"folder {folder}",
+                expected="one file a frame",
+                received=f"{other.name} and {path.name}",
                 remedy="give the files of both folders the same names",
-            )  # fmt: skip
+            )
     return keyed
 
 

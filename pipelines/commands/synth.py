@@ -9,7 +9,7 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from pipelines.synth import SynthConfig, make_capture
+from pipelines.synth.make_capture import SynthConfig, make_capture
 from smplxpp.core.errors import InputError
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -56,8 +56,17 @@ class Synth:
                 remedy="name another, or delete it",
             )
         names = (
-            "cameras", "frames", "size", "seed", "fps", "layout", "quality", "truth_step", "normals_step", "scan_faces",
-        )  # fmt: skip
+            "cameras",
+            "frames",
+            "size",
+            "seed",
+            "fps",
+            "layout",
+            "quality",
+            "truth_step",
+            "normals_step",
+            "scan_faces",
+        )
         config = SynthConfig(**{name: getattr(self, name) for name in names})
         console = Console(stderr=True)
         columns = (TextColumn("{task.description:<8}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())

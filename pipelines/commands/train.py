@@ -15,16 +15,16 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.build_config import FIT_STAGE
 from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath
-from pipelines.progress import training_progress
-from smplxpp.core.artifact import StageRecord
+from pipelines.commands.progress import training_progress
+from pipelines.runs.stage import StageRecord
+from pipelines.stages.build_config import FIT_STAGE
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.training.presets import TrainingPreset
-    from pipelines.train_stage import TrainConfig
+    from pipelines.stages.train import TrainConfig
 
 log = logging.getLogger(__name__)
 STAGES = ("fit", "teacher", "bake", "compensate")
@@ -101,10 +101,10 @@ class Train:
         require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
             logging.disable(logging.WARNING)  # the first process says it
-        from avatar.training import choose_device
-        from avatar.training.distributed import join_processes
-        from pipelines.train_inputs import TrainInputs, open_scene
-        from pipelines.train_stage import TrainOptions, train, with_batch
+        from avatar.training.engine.device import choose_device
+        from avatar.training.engine.processes import join_processes
+        from pipelines.stages.train import TrainOptions, train, with_batch
+        from pipelines.stages.train_inputs import TrainInputs, open_scene
 
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
         if not self.max_minutes > 0:
@@ -119,9 +119,12 @@ class Train:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
             options = TrainOptions(
-                stages=self.stages(), max_seconds=60.0 * self.max_minutes, force=self.force,
-                tensorboard=self.tensorboard, bar=bar,
-            )  # fmt: skip
+                stages=self.stages(),
+                max_seconds=60.0 * self.max_minutes,
+                force=self.force,
+                tensorboard=self.tensorboard,
+                bar=bar,
+            )
             records = train(self.run_folder, inputs, scene, config, options, together)
             if not together.first:
                 return None
@@ -146,14 +149,16 @@ class Train:
             InputError: numbers out of range. MissingExtraError: a perceptual metric that is not installed.
         """
         from avatar.training.presets import training_preset
-        from pipelines.train_stage import TrainConfig, with_batch, with_perceptual
+        from pipelines.stages.train import TrainConfig, with_batch, with_perceptual
 
         given = {stage: getattr(self, f"{stage}_iterations") for stage in STAGES}
         for name, value, least in (
-            ("gaussians", self.gaussians, 1), ("batch", self.batch, 1),
-            ("seed", self.seed, 0), ("max-megabytes", self.max_megabytes, 0),
+            ("gaussians", self.gaussians, 1),
+            ("batch", self.batch, 1),
+            ("seed", self.seed, 0),
+            ("max-megabytes", self.max_megabytes, 0),
             *((f"{stage}-iterations", value, 1) for stage, value in given.items()),
-        ):  # fmt: skip
+        ):
             if value is not None and not value >= least:
                 raise InputError(f"option {name}", expected=f"a number, at least {least}", received=f"{value:g}")
         share = 1.0 if self.iterations_share is None else self.iterations_share
@@ -173,7 +178,7 @@ class Train:
         )
 
     def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:
-        from pipelines.build_report import rewrite_report
+        from pipelines.report.sections.build import rewrite_report
 
         report = self.run_folder / "report.html"
         ran = any(record.ran for record in records.values())
@@ -235,20 +240,24 @@ def _print(records: dict[str, StageRecord], report: Path) -> None:
     for record in records.values():
         numbers = record.manifest["numbers"]
         stage = record.folder.name
-        views = numbers["mean"].get("held_out", numbers["mean"].get("train", {})) if stage == FIT_STAGE else (
-            numbers.get("novel_view", {})
-        )  # fmt: skip
+        views = (
+            numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
+            if stage == FIT_STAGE
+            else (numbers.get("novel_view", {}))
+        )
         poses = numbers.get("novel_pose", {})
         state = "" if numbers["finished"] else "stopped: the same command goes on"
         table.add_row(
             stage,
             f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",
             f"{numbers['seconds_of_steps']:.0f}",
-            *(f"{values[key]:.{digits}f}" if key in values else "-"
-              for values, key, digits in ((views, "psnr", 2), (views, "ssim", 4), (poses, "psnr", 2))),
+            *(
+                f"{values[key]:.{digits}f}" if key in values else "-"
+                for values, key, digits in ((views, "psnr", 2), (views, "ssim", 4), (poses, "psnr", 2))
+            ),
             ", ".join(f"{size / 1e6:.1f}" for size in numbers.get("bytes", {}).values()) or "-",
             state if record.ran or state else "stands",
-        )  # fmt: skip
+        )
     console.print(table)
     if report.is_file():
         console.print(f"report  {report}", soft_wrap=True, highlight=False)

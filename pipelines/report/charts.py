@@ -25,10 +25,16 @@ def histogram_statistics(values: np.ndarray) -> dict[str, float]:
         )
     p5, p50, p95, p99 = np.percentile(finite, [5, 50, 95, 99])
     return {
-        "count": len(finite), "not_finite": len(values) - len(finite), "mean": float(finite.mean()),
-        "p5": float(p5), "p50": float(p50), "p95": float(p95), "p99": float(p99),
-        "min": float(finite.min()), "max": float(finite.max()),
-    }  # fmt: skip
+        "count": len(finite),
+        "not_finite": len(values) - len(finite),
+        "mean": float(finite.mean()),
+        "p5": float(p5),
+        "p50": float(p50),
+        "p95": float(p95),
+        "p99": float(p99),
+        "min": float(finite.min()),
+        "max": float(finite.max()),
+    }
 
 
 def histogram_svg(histogram: Histogram) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.core.artifact import Check
+from pipelines.runs.checks import Check
 from smplxpp.core.errors import InputError
 
 STATUSES = ("fail", "warn", "pass")  # worst first

@@ -18,7 +18,7 @@ from smplxpp.core.labels import SKIN
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import BODY_PART, Template
+from smplxpp.template.template import BODY_PART, Template
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,9 +72,10 @@ def load_params(
         raise InputError(f"{path}", expected=f"frames of person {person}", received="none")
     if absent:
         warnings.warn(
-            f"{path}: person {person} is missing in {len(absent)} of {len(files)} frames, left out "
-            f"(first {absent[0]})", GeometryWarning, stacklevel=2,
-        )  # fmt: skip
+            f"{path}: person {person} is missing in {len(absent)} of {len(files)} frames, left out (first {absent[0]})",
+            GeometryWarning,
+            stacklevel=2,
+        )
     params = _joined(parts, body, up)
     return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
 
@@ -138,9 +139,11 @@ def _read_content(content: Any, layout: str, person: int | None, source: str) ->
         ) from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            source, expected=f"the layout {layout}", received=f"{type(error).__name__}: {error}",
+            source,
+            expected=f"the layout {layout}",
+            received=f"{type(error).__name__}: {error}",
             remedy="see the layouts in `smplxpp params convert --help`",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def _content(path: Path) -> Any:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
-from smplxpp.body.skinning import forward_kinematics, skin
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 from smplxpp.core.rotations import array_namespace, matrix_from_rotvec
+from smplxpp.skinning.linear_blend import forward_kinematics, skin
 
 _WIDTHS = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
 

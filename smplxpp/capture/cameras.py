@@ -29,9 +29,11 @@ def read_cameras(path: str | Path) -> list[Camera]:
     distorted = [camera.name for camera, distortion in lenses if distortion is not None]
     if distorted:
         raise InputError(
-            f"camera file {path}", expected="cameras without distortion", received=f"distortion of {distorted[:5]}",
+            f"camera file {path}",
+            expected="cameras without distortion",
+            received=f"distortion of {distorted[:5]}",
             remedy="undistort the images; a capture that is opened whole is undistorted on reading",
-        )  # fmt: skip
+        )
     return [camera for camera, _ in lenses]
 
 

@@ -91,7 +91,16 @@ def undistort(
         return ctypes.c_void_p(array.ctypes.data)
 
     native_library().smplxpp_undistort(
-        pointer(image), image.shape[1], image.shape[0], channels,
-        pointer(inverse), pointer(K), pointer(lens), int(nearest), pointer(out), width, height,
-    )  # fmt: skip
+        pointer(image),
+        image.shape[1],
+        image.shape[0],
+        channels,
+        pointer(inverse),
+        pointer(K),
+        pointer(lens),
+        int(nearest),
+        pointer(out),
+        width,
+        height,
+    )
     return out

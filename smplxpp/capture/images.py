@@ -89,9 +89,10 @@ def _read_npy_labels(path: Path) -> np.ndarray:
         raise InputError(f"label map {path}", expected="an integer array", received=str(error)) from None
     if values.ndim != 2 or values.dtype.kind not in "iub" or values.min(initial=0) < 0 or values.max(initial=0) > 255:
         raise InputError(
-            f"label map {path}", expected="integers from 0 to 255 of shape (H, W)",
+            f"label map {path}",
+            expected="integers from 0 to 255 of shape (H, W)",
             received=f"{values.dtype} of shape {values.shape}",
-        )  # fmt: skip
+        )
     return values.astype(np.uint8)
 
 

@@ -61,9 +61,10 @@ class MattingModel:
         entry = self._session.get_inputs()[0]
         if len(self._session.get_inputs()) != 1 or len(entry.shape) != 4 or entry.shape[1] not in (3, "C", None):
             raise InputError(
-                f"matting model {path}", expected="one input of shape (1, 3, H, W)",
+                f"matting model {path}",
+                expected="one input of shape (1, 3, H, W)",
                 received=f"{[(i.name, i.shape) for i in self._session.get_inputs()]}",
-            )  # fmt: skip
+            )
         self._name = entry.name
         self._dtype = np.float16 if "float16" in entry.type else np.float32
         height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in entry.shape[2:])
@@ -85,9 +86,10 @@ class MattingModel:
         mattes = [np.asarray(o, dtype=np.float32) for o in outputs if np.ndim(o) >= 2 and np.size(o) == self._pixels]
         if not mattes:
             raise InputError(
-                "matting model", expected=f"an output of {self._size[1]} x {self._size[0]} values",
+                "matting model",
+                expected=f"an output of {self._size[1]} x {self._size[0]} values",
                 received=f"shapes {[np.shape(o) for o in outputs]}",
-            )  # fmt: skip
+            )
         matte = mattes[0].reshape(self._size[1], self._size[0])
         inside = matte.min() >= -1e-3 and matte.max() <= 1.0 + 1e-3
         return np.clip(matte, 0.0, 1.0) if inside else 1.0 / (1.0 + np.exp(-np.clip(matte, -30, 30)))

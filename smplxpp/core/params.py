@@ -98,9 +98,10 @@ class BodyParams:
         for name in ("left_hand_pose", "right_hand_pose"):
             if getattr(self, name).shape[1] != 45:
                 raise InputError(
-                    f"parameter {name}", expected="45 axis-angle numbers",
+                    f"parameter {name}",
+                    expected="45 axis-angle numbers",
                     received=f"{getattr(self, name).shape[1]} PCA coefficients",
-                )  # fmt: skip
+                )
         return np.concatenate([getattr(self, name) for name, _ in POSE_BLOCKS], axis=1).reshape(len(self), -1, 3)
 
     def frame(self, index: int) -> BodyParams:
@@ -165,9 +166,11 @@ class BodyParams:
         missing = [name for name in required if name not in values]
         if missing:
             raise InputError(
-                source, expected=f"the keys {', '.join(required)}", received=f"keys {sorted(values)}",
+                source,
+                expected=f"the keys {', '.join(required)}",
+                received=f"keys {sorted(values)}",
                 remedy="see `smplxpp params convert --help` for the layouts that are read",
-            )  # fmt: skip
+            )
         zeros = {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS} | {"expression": np.zeros(10)}
         arrays = zeros | {name: values[name] for name in ARRAY_NAMES if name in values}
         fps = float(values["fps"]) if "fps" in values else None

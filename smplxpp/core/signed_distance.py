@@ -78,10 +78,11 @@ class SignedDistanceField:
     def _outer_faces(self, mesh: TriangleMesh) -> np.ndarray:
         if np.einsum("ij,ij->", mesh.face_centers - mesh.vertices.mean(axis=0), mesh.face_cross) < 0:
             raise InputError(
-                "signed distance", expected="a solid with counter-clockwise faces seen from outside",
+                "signed distance",
+                expected="a solid with counter-clockwise faces seen from outside",
                 received="faces that point inward",
                 remedy="reverse the order of the corners of every face",
-            )  # fmt: skip
+            )
         self._winding = igl.FastWindingNumberBVH()
         self._winding.init(mesh.vertices, mesh.faces)
         before = mesh.face_centers + _BURIED_PROBE * mesh.bbox_diagonal * mesh.face_normals

@@ -9,11 +9,11 @@ import pygltflib
 
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.params import BodyParams
-from smplxpp.core.template import BODY_PART, Template
 from smplxpp.export.gltf_animation import add_animation
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_mesh import add_parts
 from smplxpp.export.gltf_skin import add_skin
+from smplxpp.template.template import BODY_PART, Template
 
 
 def write_glb(

@@ -13,9 +13,9 @@ from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
-from smplxpp.core.template import Template
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
+from smplxpp.template.template import Template
 
 DEFAULT_FPS = 30.0
 # A joint that expressions move by less, in metres, keeps its place at rest.
@@ -42,9 +42,11 @@ def joint_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np
     """
     if template.joint_count not in JOINT_NAMES:
         raise InputError(
-            "animation", expected=f"a template of {', '.join(map(str, sorted(JOINT_NAMES)))} joints, as the parameters",
-            received=f"{template.joint_count} joints", remedy="write the file without an animation",
-        )  # fmt: skip
+            "animation",
+            expected=f"a template of {', '.join(map(str, sorted(JOINT_NAMES)))} joints, as the parameters",
+            received=f"{template.joint_count} joints",
+            remedy="write the file without an animation",
+        )
     posed = _joints_alone(template).forward(replace(params, betas=np.zeros((len(params), 0))))
     global_rotations = posed.posed_from_rest[..., :3, :3]
     parents = template.parents

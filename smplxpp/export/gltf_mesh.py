@@ -7,9 +7,9 @@ import pygltflib
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from smplxpp.core.labels import LABELS
-from smplxpp.core.template import BODY_PART, Template
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 from smplxpp.export.gltf_skin import influence_sets, quantized_influences
+from smplxpp.template.template import BODY_PART, Template
 
 # A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
 _STILL = 1e-6

@@ -6,8 +6,8 @@ import numpy as np
 import pygltflib
 
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
 from smplxpp.export.gltf_buffers import BufferBuilder
+from smplxpp.template.template import Template
 
 # glTF names influences four at a time; two sets are what engines that read more than one take.
 SET_SIZE = 4
@@ -50,7 +50,7 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
     """Add the skeleton: a root node, a node for each joint at rest, and the skin that binds them.
 
     A joint's node holds its offset from its parent; its inverse bind matrix is the translation by `-J_j`, so that
-    the global transform of the node times it is `posed_from_rest` of `smplxpp.body.skinning`.
+    the global transform of the node times it is `posed_from_rest` of `smplxpp.skinning.linear_blend`.
 
     Returns:
         (J,) indices of the joints' nodes. The skeleton's root node is the one before the first.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.core.atomic import atomic_write_text
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 
 def write_obj(path: str | Path, template: Template) -> None:

@@ -15,8 +15,14 @@ from smplxpp.core.safe_pickle import safe_load
 from smplxpp.segment.labels import LabelSet, map_labels
 
 _KEYS = (
-    "label", "labels", "scan_labels", "vertex_label", "vertex_labels", "face_label", "face_labels",
-)  # fmt: skip
+    "label",
+    "labels",
+    "scan_labels",
+    "vertex_label",
+    "vertex_labels",
+    "face_label",
+    "face_labels",
+)
 
 
 def read_labels(

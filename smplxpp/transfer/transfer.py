@@ -75,9 +75,14 @@ def transfer_weights(
     dense = np.zeros((target.vertex_count, joint_count))
     dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, length, config)
     return SkinWeights.from_dense(
-        dense, max_influences=config.max_influences, matched=matched, distance=found.distance, angle=found.angle,
-        component=component, policies=policies,
-    )  # fmt: skip
+        dense,
+        max_influences=config.max_influences,
+        matched=matched,
+        distance=found.distance,
+        angle=found.angle,
+        component=component,
+        policies=policies,
+    )
 
 
 def _values(

@@ -27,9 +27,14 @@ def random_splats(count: int = 7, degree: int = 1) -> Splats:
         return rng.normal(size=(count, *shape)).astype(np.float32)
 
     return Splats(
-        means=normal(3), normals=normal(3), f_dc=normal(3), f_rest=normal((degree + 1) ** 2 - 1, 3),
-        opacity_logits=normal(), log_scales=normal(3), quats=normal(4),
-    )  # fmt: skip
+        means=normal(3),
+        normals=normal(3),
+        f_dc=normal(3),
+        f_rest=normal((degree + 1) ** 2 - 1, 3),
+        opacity_logits=normal(),
+        log_scales=normal(3),
+        quats=normal(4),
+    )
 
 
 def assert_same(a: Splats, b: Splats) -> None:

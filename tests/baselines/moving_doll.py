@@ -13,25 +13,25 @@ from PIL import Image
 
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
-from avatar.models.blend_shapes import BlendShapeConfig
-from avatar.models.deformation_field import FieldConfig
-from avatar.models.presets import NetworkPreset
-from avatar.models.teacher import TeacherConfig
-from avatar.training.bake import BakeConfig
-from avatar.training.compensate import CompensateConfig
-from avatar.training.fit_config import FitConfig
-from avatar.training.fit_teacher import FitTeacherConfig
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.networks.presets import NetworkPreset
+from avatar.models.networks.teacher import TeacherConfig
+from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.presets import TrainingPreset
-from avatar.training.pretrain import PretrainConfig
-from avatar.training.track import Level, TrackConfig
+from avatar.training.reference_fit.config import FitConfig
+from avatar.training.student.bake import BakeConfig
+from avatar.training.student.compensate import CompensateConfig
+from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.tracking.track import Level, TrackConfig
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.camera import Camera
 from smplxpp.core.labels import LOWER, SKIN
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
 from smplxpp.raster import rasterize_mesh
+from smplxpp.template.template import Template
 
 WIDTH, HEIGHT = 48, 64
 TRAIN, HELD_OUT = ("Ring0", "Ring1", "Ring2", "Ring3"), "Held"
@@ -64,14 +64,25 @@ def template() -> Template:
         faces=np.concatenate([fine.faces, ball.faces + TORSO, cone.faces + count]),
         vertex_labels=np.repeat([SKIN.id, LOWER.id], [count, own - count]),
         vertex_part=np.repeat([0, 1], [count, own - count]),
-        part_names=("body", "lower"), vertex_colors=np.full((own, 3), 128),
-        weights=SkinWeights.from_dense(weights), joint_regressor=np.full((joints, count), 1.0 / count),
-        parents=body.parents, joint_names=body.joint_names, betas=np.zeros(2),
-        shape_basis=np.zeros((count, 3, 2)), expression_basis=0.002 * rng.normal(size=(count, 3, 2)),
-        pose_basis=None, left_hand_components=None, right_hand_components=None, left_hand_mean=None,
-        right_hand_mean=None, body_labels=np.zeros(count), body_label_names=("all",),
-        body_index=np.concatenate([np.arange(count), np.zeros(own - count)]), scan_index=np.full(own, -1),
-    )  # fmt: skip
+        part_names=("body", "lower"),
+        vertex_colors=np.full((own, 3), 128),
+        weights=SkinWeights.from_dense(weights),
+        joint_regressor=np.full((joints, count), 1.0 / count),
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=np.zeros(2),
+        shape_basis=np.zeros((count, 3, 2)),
+        expression_basis=0.002 * rng.normal(size=(count, 3, 2)),
+        pose_basis=None,
+        left_hand_components=None,
+        right_hand_components=None,
+        left_hand_mean=None,
+        right_hand_mean=None,
+        body_labels=np.zeros(count),
+        body_label_names=("all",),
+        body_index=np.concatenate([np.arange(count), np.zeros(own - count)]),
+        scan_index=np.full(own, -1),
+    )
 
 
 def params(frame: int) -> BodyParams:
@@ -110,10 +121,16 @@ def write_moving_capture(root: Path) -> Path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 Image.fromarray(image).save(path)
     entries = [
-        {"name": name, "w": WIDTH, "h": HEIGHT, "K": c.K.tolist(), "R": c.cam_from_world[:3, :3].tolist(),
-         "T": c.cam_from_world[:3, 3].tolist()}
+        {
+            "name": name,
+            "w": WIDTH,
+            "h": HEIGHT,
+            "K": c.K.tolist(),
+            "R": c.cam_from_world[:3, :3].tolist(),
+            "T": c.cam_from_world[:3, 3].tolist(),
+        }
         for name, c in cameras.items()
-    ]  # fmt: skip
+    ]
     (root / "cameras.json").write_text(json.dumps({"cameras": entries}))
     last = len(ANGLES) - 1
     about = {"name": "moving doll", "novel_views": [HELD_OUT], "novel_pose_frames": [last, last]}
@@ -136,12 +153,25 @@ def write_moving_run(run: Path) -> Path:
 def tiny_preset(iterations: int = 3) -> TrainingPreset:
     """All stages in a second, on 500 Gaussians."""
     teacher = TeacherConfig(
-        networks="shared", in_size=32, out_size=64, bottleneck=8, channel_base=64, channel_max=8, style_size=8,
-        style_layers=1, noise=False, zero_output=True,
-    )  # fmt: skip
+        networks="shared",
+        in_size=32,
+        out_size=64,
+        bottleneck=8,
+        channel_base=64,
+        channel_max=8,
+        style_size=8,
+        style_layers=1,
+        noise=False,
+        zero_output=True,
+    )
     track = TrackConfig(levels=(Level(0, 2, 2e-3),), control_points=60, views=2)
-    shared = {"iterations": iterations, "evaluations": 1, "evaluated": 1, "null_share": 0.2,
-              "weights": ReconstructionWeights(perceptual=0.0, alpha=0.1)}  # fmt: skip
+    shared = {
+        "iterations": iterations,
+        "evaluations": 1,
+        "evaluated": 1,
+        "null_share": 0.2,
+        "weights": ReconstructionWeights(perceptual=0.0, alpha=0.1),
+    }
     return TrainingPreset(
         networks=NetworkPreset(teacher, FieldConfig(width=16, hidden_layers=2, code_size=4)),
         fit=FitConfig(sampling=SamplingConfig(count=500), iterations=iterations, margin=4),

@@ -14,12 +14,12 @@ from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.baselines.point_mlp import PointMLPConfig
 from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig
+from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.models.deformation_field import FieldConfig
-from avatar.models.rig import Rig
+from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.training.machine import seeded
-from avatar.training.sequence import AvatarSequence
+from avatar.rig.rig import Rig
+from avatar.training.engine.random_state import seeded
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
 from tests.baselines.moving_doll import TORSO, open_moving, params, template

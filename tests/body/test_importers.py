@@ -97,9 +97,14 @@ def test_amass(tmp_path, params, pca_body, kind):
     blocks = [params.global_orient, params.body_pose, *face, params.left_hand_pose, params.right_hand_pose]
     rate = {"mocap_frame_rate": 120.0} if face else {"mocap_framerate": 120.0}
     np.savez(
-        tmp_path / "walk_poses.npz", poses=np.concatenate(blocks, axis=1), trans=params.transl, betas=params.betas[0],
-        gender="male", dmpls=np.zeros((FRAMES, 8)), **rate,
-    )  # fmt: skip
+        tmp_path / "walk_poses.npz",
+        poses=np.concatenate(blocks, axis=1),
+        trans=params.transl,
+        betas=params.betas[0],
+        gender="male",
+        dmpls=np.zeros((FRAMES, 8)),
+        **rate,
+    )
     read = load_params(tmp_path / "walk_poses.npz")
     expected = replace(params, expression=np.zeros((FRAMES, 10)), flat_hand_mean=True)
     if not face:
@@ -154,16 +159,23 @@ def easymocap_record(params: BodyParams, outer, index: int, *, person: int = 0) 
     poses = np.concatenate([*blocks, frame.jaw_pose, frame.leye_pose, frame.reye_pose], axis=1)
     assert poses.shape == (1, 87)
     return {
-        "id": person, "Rh": outer[0][index : index + 1], "Th": outer[1][index : index + 1], "poses": poses,
-        "shapes": frame.betas, "expression": frame.expression,
-    }  # fmt: skip
+        "id": person,
+        "Rh": outer[0][index : index + 1],
+        "Th": outer[1][index : index + 1],
+        "poses": poses,
+        "shapes": frame.betas,
+        "expression": frame.expression,
+    }
 
 
 def easymocap_truth(params: BodyParams, outer, body) -> np.ndarray:
     inner = replace(
-        params, global_orient=np.zeros((FRAMES, 3)), transl=np.zeros((FRAMES, 3)),
-        left_hand_pose=params.left_hand_pose[:, :6], right_hand_pose=params.right_hand_pose[:, :6],
-    )  # fmt: skip
+        params,
+        global_orient=np.zeros((FRAMES, 3)),
+        transl=np.zeros((FRAMES, 3)),
+        left_hand_pose=params.left_hand_pose[:, :6],
+        right_hand_pose=params.right_hand_pose[:, :6],
+    )
     return moved(body.forward(inner, flat_hand_mean=False).vertices, *outer)
 
 

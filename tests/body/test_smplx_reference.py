@@ -43,9 +43,14 @@ def ask_smplx(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     with warnings.catch_warnings(), as_float64:
         warnings.simplefilter("ignore")
         model = smplx.SMPLX(
-            str(path), num_betas=betas, num_expression_coeffs=expressions, use_pca=hand < 45,
-            num_pca_comps=hand, flat_hand_mean=flat, dtype=torch.float64,
-        )  # fmt: skip
+            str(path),
+            num_betas=betas,
+            num_expression_coeffs=expressions,
+            use_pca=hand < 45,
+            num_pca_comps=hand,
+            flat_hand_mean=flat,
+            dtype=torch.float64,
+        )
     tensors = {k: torch.tensor(v) for k, v in params.as_dict().items() if k != "flat_hand_mean"}
     with torch.no_grad():
         answer = model(**tensors)

@@ -197,9 +197,9 @@ def write_neus2(scene: Scene, root: Path) -> Path:
             K = np.eye(4)
             K[:3, :3] = camera.K
             pose = np.linalg.inv(camera.cam_from_world)
-            entries.append({
-                "file_path": f"../{file}", "transform_matrix": pose.tolist(), "intrinsic_matrix": K.tolist()
-            })  # fmt: skip
+            entries.append(
+                {"file_path": f"../{file}", "transform_matrix": pose.tolist(), "intrinsic_matrix": K.tolist()}
+            )
         size = {"w": camera.width, "h": camera.height}
         unit = {"aabb_scale": 1.0, "scale": 0.5, "offset": [0.5, 0.5, 0.5]}
         _json(root / "train" / f"transform_{frame:06d}.json", {"from_na": True, **size, **unit, "frames": entries})

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.models.deformation_field import FieldConfig
-from avatar.models.rig import Rig
+from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import Rig
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.labels import LOWER
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 from tests.training.doll import HELD_OUT, doll, write_capture
 
 FRAMES, NOVEL = 6, (4, 5)

@@ -12,17 +12,16 @@ import pytest
 import torch
 from torch import nn
 
-from avatar.evaluation import image as metric_names
+from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import EvaluationConfig, evaluate_models
-from avatar.evaluation.image import load_metric
-from avatar.evaluation.posing import at_rest
 from avatar.evaluation.protocol import SETS, ProtocolConfig
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport
-from avatar.evaluation.speed import bytes_on_disk, fitted, measure_speed, parameter_counts
 from avatar.evaluation.summary import evaluation_tables, summary_figures
-from avatar.losses.perceptual import MissingPackageError
-from avatar.models.rig import Rig
-from avatar.training.sequence import AvatarSequence
+from avatar.losses import perceptual as metric_names
+from avatar.losses.perceptual import MissingPackageError, load_metric
+from avatar.metrics.speed import bytes_on_disk, fitted, measure_speed, parameter_counts
+from avatar.rig.posed import at_rest
+from avatar.rig.rig import Rig
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams

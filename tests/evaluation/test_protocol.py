@@ -102,9 +102,7 @@ def test_an_image_of_another_size_is_told_before_work_starts(tmp_path):
         with_people(capture, view_sets(capture, ProtocolConfig()))
 
 
-@pytest.mark.parametrize(
-    "options", [{"sets": ("novel",)}, {"every": 0}, {"cameras_a_frame": 0}]
-)  # fmt: skip
+@pytest.mark.parametrize("options", [{"sets": ("novel",)}, {"every": 0}, {"cameras_a_frame": 0}])
 def test_unusable_choices_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options)).split("_")[0]):
         ProtocolConfig(**options)

@@ -7,7 +7,7 @@ import numpy as np
 from smplxpp.body import load_body
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 
 def random_template(
@@ -56,15 +56,29 @@ def open_body_template() -> Template:
     count = body.vertex_count
     rng = np.random.default_rng(0)
     return Template(
-        vertices=body.v_template, faces=body.faces, vertex_labels=np.zeros(count), vertex_part=np.zeros(count),
-        part_names=("body",), vertex_colors=rng.integers(0, 256, (count, 3)),
-        weights=SkinWeights.from_dense(body.weights), joint_regressor=body.joint_regressor, parents=body.parents,
-        joint_names=body.joint_names, betas=np.zeros(body.num_betas), shape_basis=body.shapedirs,
-        expression_basis=body.exprdirs, pose_basis=body.posedirs, left_hand_components=body.left_hand_components,
-        right_hand_components=body.right_hand_components, left_hand_mean=body.left_hand_mean,
-        right_hand_mean=body.right_hand_mean, body_labels=body.part_labels,
-        body_label_names=body.part_label_names, body_index=np.arange(count), scan_index=np.full(count, -1),
-    )  # fmt: skip
+        vertices=body.v_template,
+        faces=body.faces,
+        vertex_labels=np.zeros(count),
+        vertex_part=np.zeros(count),
+        part_names=("body",),
+        vertex_colors=rng.integers(0, 256, (count, 3)),
+        weights=SkinWeights.from_dense(body.weights),
+        joint_regressor=body.joint_regressor,
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=np.zeros(body.num_betas),
+        shape_basis=body.shapedirs,
+        expression_basis=body.exprdirs,
+        pose_basis=body.posedirs,
+        left_hand_components=body.left_hand_components,
+        right_hand_components=body.right_hand_components,
+        left_hand_mean=body.left_hand_mean,
+        right_hand_mean=body.right_hand_mean,
+        body_labels=body.part_labels,
+        body_label_names=body.part_label_names,
+        body_index=np.arange(count),
+        scan_index=np.full(count, -1),
+    )
 
 
 def random_motion(frames: int, *, expressions: int, fps: float | None = None, seed: int = 0) -> BodyParams:

@@ -13,7 +13,7 @@ from avatar.gaussians.binding import THICKNESS, topology_digest, world_from_loca
 from avatar.gaussians.sampling import SamplingConfig, head_faces, sample_on_mesh, seen_faces
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 from tests.export.templates import open_body_template, random_template
 
 
@@ -128,10 +128,16 @@ def test_first_values(template):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("count", 0), ("head_share", 1.5), ("spread_by", "volume"), ("hidden_density", -0.1), ("touch", 0.0),
-        ("touch", float("nan")), ("opacity", 1.0), ("sh_degree", 4),
+        ("count", 0),
+        ("head_share", 1.5),
+        ("spread_by", "volume"),
+        ("hidden_density", -0.1),
+        ("touch", 0.0),
+        ("touch", float("nan")),
+        ("opacity", 1.0),
+        ("sh_degree", 4),
     ],
-)  # fmt: skip
+)
 def test_bad_settings_are_refused(name, value):
     with pytest.raises(InputError, match=name.replace("sh_degree", "degree")):
         SamplingConfig(**{name: value})

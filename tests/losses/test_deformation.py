@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
-from avatar.models.rig import Rig
 from avatar.models.teacher_avatar import map_frame
+from avatar.rig.rig import Rig
 from tests.training.dancing_doll import gaussians, template
 
 SIZE = 48

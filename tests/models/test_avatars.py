@@ -9,10 +9,10 @@ import torch
 
 from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.frames import triangle_frames
-from avatar.models.blend_shapes import BlendShapeConfig
-from avatar.models.rig import Rig
+from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import HALF_EXTENT, TeacherAvatar, map_frame
+from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
 from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
 

@@ -10,12 +10,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from avatar.models.blend_shapes import BlendShapeConfig
 from avatar.models.model_file import HEADER, SCHEMA, load_avatar, save_avatar
-from avatar.models.rig import Rig
+from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.models.tracked import ControlCage, Track
+from avatar.models.tracked_surface import ControlCage, Track
+from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
 from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
 
@@ -47,8 +47,12 @@ def make(kind: str, rig: Rig):
         )
         model.centre(rig.motion(dance().frame(frame)) for frame in range(4))
     else:
-        shapes = {"shapes": SHAPES, "local": replace(SHAPES, parts=4), "gated": replace(SHAPES, gated=True),
-                  "pruned": replace(SHAPES, parts=3, gated=True, jaw=True)}.get(kind)  # fmt: skip
+        shapes = {
+            "shapes": SHAPES,
+            "local": replace(SHAPES, parts=4),
+            "gated": replace(SHAPES, gated=True),
+            "pruned": replace(SHAPES, parts=3, gated=True, jaw=True),
+        }.get(kind)
         config = StudentConfig(
             None if kind == "no field" else TINY_FIELD, shapes, 40 if kind == "control points" else 0
         )
@@ -65,8 +69,14 @@ def make(kind: str, rig: Rig):
 def look(model, rig) -> list[torch.Tensor]:
     with torch.no_grad():
         posed = model(rig.motion(dance().frame(3), frame=3), EYES)
-    return [posed.vertices, posed.gaussians.means, posed.gaussians.scales, posed.gaussians.quats,
-            posed.gaussians.opacities, posed.colors]  # fmt: skip
+    return [
+        posed.vertices,
+        posed.gaussians.means,
+        posed.gaussians.scales,
+        posed.gaussians.quats,
+        posed.gaussians.opacities,
+        posed.colors,
+    ]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -135,8 +145,11 @@ def changed(path, *, about=None, tensors=None, header=HEADER) -> None:
     with safe_open(path, framework="pt") as file:
         own = json.loads(file.metadata()[HEADER])
         kept = {name: file.get_tensor(name) for name in file.keys()}
-    save_file({**kept, **(tensors or {})} if tensors is None or tensors else {}, path,
-              metadata={header: json.dumps({**own, **(about or {})})})  # fmt: skip
+    save_file(
+        {**kept, **(tensors or {})} if tensors is None or tensors else {},
+        path,
+        metadata={header: json.dumps({**own, **(about or {})})},
+    )
 
 
 def test_files_that_are_no_avatar_are_refused(rig, tmp_path):

@@ -5,7 +5,7 @@
 #include <random>
 #include <vector>
 
-#include "gaussian.hpp"
+#include "gaussians/gaussian.hpp"
 
 using namespace smplxpp::gaussian;
 

@@ -15,7 +15,7 @@ from smplxpp.body import load_body
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 FRAMES = 4
 LEFT_SHOULDER = 15  # index among the 21 joints of body_pose
@@ -31,13 +31,29 @@ def run(tmp_path_factory):
     path = folder / TEMPLATE_FILE
     path.parent.mkdir(parents=True)
     Template(
-        vertices=body.v_template, faces=body.faces, vertex_labels=np.zeros(count), vertex_part=np.zeros(count),
-        part_names=("body",), vertex_colors=colors, weights=SkinWeights.from_dense(body.weights),
-        joint_regressor=body.joint_regressor, parents=body.parents, joint_names=body.joint_names, betas=np.zeros(20),
-        shape_basis=body.shapedirs, expression_basis=body.exprdirs, pose_basis=None, left_hand_components=None,
-        right_hand_components=None, left_hand_mean=None, right_hand_mean=None, body_labels=body.part_labels,
-        body_label_names=body.part_label_names, body_index=np.arange(count), scan_index=np.full(count, -1),
-    ).save(path)  # fmt: skip
+        vertices=body.v_template,
+        faces=body.faces,
+        vertex_labels=np.zeros(count),
+        vertex_part=np.zeros(count),
+        part_names=("body",),
+        vertex_colors=colors,
+        weights=SkinWeights.from_dense(body.weights),
+        joint_regressor=body.joint_regressor,
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=np.zeros(20),
+        shape_basis=body.shapedirs,
+        expression_basis=body.exprdirs,
+        pose_basis=None,
+        left_hand_components=None,
+        right_hand_components=None,
+        left_hand_mean=None,
+        right_hand_mean=None,
+        body_labels=body.part_labels,
+        body_label_names=body.part_label_names,
+        body_index=np.arange(count),
+        scan_index=np.full(count, -1),
+    ).save(path)
     return folder
 
 
@@ -123,11 +139,16 @@ def test_mp4_without_its_extra(run, params, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"out": "film.avi"}, "output"), ({"start": 9}, "frames"), ({"step": 0}, "step"), ({"height": 3}, "height"),
-        ({"width": 0}, "width"), ({"fps": -1.0}, "fps"), ({"run": "nowhere"}, "run"),
+        ({"out": "film.avi"}, "output"),
+        ({"start": 9}, "frames"),
+        ({"step": 0}, "step"),
+        ({"height": 3}, "height"),
+        ({"width": 0}, "width"),
+        ({"fps": -1.0}, "fps"),
+        ({"run": "nowhere"}, "run"),
         ({"params": "nothing.npz"}, "nothing"),
     ],
-)  # fmt: skip
+)
 def test_bad_options_are_refused_before_anything_is_written(run, params, tmp_path, options, message):
     values = {"run": run, "params": params, "out": "film.gif"} | options
     before = set(tmp_path.rglob("*"))

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.build_config import STAGES, BuildConfig, BuildInputs
-from pipelines.build_template import build
 from pipelines.cli import main
 from pipelines.commands.inspect import summarise_run
+from pipelines.runs.stage import StageRecord
+from pipelines.stages.build import build
+from pipelines.stages.build_config import STAGES, BuildConfig, BuildInputs
 from smplxpp.body import load_params
-from smplxpp.body.hard_poses import hard_poses
+from smplxpp.body.stress_poses import hard_poses
 from smplxpp.clean import simplify
-from smplxpp.core.artifact import StageRecord
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh_io import read_mesh
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 PARAMS = FIXTURE / "params" / "params.npz"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pipelines.cli import COMMANDS, main
-from smplxpp.core.artifact import StageOutput, run_stage
+from pipelines.runs.stage import StageOutput, run_stage
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
 
@@ -25,8 +25,20 @@ SCAN, PARAMS = FIXTURE / "scans" / "scan_000000.ply", FIXTURE / "params" / "para
 @pytest.fixture
 def cube(tmp_path) -> Path:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    faces = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
     write_ply(tmp_path / "cube.ply", TriangleMesh(corners, np.array(faces)))
     return tmp_path / "cube.ply"
 
@@ -149,7 +161,10 @@ def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
     write_ply(huge, TriangleMesh(np.array([[0, 0, 0], [500, 0, 0], [0, 500, 0]], float), np.array([[0, 1, 2]])))
     done = subprocess.run(
         [sys.executable, "-m", "pipelines.cli", "metrics", str(cube), str(huge), "--samples", "100"],
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     text = " ".join(done.stderr.split())
     assert "WARNING" in text and "units" in text and ".py:" not in text and "warnings.warn" not in text

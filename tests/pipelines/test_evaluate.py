@@ -15,23 +15,24 @@ from PIL import Image
 from avatar.evaluation.report import EvalReport
 from avatar.gaussians.bound_file import save_bound
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.models.deformation_field import FieldConfig
 from avatar.models.model_file import save_avatar
-from avatar.models.rig import Rig
+from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import Rig
 from pipelines.cli import main
 from pipelines.commands import evaluate as command
-from pipelines.evaluate_config import MODEL_FILES
-from pipelines.evaluate_pictures import read_tiles, surface_picture, write_tiles
-from pipelines.evaluate_report import evaluation_key_numbers, evaluation_sections, standing_evaluation
-from pipelines.overview import held_out_view
+from pipelines.figures.evaluation import read_tiles, surface_picture, write_tiles
 from pipelines.report import Report, write_report
-from smplxpp.core.artifact import read_manifest, sha256_file
+from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.evaluate_config import MODEL_FILES
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 from tests.evaluation.standing_doll import FRAMES, dressed, write_frames
 from tests.training.doll import HELD_OUT, doll
+from tools.overview import held_out_view
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 QUICK = ("--every", "4", "--samples", "1000", "--metric", "none", "--speed-pictures", "1", "--speed-size", "24", "32")
@@ -108,8 +109,9 @@ def test_files_of_the_stage(evaluated):
     shown = {Path(view["file"]).name for view in manifest["numbers"]["views"]}
     assert {"novel_view_Held0_000000.png", "novel_pose_Held1_000004.png"} <= shown
     assert {path.name for path in (folder / "pictures").iterdir()} == shown | {
-        "surface_training_000001.png", "surface_held_out_000005.png"
-    }  # fmt: skip
+        "surface_training_000001.png",
+        "surface_held_out_000005.png",
+    }
     truth, rendered = read_tiles(folder / "pictures" / "novel_view_Held0_000000.png", 2)
     np.testing.assert_array_equal(truth, doll().images["Held0"])
     assert not np.array_equal(rendered[0], rendered[1])
@@ -139,8 +141,10 @@ def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     assert any(caption.startswith("novel poses, Held1, frame 4, head, ") for caption in captions)
     assert len(pictures.comparisons) == 2
     assert [number.label for number in evaluation_key_numbers(record)] == [
-        "novel views", "novel poses", "pictures a second"
-    ]  # fmt: skip
+        "novel views",
+        "novel poses",
+        "pictures a second",
+    ]
     html = write_report(tmp_path / "report.html", Report("doll", sections=(figures, pictures))).read_text()
     assert "Avatar: figures" in html and "http" not in html.replace("http://www.w3.org", "")
 

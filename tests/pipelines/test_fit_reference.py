@@ -13,13 +13,13 @@ from PIL import Image
 
 from avatar.export.splats import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
-from avatar.training.fit_reference import choose_device
+from avatar.training.engine.device import choose_device
 from pipelines.cli import main
 from pipelines.commands import extras, inspect
 from pipelines.commands.inspect import summarise_run
-from pipelines.fit_pictures import read_strip
-from pipelines.progress import training_progress
-from smplxpp.core.artifact import read_manifest
+from pipelines.commands.progress import training_progress
+from pipelines.figures.comparison import read_strip
+from pipelines.runs.stage import read_manifest
 from smplxpp.core.params import BodyParams
 from tests.training.doll import HELD_OUT, TRAIN, doll, write_capture, write_run
 
@@ -125,8 +125,8 @@ def test_a_limit_of_time_gives_a_result_and_the_same_command_goes_on(fitted, tmp
 
 
 def test_a_killed_fit_goes_on(fitted, tmp_path, capture, monkeypatch):
-    from avatar.training import loop
-    from avatar.training.fit_reference import FitTask
+    from avatar.training.engine import loop
+    from avatar.training.reference_fit.fit import FitTask
 
     run = write_run(tmp_path / "run")
     step = FitTask.step
@@ -155,7 +155,7 @@ def _often(init):
 
 
 def test_progress_shows_a_fit_that_is_taken_up_again():
-    from avatar.training import Progress
+    from avatar.training.engine.loop import Progress
 
     with training_progress("fit", 20) as show:
         show(Progress(10, 20, 1.0, 5.0, {"loss": 0.5}))
@@ -231,7 +231,7 @@ def test_cameras_that_the_splits_leave_out_are_not_trained_on(tmp_path, capture,
 def test_the_gpu_is_taken_where_gsplat_is(monkeypatch, caplog):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for found, device in ((None, "cpu"), (object(), "cuda")):
-        module = sys.modules["avatar.training.fit_reference"]  # the package has a function of this name
+        module = sys.modules["avatar.training.engine.device"]
         monkeypatch.setattr(module, "find_spec", lambda name, found=found: found)
         assert choose_device("auto") == device and choose_device("cuda") == "cuda"
     assert "gsplat is not installed" in caplog.text

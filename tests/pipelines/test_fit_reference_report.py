@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.build_config import BuildConfig, BuildInputs, load_build, save_build
-from pipelines.build_report import rewrite_report
 from pipelines.cli import main
-from pipelines.fit_pictures import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
-from pipelines.fit_report import fit_key_numbers, fit_section, standing_fit
-from pipelines.pictures import colormap
+from pipelines.figures import colormap
+from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
 from pipelines.report import Curve, Report, write_report
 from pipelines.report.charts import curve_svg
-from smplxpp.core.artifact import StageRecord, read_manifest, sha256_file
+from pipelines.report.sections.build import rewrite_report
+from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.stage import StageRecord, read_manifest
+from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from smplxpp.core.errors import InputError
 from tests.training.doll import HELD_OUT, TRAIN, write_capture, write_run
 

@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from pipelines.build_config import STAGES
 from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
-from smplxpp.core.artifact import Check, StageOutput, run_stage
+from pipelines.runs.checks import Check
+from pipelines.runs.stage import StageOutput, run_stage
+from pipelines.stages.build_config import STAGES
 from smplxpp.core.errors import InputError
 
 

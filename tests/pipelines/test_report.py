@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from pipelines.pictures import encode_jpeg, encode_png
+from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import (
     CheckRow,
     Comparison,
@@ -23,7 +23,7 @@ from pipelines.report import (
     write_report,
 )
 from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
-from smplxpp.core.artifact import Check
+from pipelines.runs.checks import Check
 from smplxpp.core.errors import InputError
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
@@ -92,7 +92,7 @@ def sample_report():
             ),
         ),
         provenance={"Configuration": {"seed": 0, "budgets": {"hair": 2000}}, "Inputs": {"scan": "ab" * 32}},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +114,23 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page):
 def test_the_page_holds_every_number_and_picture(page):
     parsed, _ = page
     for text in (
-        "dancer & co", "Scan <front>", "0.62 mm", "not a number", "visible surface", "1 pass", "1 warn", "2 fail",
-        "Some checks fail", "3.0 s in all", "0.457", "20,000", "budgets.hair", "2,000", "ab" * 32, "2,000 values",
-    ):  # fmt: skip
+        "dancer & co",
+        "Scan <front>",
+        "0.62 mm",
+        "not a number",
+        "visible surface",
+        "1 pass",
+        "1 warn",
+        "2 fail",
+        "Some checks fail",
+        "3.0 s in all",
+        "0.457",
+        "20,000",
+        "budgets.hair",
+        "2,000",
+        "ab" * 32,
+        "2,000 values",
+    ):
         assert text in parsed.text, text
     first = next(s for s in parsed.sources if "png" in s)
     assert base64.b64decode(first.split(",", 1)[1]) == sample_report().hero[0].data
@@ -131,7 +145,7 @@ def test_markup_in_names_stays_text(tmp_path):
         seconds={evil: 1.0},
         sections=(Section(evil, (evil,), histograms=(Histogram(evil, np.arange(9.0), evil, ((evil, 4.0),)),)),),
         provenance={evil: {evil: evil}},
-    )  # fmt: skip
+    )
     html = write_report(tmp_path / "r.html", report).read_text()
     assert evil not in html and Page(html).tags.count("script") == 1
 
@@ -169,13 +183,27 @@ def test_pictures_and_tables_are_checked():
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (0.61666, "0.617"), (12, "12"), (20908, "20,908"), (3.0, "3"), (10.0, "10"), (99.94, "99.9"), (0, "0"),
-        (0.0, "0"), (123.456, "123.5"), (12345.6, "12,346"), (2e-16, "2.00e-16"), (True, "yes"),
-        (None, "-"), ("text", "text"),
-        (float("nan"), "not a number"), (float("-inf"), "-∞"), (-0.05, "-0.05"), (np.float32(1.5), "1.5"),
+        (0.61666, "0.617"),
+        (12, "12"),
+        (20908, "20,908"),
+        (3.0, "3"),
+        (10.0, "10"),
+        (99.94, "99.9"),
+        (0, "0"),
+        (0.0, "0"),
+        (123.456, "123.5"),
+        (12345.6, "12,346"),
+        (2e-16, "2.00e-16"),
+        (True, "yes"),
+        (None, "-"),
+        ("text", "text"),
+        (float("nan"), "not a number"),
+        (float("-inf"), "-∞"),
+        (-0.05, "-0.05"),
+        (np.float32(1.5), "1.5"),
         (np.int64(7), "7"),
     ],
-)  # fmt: skip
+)
 def test_numbers_are_written_for_readers(value, text):
     assert format_value(value) == text
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from avatar.models.model_file import load_avatar
-from avatar.models.rig import Rig
-from avatar.training.bake import BakeTask
+from avatar.rig.rig import Rig
 from avatar.training.presets import TRAINING_PRESETS
-from pipelines import train_stage
+from avatar.training.student.bake import BakeTask
 from pipelines.cli import main
-from pipelines.fit_pictures import read_strip
-from smplxpp.core.artifact import read_manifest
+from pipelines.figures.comparison import read_strip
+from pipelines.runs.stage import read_manifest
+from pipelines.stages import train as train_stage
 from smplxpp.core.errors import InputError
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
 from tests.training.dancing_doll import HELD_OUT, template, write_dance, write_dance_run
@@ -78,8 +78,10 @@ def test_files_and_figures_of_every_stage(trained, stage):
     for kind in ("novel_view", "novel_pose"):
         assert 3 < numbers[kind]["psnr"] < 60 and 3 < numbers["start"][kind]["psnr"] < 60
     assert {c["name"] for c in manifest["checks"]} >= {
-        "held-out views: PSNR of the person", "held-out poses: SSIM", "iterations done"
-    }  # fmt: skip
+        "held-out views: PSNR of the person",
+        "held-out poses: SSIM",
+        "iterations done",
+    }
     real, rendered, _ = read_strip(folder / "previews" / "Held0_000004.png")
     assert real.shape == rendered.shape == (64, 48, 3) and real.max() > 100
     assert not list(trained.glob("*_work"))
@@ -207,8 +209,22 @@ def test_the_terminal_shows_figures(own, capture, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_torchrun_trains_with_two_processes(fitted, capture):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
-               "pipelines.cli", "train", "--run-folder", str(fitted), "--capture", str(capture), *SMALL]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        "-m",
+        "pipelines.cli",
+        "train",
+        "--run-folder",
+        str(fitted),
+        "--capture",
+        str(capture),
+        *SMALL,
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -13,10 +13,10 @@ from PIL import Image
 
 from pipelines.commands import extras
 from pipelines.commands import train as command
-from pipelines.train_inputs import TrainInputs, open_scene
-from smplxpp.core.artifact import read_manifest
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.train_inputs import TrainInputs, open_scene
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.template import Template
+from smplxpp.template.template import Template
 from tests.pipelines.training_runs import refused, train
 from tests.training.dancing_doll import (
     FRAMES,
@@ -234,7 +234,7 @@ def test_a_checkpoint_of_a_newer_version_is_refused_and_kept(run, original, caps
 
 @pytest.mark.parametrize("shortage", [MemoryError(), OSError(28, "No space left on device")])
 def test_what_runs_out_is_said_and_finished_stages_stay(run, original, capsys, monkeypatch, shortage):
-    from avatar.training.fit_teacher import TeacherTask
+    from avatar.training.teacher.fit_teacher import TeacherTask
 
     def broken(self, iteration):
         raise shortage

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.report import Report, write_report
-from pipelines.train_names import kind_name, spread
-from pipelines.train_report import standing_trainings, training_key_numbers, training_section
-from smplxpp.core.artifact import StageRecord, read_manifest
+from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
+from pipelines.runs.stage import StageRecord, read_manifest
+from pipelines.stages.train_names import kind_name, spread
 from tests.pipelines.training_runs import STAGES, train
 from tests.training.dancing_doll import write_dance, write_dance_run
 
@@ -114,9 +114,15 @@ def test_a_training_that_was_stopped_before_its_first_step_still_has_a_section(r
 def test_the_page_is_written(run, tmp_path):
     sections = tuple(training_section(record) for record in standing(run).values())
     report = Report(
-        subject="doll", summary="three trainings", hero=(), key_numbers=training_key_numbers(standing(run)), checks=(),
-        seconds={}, sections=sections, provenance={},
-    )  # fmt: skip
+        subject="doll",
+        summary="three trainings",
+        hero=(),
+        key_numbers=training_key_numbers(standing(run)),
+        checks=(),
+        seconds={},
+        sections=sections,
+        provenance={},
+    )
     page = write_report(tmp_path / "report.html", report).read_text()
     assert all(section.title in page for section in sections) and "PSNR" in page
 

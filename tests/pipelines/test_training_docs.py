@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from avatar.models.teacher import Teacher
+from avatar.models.networks.teacher import Teacher
+from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.presets import TRAINING_PRESETS, TrainingPreset
-from avatar.training.pretrain import PretrainConfig
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "avatar_training.md"
 

@@ -7,22 +7,37 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
-from avatar.models.presets import NetworkPreset
+from avatar.models.networks.presets import NetworkPreset
 from avatar.training.presets import TRAINING_PRESETS
-from avatar.training.track import Level, TrackConfig
+from avatar.training.tracking.track import Level, TrackConfig
 from pipelines.cli import main
 from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER
 
 STAGES = ("80_teacher", "85_bake", "90_compensate")
 SMALL = (
-    "--preset", "demo", "--gaussians", "300", "--fit-iterations", "2", "--teacher-iterations", "3",
-    "--bake-iterations", "3", "--compensate-iterations", "3", "--device", "cpu", "--json", "--no-report",
-)  # fmt: skip
+    "--preset",
+    "demo",
+    "--gaussians",
+    "300",
+    "--fit-iterations",
+    "2",
+    "--teacher-iterations",
+    "3",
+    "--bake-iterations",
+    "3",
+    "--compensate-iterations",
+    "3",
+    "--device",
+    "cpu",
+    "--json",
+    "--no-report",
+)
 DEMO = TRAINING_PRESETS["demo"]
 QUICK = replace(
-    DEMO, networks=NetworkPreset(TINY_TEACHER, TINY_FIELD),
+    DEMO,
+    networks=NetworkPreset(TINY_TEACHER, TINY_FIELD),
     teacher=replace(DEMO.teacher, track=TrackConfig(levels=(Level(1, 2, 2e-3),), control_points=24)),
-)  # fmt: skip
+)
 
 
 def train(run: Path, capture: Path, *options: str) -> int:
@@ -49,7 +64,7 @@ def same_models(one: Path, two: Path) -> bool:
 
 def often(monkeypatch) -> None:
     """A checkpoint after every step."""
-    from avatar.training import loop
+    from avatar.training.engine import loop
 
     init = loop.LoopConfig.__init__
 

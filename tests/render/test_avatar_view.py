@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.models.posed import PosedAvatar
-from avatar.models.rig import Rig
+from avatar.data.sequence import eyes_of
+from avatar.data.views import View
 from avatar.models.student import Student, StudentConfig
 from avatar.render.api import rasterize
 from avatar.render.avatar_view import render_view
-from avatar.training.sequence import eyes_of
-from avatar.training.views import View
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Rig
 from tests.training.dancing_doll import HEIGHT, WIDTH, cameras, dance, gaussians, template, varied
 
 GREY = torch.tensor([0.2, 0.4, 0.6])
@@ -39,9 +39,18 @@ def test_colour_is_that_of_the_rasteriser_on_the_background(posed, index):
     view, world = views()[index], posed.gaussians
     seen = render_view(posed, index, view, GREY, eps2d=0.3)
     image, alpha, _ = rasterize(
-        world.means, world.quats, world.scales, world.opacities, posed.colors[index][None], view.viewmat[None],
-        view.K[None], WIDTH, HEIGHT, background=GREY, eps2d=0.3,
-    )  # fmt: skip
+        world.means,
+        world.quats,
+        world.scales,
+        world.opacities,
+        posed.colors[index][None],
+        view.viewmat[None],
+        view.K[None],
+        WIDTH,
+        HEIGHT,
+        background=GREY,
+        eps2d=0.3,
+    )
     torch.testing.assert_close(seen.image, image[0])
     torch.testing.assert_close(seen.alpha, alpha[0, ..., 0])
     assert seen.normals is None and seen.extra is None
@@ -57,9 +66,18 @@ def test_normals_and_extra_values_are_blended_as_colour_is_and_do_not_change_it(
     torch.testing.assert_close(both.image, alone.image)
     torch.testing.assert_close(both.extra, render_view(posed, 1, view, GREY, extra=extra).extra)
     drawn = rasterize(
-        world.means, world.quats, world.scales, world.opacities, world.normals[None], view.viewmat[None], view.K[None],
-        WIDTH, HEIGHT, background=torch.zeros(3), eps2d=0.1,
-    )[0][0]  # fmt: skip
+        world.means,
+        world.quats,
+        world.scales,
+        world.opacities,
+        world.normals[None],
+        view.viewmat[None],
+        view.K[None],
+        WIDTH,
+        HEIGHT,
+        background=torch.zeros(3),
+        eps2d=0.1,
+    )[0][0]
     torch.testing.assert_close(both.normals, drawn)
     assert both.extra.shape == (HEIGHT, WIDTH, 4)
     assert not both.normals[0, 0].any() and not both.extra[0, 0].any()

@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from avatar.models.map_sampling import MapFrame
 from avatar.render.barycentrics import barycentrics_reference
+from avatar.render.map_frame import MapFrame
 from avatar.render.mesh_maps import face_normal_map, front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError

@@ -100,9 +100,18 @@ def test_labels_of_a_mesh_file(tmp_path):
     np.testing.assert_array_equal(read_labels(path, **counts), ids)
     plain = trimesh.creation.icosphere(subdivisions=1)
     rows = [" ".join(map(str, [*v, i % 7])) for i, v in enumerate(plain.vertices)]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", "property float x", "property float y",
-              "property float z", "property uchar label", f"element face {len(plain.faces)}",
-              "property list uchar int vertex_indices", "end_header"]  # fmt: skip
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(rows)}",
+        "property float x",
+        "property float y",
+        "property float z",
+        "property uchar label",
+        f"element face {len(plain.faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
     path.write_text("\n".join([*header, *rows, *("3 " + " ".join(map(str, f)) for f in plain.faces)]) + "\n")
     expected = map_labels(np.arange(len(rows)) % 7, "capture")
     np.testing.assert_array_equal(read_labels(path, label_set="capture", **counts), expected)

@@ -12,11 +12,11 @@ import torch
 import trimesh
 from PIL import Image
 
+from avatar.data.sequence import AvatarSequence, SequenceConfig
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.models.deformation_field import FieldConfig
-from avatar.models.teacher import TeacherConfig
-from avatar.training.sequence import AvatarSequence, SequenceConfig
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.networks.teacher import TeacherConfig
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.camera import Camera
@@ -24,17 +24,25 @@ from smplxpp.core.labels import LOWER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
 from smplxpp.raster import rasterize_mesh
+from smplxpp.template.template import Template
 
 WIDTH, HEIGHT = 48, 64
 FRAMES, NOVEL_POSES = 6, (4, 5)
 TRAIN, HELD_OUT = ("Ring0", "Ring1", "Ring2", "Ring3"), ("Held0",)
 EXPRESSIONS = 2
 TINY_TEACHER = TeacherConfig(
-    in_size=16, out_size=32, bottleneck=4, channel_base=64, channel_max=8, style_size=4, style_layers=1,
-    networks="shared", noise=False, zero_output=True,
-)  # fmt: skip
+    in_size=16,
+    out_size=32,
+    bottleneck=4,
+    channel_base=64,
+    channel_max=8,
+    style_size=4,
+    style_layers=1,
+    networks="shared",
+    noise=False,
+    zero_output=True,
+)
 TINY_FIELD = FieldConfig(width=8, hidden_layers=1, frequencies=2, code_size=4)
 
 
@@ -63,14 +71,27 @@ def template() -> Template:
     return Template(
         vertices=np.concatenate([torso, head, dress]),
         faces=np.concatenate([ball.faces + k * size for k in range(3)]),
-        vertex_labels=np.repeat([0, 0, LOWER.id], size), vertex_part=np.repeat([0, 0, 1], size),
-        part_names=("body", "dress"), vertex_colors=np.full((3 * size, 3), 128),
-        weights=SkinWeights.from_dense(weights), joint_regressor=regressor, parents=body.parents,
-        joint_names=body.joint_names, betas=np.zeros(2), shape_basis=shapes, expression_basis=smile, pose_basis=None,
-        left_hand_components=None, right_hand_components=None, left_hand_mean=None, right_hand_mean=None,
-        body_labels=np.zeros(2 * size), body_label_names=("all",),
-        body_index=np.concatenate([np.arange(2 * size), np.arange(size)]), scan_index=np.full(3 * size, -1),
-    )  # fmt: skip
+        vertex_labels=np.repeat([0, 0, LOWER.id], size),
+        vertex_part=np.repeat([0, 0, 1], size),
+        part_names=("body", "dress"),
+        vertex_colors=np.full((3 * size, 3), 128),
+        weights=SkinWeights.from_dense(weights),
+        joint_regressor=regressor,
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=np.zeros(2),
+        shape_basis=shapes,
+        expression_basis=smile,
+        pose_basis=None,
+        left_hand_components=None,
+        right_hand_components=None,
+        left_hand_mean=None,
+        right_hand_mean=None,
+        body_labels=np.zeros(2 * size),
+        body_label_names=("all",),
+        body_index=np.concatenate([np.arange(2 * size), np.arange(size)]),
+        scan_index=np.full(3 * size, -1),
+    )
 
 
 @cache
@@ -110,10 +131,16 @@ def write_dance(root: Path) -> Path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 Image.fromarray(image).save(path)
     entries = [
-        {"name": name, "w": WIDTH, "h": HEIGHT, "K": c.K.tolist(), "R": c.cam_from_world[:3, :3].tolist(),
-         "T": c.cam_from_world[:3, 3].tolist()}
+        {
+            "name": name,
+            "w": WIDTH,
+            "h": HEIGHT,
+            "K": c.K.tolist(),
+            "R": c.cam_from_world[:3, :3].tolist(),
+            "T": c.cam_from_world[:3, 3].tolist(),
+        }
         for name, c in cameras().items()
-    ]  # fmt: skip
+    ]
     (root / "cameras.json").write_text(json.dumps({"cameras": entries}))
     about = {"name": "dance", "novel_views": list(HELD_OUT), "novel_pose_frames": list(NOVEL_POSES)}
     (root / "capture.json").write_text(json.dumps(about))

@@ -16,8 +16,8 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.template import Template
 from smplxpp.raster import rasterize_mesh
+from smplxpp.template.template import Template
 
 WIDTH, HEIGHT = 64, 80
 TRAIN, HELD_OUT = ("Ring0", "Ring1", "Ring2", "Ring3", "Ring4", "Ring5", "Face"), ("Held0", "Held1")
@@ -68,10 +68,16 @@ def write_capture(root: Path) -> Path:
             path.parent.mkdir(parents=True)
             Image.fromarray(image).save(path)
     entries = [
-        {"name": name, "w": c.width, "h": c.height, "K": c.K.tolist(), "R": c.cam_from_world[:3, :3].tolist(),
-         "T": c.cam_from_world[:3, 3].tolist()}
+        {
+            "name": name,
+            "w": c.width,
+            "h": c.height,
+            "K": c.K.tolist(),
+            "R": c.cam_from_world[:3, :3].tolist(),
+            "T": c.cam_from_world[:3, 3].tolist(),
+        }
         for name, c in it.cameras.items()
-    ]  # fmt: skip
+    ]
     (root / "cameras.json").write_text(json.dumps({"cameras": entries}))
     (root / "capture.json").write_text(json.dumps({"name": "doll", "novel_views": list(HELD_OUT)}))
     (root / "params").mkdir()
@@ -93,14 +99,29 @@ def _template(vertices: np.ndarray, faces: np.ndarray) -> Template:
     weights[: count // 2, 0] = 1.0
     weights[count // 2 :, body.joint_names.index("head")] = 1.0
     return Template(
-        vertices=vertices, faces=faces, vertex_labels=np.zeros(count), vertex_part=np.zeros(count),
-        part_names=("body",), vertex_colors=np.full((count, 3), 128), weights=SkinWeights.from_dense(weights),
-        joint_regressor=np.full((joints, count), 1.0 / count), parents=body.parents, joint_names=body.joint_names,
-        betas=np.zeros(2), shape_basis=np.zeros((count, 3, 2)), expression_basis=np.zeros((count, 3, 0)),
-        pose_basis=None, left_hand_components=None, right_hand_components=None, left_hand_mean=None,
-        right_hand_mean=None, body_labels=np.zeros(count), body_label_names=("all",), body_index=np.arange(count),
+        vertices=vertices,
+        faces=faces,
+        vertex_labels=np.zeros(count),
+        vertex_part=np.zeros(count),
+        part_names=("body",),
+        vertex_colors=np.full((count, 3), 128),
+        weights=SkinWeights.from_dense(weights),
+        joint_regressor=np.full((joints, count), 1.0 / count),
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=np.zeros(2),
+        shape_basis=np.zeros((count, 3, 2)),
+        expression_basis=np.zeros((count, 3, 0)),
+        pose_basis=None,
+        left_hand_components=None,
+        right_hand_components=None,
+        left_hand_mean=None,
+        right_hand_mean=None,
+        body_labels=np.zeros(count),
+        body_label_names=("all",),
+        body_index=np.arange(count),
         scan_index=np.full(count, -1),
-    )  # fmt: skip
+    )
 
 
 def _camera(

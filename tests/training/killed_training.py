@@ -19,9 +19,9 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from avatar.training.gradient_task import OptimiserConfig
-from avatar.training.loop import STATE_FILE, LoopConfig, run_training
-from tests.training.toy import Toy
+from avatar.training.engine.loop import STATE_FILE, LoopConfig, run_training
+from avatar.training.engine.optimization_task import OptimiserConfig
+from tests.training.engine.toy import Toy
 
 STEPS = 330
 

@@ -9,23 +9,25 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.models.rig import Rig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.models.tracked import ControlCage, Track
-from avatar.training.bake import BakeConfig
-from avatar.training.fit_teacher import FitTeacherConfig
-from avatar.training.gradient_task import GradientTask
-from avatar.training.loop import METRICS_FILE
-from avatar.training.metrics_log import read_metrics
-from avatar.training.pretrain import PretrainConfig, PretrainFieldTask, PretrainTeacherTask, _MapLookup
-from avatar.training.track import Level
+from avatar.models.tracked_surface import ControlCage, Track
+from avatar.rig.rig import Rig
+from avatar.training.engine.loop import METRICS_FILE
+from avatar.training.engine.metrics_log import read_metrics
+from avatar.training.engine.optimization_task import GradientTask
+from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.student.bake import BakeConfig
+from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
+from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.track import Level
 from avatar.training.train import PRETRAIN, TRACK, Session, bake, fit_teacher
 from smplxpp.core.errors import InputError
 from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, sequence, template, write_dance
-from tests.training.test_track import CONFIG as TRACKING
-from tests.training.test_view_tasks import BAKE, TEACHER
-from tests.training.toy import copied, same_state
+from tests.training.engine.test_photometric_tasks import BAKE, TEACHER
+from tests.training.engine.toy import copied, same_state
+from tests.training.tracking.test_track import CONFIG as TRACKING
 
 CONFIG = PretrainConfig(iterations=40, batch=2, rate=1e-2)
 APART = replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True)

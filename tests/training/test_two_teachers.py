@@ -12,11 +12,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.training.distributed import Distributed, join_processes
-from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
-from avatar.training.loop import LoopConfig, run_training
+from avatar.training.engine.loop import LoopConfig, run_training
+from avatar.training.engine.processes import Distributed, join_processes
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
 from tests.training.dancing_doll import TINY_TEACHER, gaussians, sequence, write_dance
-from tests.training.test_view_tasks import STEPS
+from tests.training.engine.test_photometric_tasks import STEPS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,8 +37,17 @@ def teach(capture: Path, folder: Path, together: Distributed) -> None:
 def test_two_processes_train_the_teacher_of_one(tmp_path):
     capture = write_dance(tmp_path / "capture")
     teach(capture, tmp_path / "one", Distributed())
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", __file__,
-               str(capture), str(tmp_path / "two")]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        __file__,
+        str(capture),
+        str(tmp_path / "two"),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]

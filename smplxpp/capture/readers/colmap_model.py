@@ -13,9 +13,14 @@ from smplxpp.core.errors import InputError
 
 # Name, number of parameters, in the order of COLMAP's model ids.
 MODELS = (
-    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,11 @@ class ColmapCamera:
         if self.model in ("OPENCV", "FULL_OPENCV"):
             return K, rest
         raise InputError(
-            source, expected=f"one of {', '.join(name for name, _ in MODELS if 'FISHEYE' not in name)}",
-            received=self.model, remedy="undistort with `colmap image_undistorter` and open its result",
-        )  # fmt: skip
+            source,
+            expected=f"one of {', '.join(name for name, _ in MODELS if 'FISHEYE' not in name)}",
+            received=self.model,
+            remedy="undistort with `colmap image_undistorter` and open its result",
+        )
 
 
 @dataclass(frozen=True, eq=False)

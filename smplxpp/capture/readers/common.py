@@ -105,9 +105,11 @@ def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int
     """
     if name not in files:
         raise InputError(
-            f"camera {name!r}", expected="an image, because the calibration does not say its size", received="none",
+            f"camera {name!r}",
+            expected="an image, because the calibration does not say its size",
+            received="none",
             remedy="remove the camera from the calibration, or add its images",
-        )  # fmt: skip
+        )
     series = files[name]
     return image_size(series.path(int(series.numbers[0])))
 

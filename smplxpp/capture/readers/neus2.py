@@ -123,9 +123,11 @@ def _keep(cameras: dict[str, Camera], name: str, camera: Camera, path: Path) -> 
     same = np.allclose(known.cam_from_world, camera.cam_from_world, atol=1e-6) and np.allclose(known.K, camera.K)
     if not same:
         raise InputError(
-            f"file {path}: camera {name}", expected="the pose and intrinsics it has in the other frames",
-            received="others", remedy="a capture's cameras stand still: give moving cameras names of their own",
-        )  # fmt: skip
+            f"file {path}: camera {name}",
+            expected="the pose and intrinsics it has in the other frames",
+            received="others",
+            remedy="a capture's cameras stand still: give moving cameras names of their own",
+        )
 
 
 def _has_alpha(images: Mapping[str, FileSeries]) -> bool:

@@ -24,8 +24,12 @@ from smplxpp.core.errors import InputError
 NAME = "simple"
 LOOKS_FOR = "capture.json, or cameras.json or calibration.csv beside rgbs/, or scans/ with params/"
 # Folder and part of the name of each kind of file: masks/CAM/CAM_maskFFFFFF.png.
-_FOLDERS = {"image": ("rgbs", "rgb"), "mask": ("masks", "mask"), "label": ("labels", "label"),
-            "normal": ("normals", "normal")}  # fmt: skip
+_FOLDERS = {
+    "image": ("rgbs", "rgb"),
+    "mask": ("masks", "mask"),
+    "label": ("labels", "label"),
+    "normal": ("normals", "normal"),
+}
 _CAMERA_FILES = ("cameras.json", "calibration.csv")
 # Written by hand, or by the tool that made the capture.
 _DESCRIPTIONS = ("capture.json", "manifest.json")
@@ -54,9 +58,10 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"file {path}", expected="an object with the keys of docs/captures.md",
+            f"file {path}",
+            expected="an object with the keys of docs/captures.md",
             received=f"{type(error).__name__}: {error}",
-        ) from None  # fmt: skip
+        ) from None
 
 
 def _described(

@@ -44,9 +44,10 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     images = next((folder for folder in places if _has(folder, cameras)), None)
     if images is None:
         raise InputError(
-            f"capture {root}", expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ...",
+            f"capture {root}",
+            expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ...",
             received=", ".join(subfolders(root)) or "no folder",
-        )  # fmt: skip
+        )
     return Recording(
         name=root.name,
         root=root,

@@ -1,0 +1,180 @@
+"""A capture's frames as training sees them: poses of the template, cropped views, and the order they come in."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.data.views import View, read_view
+from avatar.rig.rig import Motion, Rig
+from smplxpp.capture import Capture
+from smplxpp.core.errors import InputError
+from smplxpp.template.template import Template
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceConfig:
+    """How a capture is read for training.
+
+    Attributes:
+        margin: pixels kept around the silhouette of a training view.
+        normals: read the capture's normal maps where it has them.
+        motions: poses kept in memory, the latest used; one is about 1.3 MB for 22k vertices. Images are kept by the
+            capture, which has a bound of its own.
+    """
+
+    margin: int = 12
+    normals: bool = True
+    motions: int = 256
+
+    def __post_init__(self) -> None:
+        for name, least in (("margin", 0), ("motions", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"sequence: {name}", expected=f"at least {least}", received=str(getattr(self, name)))
+
+
+@dataclass(frozen=True)
+class Item:
+    """What one rendering of a step is made of: a frame, and the cameras that look at it."""
+
+    frame: int
+    cameras: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"frame {self.frame}, cameras {' '.join(self.cameras)}"
+
+
+class AvatarSequence:
+    """Frames and views of a capture to train an avatar on.
+
+    Args:
+        capture: with cameras, images, masks and parameters.
+        template: of the person.
+        config: how it is read.
+        device: of all tensors.
+
+    Raises:
+        InputError: no training camera or frame, or a training frame without parameters.
+    """
+
+    def __init__(
+        self, capture: Capture, template: Template, config: SequenceConfig | None = None, *, device: str = "cpu"
+    ) -> None:
+        self.capture, self.config, self.device = capture, config or SequenceConfig(), device
+        self.rig = Rig(template, device)
+        self.train_cameras, self.train_frames = _training_part(capture)
+        behind = capture.recording.background or (0.0, 0.0, 0.0)
+        self.background = torch.tensor(behind, dtype=torch.float32, device=device)
+        self._motions: OrderedDict[int, Motion] = OrderedDict()
+        self._expected: dict[tuple[str, int], Future[View]] = {}
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
+
+    def motion(self, frame: int) -> Motion:
+        """The pose of a frame; it has the frame's number if training sees the frame, else the null code.
+
+        Raises:
+            InputError: no parameters of it.
+        """
+        if frame not in self._motions:
+            self._motions[frame] = self._read_motion(frame)
+            if len(self._motions) > self.config.motions:
+                self._motions.popitem(last=False)
+        self._motions.move_to_end(frame)
+        return self._motions[frame]
+
+    def view(self, camera: str, frame: int) -> View:
+        """A training view, cut to the silhouette."""
+        expected = self._expected.pop((camera, frame), None)
+        return (self._read_view(camera, frame) if expected is None else expected.result()).to(self.device)
+
+    def whole_view(self, camera: str, frame: int) -> View:
+        """All pixels of a view, of any camera and frame of the capture; not cached."""
+        return read_view(self.capture, camera, frame).to(self.device)
+
+    def expect(self, items: Sequence[Item]) -> None:
+        """Read the views of items in the background: they will be asked for soon."""
+        for item in items:
+            for camera in item.cameras:
+                if (camera, item.frame) not in self._expected:
+                    read = self._reader.submit(self._read_view, camera, item.frame)
+                    self._expected[camera, item.frame] = read
+
+    def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
+        """The items of a step, decided by seed and step alone.
+
+        Every frame comes once an epoch in a shuffled order; from epoch to epoch a frame goes through its cameras, in
+        a shuffled order too, so that every view is seen equally often.
+
+        Args:
+            count: items. views: cameras of each; all of a frame's where it has fewer.
+        """
+        out = []
+        for number in range(step * count, (step + 1) * count):
+            epoch, place = divmod(number, len(self.train_frames))
+            frame = self.train_frames[_shuffled((seed, 0, epoch), len(self.train_frames))[place]]
+            out.append(Item(frame, self.cameras(frame, epoch, views, seed)))
+        return out
+
+    def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
+        """Training cameras for a visit of a frame: visit after visit every camera comes equally often."""
+        names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
+        views = min(views, len(names))
+        chosen = []
+        for number in range(visit * views, (visit + 1) * views):
+            cycle, place = divmod(number, len(names))
+            chosen.append(names[_shuffled((seed, 1, frame, cycle), len(names))[place]])
+        return tuple(chosen)
+
+    def _read_motion(self, frame: int) -> Motion:
+        params = self.capture.params(frame)
+        if params is None:
+            raise InputError(
+                f"capture {self.capture.name}",
+                expected=f"body parameters of frame {frame}",
+                received="none",
+                remedy="leave the frame out, or name a file with --params",
+            )
+        return self.rig.motion(params, frame=frame if frame in self.train_frames else None)
+
+    def _read_view(self, camera: str, frame: int) -> View:
+        whole = read_view(self.capture, camera, frame, normals=self.config.normals)
+        return whole.cropped(self.config.margin)
+
+
+def eyes_of(views: Sequence[View]) -> Tensor:
+    """(C, 3) centres of projection in the world."""
+    return torch.stack([view.position for view in views])
+
+
+def evenly(frames: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the frames, each from the middle of its share."""
+    if not len(frames):
+        return []
+    count = min(count, len(frames))
+    return [frames[int((k + 0.5) * len(frames) / count)] for k in range(count)]
+
+
+def _training_part(capture: Capture) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    cameras = capture.splits.train_cameras
+    presence = capture.presence()
+    rows = [row for row, name in enumerate(capture.cameras) if name in set(cameras)]
+    seen = {frame for frame, there in zip(capture.frames, presence[rows].any(axis=0), strict=True) if there}
+    frames = tuple(frame for frame in capture.splits.train_frames if frame in seen)
+    if not cameras or not frames:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="training cameras with images of training frames",
+            received=f"{len(cameras)} cameras, {len(frames)} frames with an image in one of them",
+            remedy="see docs/captures.md: splits are read from the capture",
+        )
+    return cameras, frames
+
+
+def _shuffled(seed: tuple[int, ...], count: int) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(count)

@@ -1,0 +1,147 @@
+"""What an avatar costs: milliseconds a picture, parameters, bytes on disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+import torch
+from torch import nn
+
+from avatar.data.views import View
+from avatar.render.avatar_view import render_view
+from avatar.rig.posed import AvatarModel, at_rest
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+
+CONVENTION = (
+    "Every picture has a new pose, one after the other. Pose: joints to skinning transforms (numpy on the CPU). "
+    "Deform: networks, skinning, Gaussians, colours. Render: rasterising with clamping. Medians after a warm-up; "
+    "frames a second are of deform and render together, the image staying where it was made."
+)
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Medians of the time of one picture.
+
+    Attributes:
+        width, height: pixels. gaussians: drawn.
+        pose_ms, deform_ms, render_ms: see `CONVENTION`. fps: of deform and render, the median of pictures.
+        pictures: measured. device: in words. threads: of torch and the rasteriser; 0 on a GPU.
+    """
+
+    width: int
+    height: int
+    gaussians: int
+    pose_ms: float
+    deform_ms: float
+    render_ms: float
+    fps: float
+    pictures: int
+    device: str
+    threads: int
+
+
+def measure_speed(
+    model: AvatarModel,
+    params: Sequence[BodyParams],
+    camera: Camera,
+    *,
+    size: tuple[int, int] = (512, 512),
+    pictures: int = 20,
+    warmup: int = 3,
+    eps2d: float = 0.1,
+) -> Speed:
+    """Time pictures of a model in the poses of `params`, over and over.
+
+    Args:
+        params: one frame each.
+        camera: its view is scaled into `size` (width, height) whole, see `fitted`.
+        pictures: timed. warmup: drawn before.
+
+    Raises:
+        InputError: no pose, no picture.
+    """
+    if not params or pictures < 1:
+        raise InputError(
+            "speed", expected="at least one pose and one picture", received=f"{len(params)} and {pictures}"
+        )
+    device = model.rig.device
+    view = _blank(fitted(camera, *size)).to(device)
+    background = torch.zeros(3, device=device)
+    now = _clock(device)
+    times = []
+    with at_rest(model):
+        for k in range(warmup + pictures):
+            begin = now()
+            motion = model.rig.motion(params[k % len(params)])
+            placed = now()
+            posed = model(motion, view.position[None])
+            deformed = now()
+            render_view(posed, 0, view, background, eps2d=eps2d).image.clamp(0.0, 1.0)
+            times.append((placed - begin, deformed - placed, now() - deformed))
+    times = times[warmup:]
+    pose, deform, render = (median(column) for column in zip(*times, strict=True))
+    return Speed(
+        *size,
+        gaussians=len(posed.bound),
+        pose_ms=1e3 * pose,
+        deform_ms=1e3 * deform,
+        render_ms=1e3 * render,
+        fps=1.0 / median(d + r for _, d, r in times),
+        pictures=pictures,
+        device=torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU",
+        threads=0 if device.type == "cuda" else torch.get_num_threads(),
+    )
+
+
+def fitted(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with its whole picture in the middle of another size, as large as fits.
+
+    Raises:
+        InputError: a size below 1.
+    """
+    if width < 1 or height < 1:
+        raise InputError("picture size", expected="at least 1 x 1", received=f"{width} x {height}")
+    scale = min(width / camera.width, height / camera.height)
+    K = camera.K.copy()
+    K[:2] *= scale
+    K[:2, 2] += 0.5 * (width - scale * camera.width), 0.5 * (height - scale * camera.height)
+    return replace(camera, K=K, width=width, height=height)
+
+
+def parameter_counts(model: nn.Module) -> dict[str, int]:
+    """Parameters by the module's parts, "total" last; one that parts share counts once."""
+    counts: dict[str, int] = {}
+    for name, value in model.named_parameters():
+        part = name.split(".")[0]
+        counts[part] = counts.get(part, 0) + value.numel()
+    return {**counts, "total": sum(counts.values())}
+
+
+def bytes_on_disk(path: Path) -> int:
+    """Size of a model file, or of all files of a folder."""
+    path = Path(path)
+    return sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
+
+
+def _blank(camera: Camera) -> View:
+    """A view of nothing, for its camera."""
+    size = (camera.height, camera.width)
+    return View(camera, torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.uint8))
+
+
+def _clock(device: torch.device) -> Callable[[], float]:
+    """Seconds, after the device has done what it was given."""
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    return now

@@ -1,0 +1,135 @@
+"""How close a rendered view comes to its photograph, by conventions that are named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.data.views import View
+from avatar.gaussians.sampling import head_faces
+from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
+from avatar.losses.ssim import ssim
+from smplxpp.core.camera import Camera
+from smplxpp.template.template import Template
+
+OPACITY_THRESHOLD = 0.02
+HEAD_MARGIN = 0.08
+"""Of the head's box, added on every side."""
+CONVENTION = (
+    "Images are composited on the capture's plain background, rendered colours clamped to [0, 1]. "
+    "PSNR: over pixels where mask or rendered opacity exceed 0.02. Image: over all pixels. "
+    "SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, mean over all pixels. "
+    "Head: the box of the head's vertices as the skinned template projects them, 8 % wider on every side; PSNR of the "
+    "first kind within it, SSIM of the crop as an image of its own."
+)
+PERCEPTUAL_CONVENTION = "of the whole image, and of the head's crop where it has at least 32 pixels a side."
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """Figures of one view.
+
+    Attributes:
+        psnr: dB over the person: the union of the silhouettes, mask or rendered opacity above 0.02.
+        psnr_image: dB over the whole composited image.
+        ssim: mean over the whole composited image.
+        psnr_head: as `psnr`, within the box of the head; None where the head is not in the image.
+        ssim_head: of the box alone, zero padded as an image is; None as `psnr_head`.
+        perceptual: distance of the whole composited images; None without a metric.
+        perceptual_head: of the box alone; None too where it is under 32 pixels a side.
+    """
+
+    psnr: float
+    psnr_image: float
+    ssim: float
+    psnr_head: float | None = None
+    ssim_head: float | None = None
+    perceptual: float | None = None
+    perceptual_head: float | None = None
+
+
+def decibels(mean_square: float) -> float:
+    """Peak signal-to-noise ratio of images in [0, 1]: `-10 log10(mean square error)`; infinite for equal images."""
+    return -10.0 * math.log10(mean_square) if mean_square > 0 else math.inf
+
+
+def view_quality(
+    view: View,
+    image: Tensor,
+    alpha: Tensor,
+    background: Tensor,
+    *,
+    head: Box | None,
+    metric: PerceptualDistance | None = None,
+) -> ViewQuality:
+    """Compare a rendered image with the view's.
+
+    Args:
+        image: (H, W, 3), clamped to [0, 1] as a screen would. alpha: (H, W) rendered opacity.
+        background: (3,) that both are on.
+        head: x0, y0, x1, y1 in pixels.
+        metric: perceptual distance to measure too.
+    """
+    real = view.composited(background)
+    image = image.clamp(0.0, 1.0)
+    error = (image - real).square()
+    person = (view.opacity() > OPACITY_THRESHOLD) | (alpha > OPACITY_THRESHOLD)
+    psnr_head = ssim_head = perceptual_head = None
+    if head is not None:
+        part = (slice(head[1], head[3]), slice(head[0], head[2]))
+        if bool(person[part].any()):
+            psnr_head = decibels(float(error[part][person[part]].mean()))
+            ssim_head = float(ssim(image[part].contiguous(), real[part].contiguous()))
+            perceptual_head = _distance(metric, image[part], real[part])
+    return ViewQuality(
+        psnr=decibels(float(error[person].mean())),
+        psnr_image=decibels(float(error.mean())),
+        ssim=float(ssim(image, real)),
+        psnr_head=psnr_head,
+        ssim_head=ssim_head,
+        perceptual=_distance(metric, image, real),
+        perceptual_head=perceptual_head,
+    )
+
+
+def _distance(metric: PerceptualDistance | None, image: Tensor, real: Tensor) -> float | None:
+    if metric is None or min(image.shape[:2]) < MIN_SIZE:
+        return None
+    with torch.no_grad():
+        return float(metric(image[None], real[None]))
+
+
+def mean_quality(views: Mapping[str, ViewQuality]) -> dict[str, float]:
+    """Plain means of each figure over the views that have it; figures that none has are left out."""
+    columns = {f.name: [getattr(quality, f.name) for quality in views.values()] for f in fields(ViewQuality)}
+    known = {name: [value for value in values if value is not None] for name, values in columns.items()}
+    return {name: sum(values) / len(values) for name, values in known.items() if values}
+
+
+def head_vertices(template: Template) -> np.ndarray:
+    """(n,) vertices of the head's faces; all that faces use on a body without a joint "head"."""
+    faces = template.faces[head_faces(template)] if "head" in template.joint_names else template.faces
+    return np.unique(faces)
+
+
+def head_box(points: np.ndarray, camera: Camera) -> Box | None:
+    """x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing of it is in the image."""
+    x, y, depth = camera.screen_from_world(points).T[:3]
+    if not (depth > 0).all():
+        return None
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    margin = HEAD_MARGIN * (high - low)
+    x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + margin), (camera.width, camera.height)).astype(int)
+    return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None
+
+
+def eight_bit(image: Tensor) -> Tensor:
+    """(H, W, 3) in [0, 1] as uint8 on the CPU."""
+    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()

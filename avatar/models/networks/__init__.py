@@ -1,0 +1,1 @@
+"""Networks and learned layers: modules alone, without losses, loops or captures."""

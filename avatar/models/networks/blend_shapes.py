@@ -1,0 +1,229 @@
+"""Blend shapes of the Gaussians: what the mesh's motion leaves over in position and colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from avatar.models.networks.config import require_at_least
+from smplxpp.core.errors import InputError
+
+STORED_BYTES = 2
+"""Bytes of a stored coefficient (half precision)."""
+
+
+@dataclass(frozen=True)
+class BlendShapeConfig:
+    """Sizes of the blend shapes. The defaults are the paper's.
+
+    Attributes:
+        head_shapes, body_shapes: n_h and n_b.
+        expression_size: expression parameters that drive the head.
+        jaw: the jaw's rotation (axis-angle) drives the head too.
+        pose_size: length of theta, which drives the body.
+        width, hidden_layers: of both mapping networks.
+        gated: head shapes act on the head alone and body shapes on the rest, by a weight for each Gaussian.
+        parts: 1, every Gaussian has the same coefficients; more, every part of the Gaussians has its own.
+    """
+
+    head_shapes: int = 8
+    body_shapes: int = 20
+    expression_size: int = 10
+    jaw: bool = False
+    pose_size: int = 63
+    width: int = 64
+    hidden_layers: int = 2
+    gated: bool = False
+    parts: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("head_shapes", "body_shapes", "expression_size", "pose_size", "width", "hidden_layers", "parts"):
+            require_at_least(f"blend shapes {name}", getattr(self, name), 1)
+
+    @property
+    def shapes(self) -> int:
+        """n = n_h + n_b."""
+        return self.head_shapes + self.body_shapes
+
+    @property
+    def head_inputs(self) -> int:
+        """Length of what drives the head."""
+        return self.expression_size + 3 * self.jaw
+
+
+def _mapping_network(inputs: int, outputs: int, config: BlendShapeConfig) -> nn.Sequential:
+    sizes = [inputs, *[config.width] * config.hidden_layers]
+    layers: list[nn.Module] = []
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+
+
+class BlendShapes(nn.Module):
+    """`du_i = U_i z`, `dc_i = C_i z`, `z = H(expression, jaw) + B(theta)` (+ joins vectors), for N Gaussians.
+
+    U and C are (3, n) for every Gaussian and start at zero. With several parts z is that of the Gaussian's part. With
+    gating, the first n_h columns are weighted by the head weight w_i and the others by 1 - w_i. Pruned blend shapes
+    hold U and C of the `active` Gaussians only; the others have no residual.
+
+    Args:
+        config: sizes.
+        count: N.
+        part: (N,) integers below `config.parts`; needed where there are several.
+        head_weight: (N,) in [0, 1]; needed with gating.
+        active: (M,) increasing indices of the Gaussians that have blend shapes; None: all.
+
+    Raises:
+        InputError: one of these that does not fit the others.
+    """
+
+    def __init__(
+        self,
+        config: BlendShapeConfig,
+        count: int,
+        *,
+        part: Tensor | None = None,
+        head_weight: Tensor | None = None,
+        active: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        if (part is not None) != (config.parts > 1):
+            raise InputError(
+                "parts of the Gaussians",
+                expected="given if and only if there are several",
+                received=f"{config.parts} in the configuration, {'none' if part is None else 'some'} given",
+            )
+        if (head_weight is not None) != config.gated:
+            raise InputError(
+                "head weights",
+                expected="given if and only if the blend shapes are gated",
+                received=f"gated: {config.gated}, {'none' if head_weight is None else 'some'} given",
+            )
+        for name, value, largest in (("part", part, config.parts - 1), ("head weight", head_weight, 1)):
+            if value is not None and (value.shape != (count,) or not bool(((value >= 0) & (value <= largest)).all())):
+                raise InputError(
+                    f"{name} of the Gaussians",
+                    expected=f"{count} values from 0 to {largest}",
+                    received=f"shape {tuple(value.shape)}, {float(value.min()):g} to {float(value.max()):g}",
+                )
+        if active is None:
+            active = torch.arange(count)
+        elif active.ndim != 1 or bool((active.diff() <= 0).any()) or bool(((active < 0) | (active >= count)).any()):
+            raise InputError(
+                "active Gaussians", expected=f"increasing indices below {count}", received=f"{active.tolist()[:8]} ..."
+            )
+        self.config, self.count = config, count
+        self.head = _mapping_network(config.head_inputs, config.parts * config.head_shapes, config)
+        self.body = _mapping_network(config.pose_size, config.parts * config.body_shapes, config)
+        self.U = nn.Parameter(torch.zeros(len(active), 3, config.shapes))
+        self.C = nn.Parameter(torch.zeros(len(active), 3, config.shapes))
+        self.register_buffer("active", active)
+        self.register_buffer("part", part)
+        self.register_buffer("head_weight", head_weight)
+
+    def coefficients(self, expression: Tensor, pose: Tensor, jaw: Tensor | None = None) -> Tensor:
+        """z of every part.
+
+        Args:
+            expression: (B, expression_size).
+            pose: (B, pose_size) theta, radians.
+            jaw: (B, 3) axis-angle, radians; given if and only if the configuration says so.
+
+        Returns:
+            (B, parts, n).
+
+        Raises:
+            InputError: parameters of another size, a jaw too many or too few.
+        """
+        if (jaw is not None) != self.config.jaw:
+            raise InputError(
+                "jaw rotation", expected="one" if self.config.jaw else "none", received="none" if jaw is None else "one"
+            )
+        of_head = expression if jaw is None else torch.cat([expression, jaw], dim=-1)
+        for name, value, size in (("head", of_head, self.config.head_inputs), ("body", pose, self.config.pose_size)):
+            if value.ndim != 2 or value.shape[1] != size:
+                raise InputError(
+                    f"parameters of the {name}", expected=f"shape (B, {size})", received=f"shape {tuple(value.shape)}"
+                )
+        parts = (self.config.parts, -1)
+        return torch.cat([self.head(of_head).unflatten(1, parts), self.body(pose).unflatten(1, parts)], dim=-1)
+
+    def forward(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals of all Gaussians.
+
+        Args:
+            coefficients: (B, parts, n).
+
+        Returns:
+            du: (B, N, 3) metres in the triangles' frames.
+            dc: (B, N, 3) colour.
+        """
+        return self._blend(self.U, coefficients), self._blend(self.C, coefficients)
+
+    def _blend(self, basis: Tensor, z: Tensor) -> Tensor:
+        B, M = len(z), len(basis)
+        if self.part is None and self.head_weight is None:
+            out = (basis.flatten(0, 1) @ z[:, 0].T).view(M, 3, B).permute(2, 0, 1)
+        else:
+            of_gaussian = z[:, self.part[self.active]] if self.part is not None else z.expand(-1, M, -1)
+            if self.head_weight is not None:
+                of_gaussian = of_gaussian * self._gate()
+            out = torch.einsum("mck,bmk->bmc", basis, of_gaussian)
+        if M == self.count:
+            return out
+        return out.new_zeros(B, self.count, 3).index_copy(1, self.active, out)
+
+    def _gate(self) -> Tensor:
+        """(M, n)."""
+        w = self.head_weight[self.active][:, None]
+        return torch.cat([w.expand(-1, self.config.head_shapes), (1 - w).expand(-1, self.config.body_shapes)], dim=1)
+
+    def stored_bytes(self) -> int:
+        """Bytes of U, C and the mapping networks in half precision (and of `active`, if pruned)."""
+        values = sum(parameter.numel() for parameter in self.parameters())
+        return STORED_BYTES * values + (4 * len(self.active) if len(self.active) < self.count else 0)
+
+    def importance(self, coefficient_std: Tensor) -> Tensor:
+        """(N,) share of each Gaussian in the motion and the colour changes of all, 0 where it has no blend shapes.
+
+        The energy of a Gaussian's residual is `sum_k (|U_k| sigma_k)^2`, in position and in colour; each is divided by
+        its sum over the Gaussians, so that metres and colours weigh the same.
+
+        Args:
+            coefficient_std: (parts, n) standard deviations of the coefficients over the training frames.
+        """
+        sigma = coefficient_std[self.part[self.active]] if self.part is not None else coefficient_std
+        if self.head_weight is not None:
+            sigma = sigma * self._gate()
+        shares = torch.zeros(self.count, dtype=self.U.dtype, device=self.U.device)
+        for basis in (self.U.detach(), self.C.detach()):
+            energy = (basis * sigma[:, None]).square().sum((1, 2))
+            shares[self.active] += 0.5 * energy / energy.sum().clamp_min(torch.finfo(energy.dtype).tiny)
+        return shares
+
+    def pruned(self, coefficient_std: Tensor, *, keep: float) -> BlendShapes:
+        """Copy with the blend shapes of the most important Gaussians alone.
+
+        Args:
+            coefficient_std: (parts, n), see `importance`.
+            keep: share of the N Gaussians that keep theirs, above 0 and at most 1.
+
+        Raises:
+            InputError: such a share.
+        """
+        if not 0.0 < keep <= 1.0:
+            raise InputError("share of blend shapes to keep", expected="above 0, at most 1", received=f"{keep:g}")
+        importance = self.importance(coefficient_std)[self.active]
+        kept = torch.argsort(importance, descending=True, stable=True)[: max(1, round(keep * self.count))].sort().values
+        small = BlendShapes(
+            self.config, self.count, part=self.part, head_weight=self.head_weight, active=self.active[kept]
+        ).to(self.U.device, self.U.dtype)
+        small.head.load_state_dict(self.head.state_dict())
+        small.body.load_state_dict(self.body.state_dict())
+        with torch.no_grad():
+            small.U.copy_(self.U[kept])
+            small.C.copy_(self.C[kept])
+        return small

@@ -1,0 +1,137 @@
+"""Control points of a mesh: a few vertices whose displacements are interpolated to all the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from smplxpp.core.errors import InputError
+from smplxpp.template.template import Template
+
+CLOTH_DENSITY = 4.0
+"""Control points of a vertex of the clothes, where one of the body has 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """K control vertices of V, and how every vertex is interpolated from them.
+
+    Attributes:
+        vertices: (K,) index of each control vertex.
+        neighbours: (V, k) index of control points, from 0 to K - 1.
+        weights: (V, k) non-negative, rows sum to 1.
+    """
+
+    vertices: np.ndarray
+    neighbours: np.ndarray
+    weights: np.ndarray
+
+
+def choose_control_points(
+    vertices: np.ndarray,
+    groups: np.ndarray,
+    *,
+    count: int,
+    neighbour_count: int = 6,
+    importance: np.ndarray | None = None,
+) -> ControlPoints:
+    """Spread control points evenly over every group of vertices and tie each vertex to the nearest of its own group.
+
+    Farthest-point sampling, started at the vertex farthest from the group's centroid. Weights are inverse distances
+    that fade to zero at the next nearest control point, `w_j ~ (d_max - d_j) / (d_max d_j)` (Shepard's method in Franke
+    and Little's local form): a control point keeps its own value. Groups (cloth over body, for example) do not mix,
+    however close they lie.
+
+    Args:
+        vertices: (V, 3) metres.
+        groups: (V,) integers.
+        count: of control points, shared among the groups by their numbers of vertices (at least one each).
+        neighbour_count: control points a vertex depends on.
+        importance: (V,) positive; a group's vertices count as many times in its share. None: all alike.
+
+    Raises:
+        InputError: fewer control points than groups or more than vertices, or no neighbour.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    names, group = np.unique(np.asarray(groups), return_inverse=True)
+    importance = np.ones(len(vertices)) if importance is None else np.asarray(importance, dtype=np.float64)
+    if not len(names) <= count <= len(vertices):
+        raise InputError(
+            "number of control points",
+            expected=f"{len(names)} (one for every group) to {len(vertices)} (one for every vertex)",
+            received=str(count),
+        )
+    if neighbour_count < 1:
+        raise InputError("neighbours of a vertex", expected="at least 1", received=str(neighbour_count))
+
+    chosen: list[np.ndarray] = []
+    neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
+    weights = np.zeros((len(vertices), neighbour_count))
+    before, shares = 0, _shares(np.bincount(group), np.bincount(group, weights=importance), count)
+    for k in range(len(names)):
+        members = np.flatnonzero(group == k)
+        share = shares[k]
+        controls = members[_farthest_points(vertices[members], share)]
+        used = min(neighbour_count, share)
+        nearest, w = _local_weights(vertices[members], vertices[controls], used)
+        neighbours[members, :used] = before + nearest
+        neighbours[members, used:] = before + nearest[:, :1]
+        weights[members, :used] = w
+        chosen.append(controls)
+        before += share
+    return ControlPoints(np.concatenate(chosen), neighbours, weights)
+
+
+def template_control_points(template: Template, count: int) -> ControlPoints:
+    """Control points of a template, part by part; its clothes, which fold, have `CLOTH_DENSITY` times as many.
+
+    Args:
+        count: of control points; all vertices where there are no more.
+    """
+    density = np.where(template.cloth_mask, CLOTH_DENSITY, 1.0)
+    count = min(count, template.vertex_count)
+    return choose_control_points(template.vertices, template.vertex_part, count=count, importance=density)
+
+
+def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
+    """`count` split in proportion to `wishes`, exactly: from 1 to the size of each group.
+
+    The largest remainders are rounded up; what a full group cannot take goes to the others in the same proportion.
+    """
+    shares = np.ones(len(sizes), dtype=np.int64)
+    while (left := count - shares.sum()) > 0:
+        open_wishes = np.where(shares < sizes, wishes, 0.0)
+        more = left * open_wishes / open_wishes.sum()
+        whole = np.minimum(np.floor(more).astype(np.int64), sizes - shares)
+        if not whole.any():
+            rest = np.argsort(-(more - whole), kind="stable")
+            whole[rest[shares[rest] < sizes[rest]][:left]] = 1
+        shares += whole
+    return shares
+
+
+def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` points, each the farthest from those before it."""
+    picked = np.empty(count, dtype=np.int64)
+    picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
+    distance = np.full(len(points), np.inf)
+    # Each choice depends on the one before: a loop over control points, not over vertices.
+    for i in range(1, count):
+        distance = np.minimum(distance, np.sum((points - points[picked[i - 1]]) ** 2, axis=1))
+        picked[i] = np.argmax(distance)
+    return picked
+
+
+def _local_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` nearest controls of each point, and their weights."""
+    asked = min(count + 1, len(controls))
+    distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
+    distance = np.maximum(distance, 1e-9)
+    # Where there is no next nearest control point, a distance twice the largest keeps every weight above zero.
+    limit = (distance[:, -1] if asked > count else 2.0 * distance[:, -1])[:, None]
+    weights = (limit - distance[:, :count]) / (limit * distance[:, :count])
+    # Equal distances all round (a point among symmetric controls) leave nothing to tell them apart.
+    weights[weights.sum(1) <= 0.0] = 1.0
+    return nearest[:, :count], weights / weights.sum(1, keepdims=True)

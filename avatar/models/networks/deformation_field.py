@@ -1,0 +1,240 @@
+"""The student's non-rigid field: displacements of the template's vertices from pose and frame code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.models.networks.config import require_at_least
+from avatar.models.networks.control_points import ControlPoints
+from avatar.models.networks.sparse_rows import SparseRows
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Sizes of the field. The defaults are the paper's.
+
+    Attributes:
+        frequencies: bands L of the positional encoding.
+        pose_size: length of theta (21 body joints, axis-angle).
+        code_size: length of a frame's code z_t.
+        width, hidden_layers: of both MLPs; one more layer gives the displacement.
+        local_pose: a point sees the joints of theta within as many steps along the skeleton of one that carries it
+            (`seen_joints`), the others as zero; 0: all of them, as published.
+    """
+
+    frequencies: int = 6
+    pose_size: int = 63
+    code_size: int = 32
+    width: int = 64
+    hidden_layers: int = 5
+    local_pose: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("frequencies", "local_pose"):
+            require_at_least(f"field {name}", getattr(self, name), 0)
+        for name in ("pose_size", "code_size", "width", "hidden_layers"):
+            require_at_least(f"field {name}", getattr(self, name), 1)
+
+    @property
+    def encoding_size(self) -> int:
+        """Length of a point's positional encoding."""
+        return 3 + 6 * self.frequencies
+
+
+def positional_encoding(points: Tensor, frequencies: int) -> Tensor:
+    """`phi(v) = (v, sin(2^l pi v), cos(2^l pi v) for l < L)` (Mildenhall et al. 2020, equation 4), with the identity.
+
+    Args:
+        points: (..., 3) metres.
+        frequencies: L.
+
+    Returns:
+        (..., 3 + 6 L).
+    """
+    bands = math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype, device=points.device)
+    angles = (points[..., None, :] * bands[:, None]).flatten(-2)
+    return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
+
+
+class _FieldNetwork(nn.Module):
+    """MLP on `phi(v) + theta + z`; the last layer starts at zero.
+
+    The first layer is linear in its parts: that of pose and code is computed once a frame (and once for every set of
+    joints that points see), not once a vertex.
+    """
+
+    def __init__(self, config: FieldConfig) -> None:
+        super().__init__()
+        self.of_point = nn.Linear(config.encoding_size, config.width, bias=False)
+        self.of_frame = nn.Linear(config.pose_size + config.code_size, config.width)
+        self.hidden = nn.ModuleList(nn.Linear(config.width, config.width) for _ in range(config.hidden_layers - 1))
+        self.last = nn.Linear(config.width, 3)
+        fan_in = config.encoding_size + config.pose_size + config.code_size
+        for layer in (self.of_point, self.of_frame):
+            # As one layer of all inputs would start.
+            nn.init.uniform_(layer.weight, -1.0 / math.sqrt(fan_in), 1.0 / math.sqrt(fan_in))
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, encodings: Tensor, frames: Tensor, member: Tensor | None) -> Tensor:
+        """(V, E) encodings, (B, U, pose + code) and (V, U) one-hot, or None where U is 1 -> (B, V, 3)."""
+        of_frame = self.of_frame(frames)
+        x = F.relu(self.of_point(encodings) + (of_frame if member is None else member @ of_frame))
+        for layer in self.hidden:
+            x = F.relu(layer(x))
+        return self.last(x)
+
+
+class DeformationField(nn.Module):
+    """`dv_i = m_i S_c(g_i) + S_b(g_i)`, `g_i = phi(v_i) + theta + z_t` (+ joins vectors), metres in the canonical pose.
+
+    S_b moves the whole template; S_c adds the motion of the clothes and is evaluated on them alone (m_i = 1). With
+    control points both are evaluated there and interpolated.
+
+    Args:
+        config: sizes.
+        vertices: (V, 3) canonical vertices, metres.
+        cloth_mask: (V,) bool, m.
+        control: control points of the same vertices, or None to evaluate the field on every vertex.
+        seen: (V, pose_size / 3) bool, the joints of theta that each vertex sees, where the configuration asks for it.
+
+    Raises:
+        InputError: a mask, control points or seen joints of another number of vertices or joints.
+    """
+
+    def __init__(
+        self,
+        config: FieldConfig,
+        vertices: Tensor,
+        cloth_mask: Tensor,
+        *,
+        control: ControlPoints | None = None,
+        seen: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
+            raise InputError(
+                "template of the field",
+                expected="vertices of shape (V, 3) and a cloth mask of shape (V,)",
+                received=f"shapes {tuple(vertices.shape)} and {tuple(cloth_mask.shape)}",
+            )
+        if control is not None and len(control.neighbours) != len(vertices):
+            raise InputError(
+                "control points",
+                expected=f"those of {len(vertices)} vertices",
+                received=f"those of {len(control.neighbours)}",
+            )
+        expected = (len(vertices), config.pose_size // 3) if config.local_pose else None
+        if expected != (None if seen is None else tuple(seen.shape)):
+            raise InputError(
+                "joints that the vertices see",
+                expected="none without local_pose" if expected is None else f"shape {expected}",
+                received="none" if seen is None else f"shape {tuple(seen.shape)}",
+            )
+        self.config = config
+        self.body = _FieldNetwork(config)
+        self.cloth = _FieldNetwork(config)
+        if control is not None:
+            where = torch.as_tensor(control.vertices, device=vertices.device)
+            vertices, cloth_mask = vertices[where], cloth_mask[where]
+            neighbours = torch.as_tensor(control.neighbours, device=vertices.device)
+            weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
+            self.rows: SparseRows | None = SparseRows(neighbours, weights, len(where))
+        else:
+            self.rows = None
+            where = torch.arange(len(vertices), device=vertices.device)
+        self.register_buffer("points", where, persistent=False)
+        self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
+        self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
+        sets = member = None
+        if seen is not None:
+            sets, group = torch.unique(seen[where], dim=0, return_inverse=True)
+            sets = sets.to(vertices.dtype).repeat_interleave(3, dim=1)
+            # A product with one-hot rows: its gradient is a product too, where a gather's is slow on a CPU.
+            member = F.one_hot(group, len(sets)).to(vertices.dtype)
+        self.register_buffer("sets", sets, persistent=False)
+        self.register_buffer("member", member, persistent=False)
+
+    def forward(self, pose: Tensor, code: Tensor) -> Tensor:
+        """(B, V, 3) metres, displacements of all vertices along the canonical axes; see `at_points`."""
+        moved = self.at_points(pose, code)
+        if self.rows is None:
+            return moved
+        # Poses side by side are one table.
+        spread = self.rows(moved.transpose(0, 1).flatten(1))
+        return spread.unflatten(1, (len(moved), 3)).transpose(0, 1)
+
+    def at_points(self, pose: Tensor, code: Tensor) -> Tensor:
+        """Displacements where the networks are evaluated: the K control points, or all vertices.
+
+        Args:
+            pose: (B, pose_size) theta, axis-angle, radians.
+            code: (B, code_size) frame codes.
+
+        Returns:
+            (B, K, 3) metres, along the canonical axes.
+
+        Raises:
+            InputError: poses or codes of another length or number.
+        """
+        expected = (self.config.pose_size, self.config.code_size)
+        if pose.ndim != 2 or code.ndim != 2 or (pose.shape[1], code.shape[1]) != expected or len(pose) != len(code):
+            raise InputError(
+                "pose and code",
+                expected=f"shapes (B, {expected[0]}) and (B, {expected[1]})",
+                received=f"shapes {tuple(pose.shape)} and {tuple(code.shape)}",
+            )
+        local = pose[:, None] if self.sets is None else pose[:, None] * self.sets
+        frames = torch.cat([local, code[:, None].expand(-1, local.shape[1], -1)], dim=2)
+        moved = self.body(self.encodings, frames, self.member)
+        clothes = self.cloth_index
+        member = None if self.member is None else self.member[clothes]
+        return moved.index_add(1, clothes, self.cloth(self.encodings[clothes], frames, member))
+
+
+class FrameCodes(nn.Module):
+    """Learnable codes z_t, one for every frame of a sequence, zero at first.
+
+    The zero vector is the *null code*: what a pose without a frame is driven by. It means something only if training
+    shows it to the field, in the place of some of the codes.
+
+    Args:
+        frames: numbers of the frames, each once.
+        code_size: length of a code.
+
+    Raises:
+        InputError: no frames, or one twice.
+    """
+
+    def __init__(self, frames: Sequence[int], code_size: int) -> None:
+        super().__init__()
+        if not len(frames) or len(set(frames)) != len(frames):
+            raise InputError("frames of the codes", expected="at least one, each once", received=str(list(frames)))
+        self.frames = tuple(int(frame) for frame in frames)
+        self.row = {frame: row for row, frame in enumerate(self.frames)}
+        self.codes = nn.Parameter(torch.zeros(len(self.frames), code_size))
+
+    def forward(self, frames: Sequence[int | None]) -> Tensor:
+        """(B, code_size): the code of each frame, the null code for None.
+
+        Raises:
+            InputError: a frame that has no code.
+        """
+        unknown = [frame for frame in frames if frame is not None and frame not in self.row]
+        if unknown:
+            raise InputError(
+                "frame of a code",
+                expected="one of the frames that were trained on, or None",
+                received=", ".join(map(str, unknown)),
+                remedy="drive new frames with the null code, or fit codes to them",
+            )
+        rows = torch.tensor([0 if frame is None else self.row[frame] for frame in frames], device=self.codes.device)
+        known = torch.tensor([frame is not None for frame in frames], device=self.codes.device)
+        return self.codes[rows] * known[:, None]

@@ -1,0 +1,68 @@
+"""Front and back maps of a body in its canonical pose: their cameras, and Gaussians looked up in them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from avatar.models.networks.sparse_rows import SparseRows
+from avatar.render.map_frame import MapFrame
+from smplxpp.core.errors import InputError
+
+
+class MapSampler(nn.Module):
+    """Looks N Gaussians up in front and back maps, bilinearly, each on its own side.
+
+    Values hold at pixel centres (`grid_sample`'s `align_corners=False`); beyond the outermost centres the border's
+    value holds. The lookup is linear in the maps and the same for every frame, so it is prepared as a sparse matrix:
+    several times faster than `grid_sample` on a CPU.
+
+    Args:
+        frame: of the maps.
+        size: side of the maps in pixels.
+        points: (N, 3) canonical positions, metres.
+        front: (N,) bool, True for those on the front map.
+
+    Raises:
+        InputError: points that are not finite or outside the frame, or sides of another number.
+    """
+
+    def __init__(self, frame: MapFrame, size: int, points: Tensor, front: Tensor) -> None:
+        super().__init__()
+        if points.ndim != 2 or points.shape[1] != 3 or front.shape != points.shape[:1]:
+            raise InputError(
+                "canonical Gaussians",
+                expected="positions of shape (N, 3) and sides of shape (N,)",
+                received=f"shapes {tuple(points.shape)} and {tuple(front.shape)}",
+            )
+        pixels = frame.pixels_from_canonical(points.detach(), size)
+        beyond = float((pixels - 0.5 * size).abs().max()) * 2.0 / size if len(pixels) else 0.0
+        if not beyond <= 1.0:
+            raise InputError(
+                "canonical Gaussians",
+                expected=f"within {frame.half_extent:g} m of the middle of the maps along x and y",
+                received=f"one {beyond * frame.half_extent:.3g} m away",
+                remedy="check the units, or choose a larger half extent",
+            )
+        self.size = size
+        corner = (pixels - 0.5).floor().clamp(0, size - 2)
+        right, down = (pixels - 0.5 - corner).clamp(0.0, 1.0).unbind(-1)
+        column, row = corner.long().unbind(-1)
+        first = (~front * size + row) * size + column
+        rows = torch.stack([first, first + 1, first + size, first + size + 1], dim=1)
+        weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]
+        self.lookup = SparseRows(rows, torch.stack(weights, dim=1), 2 * size * size)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(B, 2, size, size, C) front and back maps -> (B, N, C).
+
+        Raises:
+            InputError: maps of another size.
+        """
+        if maps.ndim != 5 or maps.shape[1:4] != (2, self.size, self.size):
+            raise InputError(
+                "maps",
+                expected=f"shape (B, 2, {self.size}, {self.size}, C)",
+                received=f"shape {tuple(maps.shape)}",
+            )
+        return torch.stack([self.lookup(table) for table in maps.flatten(1, 3)])

@@ -1,0 +1,55 @@
+"""Sizes of all networks under one name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from avatar.models.networks.config import require_choice
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.networks.teacher import TeacherConfig
+
+
+@dataclass(frozen=True)
+class NetworkPreset:
+    """Teacher and field of a preset."""
+
+    teacher: TeacherConfig
+    field: FieldConfig
+
+
+_LEAN = {
+    "networks": "shared",
+    "position_size": 128,
+    "centred": True,
+    "style_layers": 1,
+    "noise": False,
+    "zero_output": True,
+}
+
+_TEACHERS = {
+    "paper": TeacherConfig(),
+    "gpu": TeacherConfig(
+        in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
+    ),
+    "cpu": TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN),
+    "demo": TeacherConfig(in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16, **_LEAN),
+}
+
+# Short trainings see few poses.
+_FIELDS = {name: FieldConfig(local_pose=3) for name in ("cpu", "demo")}
+
+NETWORK_PRESETS = {
+    # The field has the paper's sizes in all of them: it is small already.
+    name: NetworkPreset(teacher, _FIELDS.get(name, FieldConfig()))
+    for name, teacher in _TEACHERS.items()
+}
+
+
+def network_preset(name: str) -> NetworkPreset:
+    """The preset "paper", "gpu", "cpu" or "demo".
+
+    Raises:
+        InputError: another name.
+    """
+    require_choice("preset", name, tuple(NETWORK_PRESETS))
+    return NETWORK_PRESETS[name]

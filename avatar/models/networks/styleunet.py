@@ -1,0 +1,267 @@
+"""StyleUNet with two decoders: maps of the front and the back of a body from maps of its pose.
+
+The form is that of StyleAvatar (Wang et al. 2023) and Animatable Gaussians (Li et al. 2024): an encoder of
+down-sampling blocks that sees the input again at every scale, and a style-modulated decoder of StyleGAN2 with skip
+connections, one for each side, whose outputs of all scales are added up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.models.networks.config import require_at_least
+from avatar.models.networks.layers import (
+    GAIN,
+    SLOPE,
+    ConvLayer,
+    EqualizedLinear,
+    FirFilter,
+    JoiningConv,
+    StyledConv,
+    ToMaps,
+)
+from smplxpp.core.errors import InputError
+
+STYLE_RATE = 0.01
+"""Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """Output of a StyleUNet: number of channels, and whether it depends on the viewing direction."""
+
+    channels: int
+    sees_view: bool = False
+
+
+@dataclass(frozen=True)
+class StyleUNetConfig:
+    """Sizes of a StyleUNet. The defaults are those of Animatable Gaussians.
+
+    Attributes:
+        in_channels: of the input image (front and back together).
+        heads: outputs; everything but the finest scale of the decoder is shared between them.
+        in_size, out_size: side of the input and output in pixels, powers of two.
+        bottleneck: side of the coarsest feature map.
+        channel_base, channel_max: a feature map of side r has `min(channel_max, channel_base / r)` channels.
+        style_size, style_layers: length of the style and depth of its mapping network.
+        noise: add fixed noise of learnt strength in the decoder.
+        zero_output: the output starts at exactly zero.
+    """
+
+    in_channels: int = 6
+    heads: tuple[Head, ...] = (Head(3),)
+    in_size: int = 512
+    out_size: int = 1024
+    bottleneck: int = 8
+    channel_base: int = 32768
+    channel_max: int = 512
+    style_size: int = 512
+    style_layers: int = 2
+    noise: bool = True
+    zero_output: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("in_size", "out_size", "bottleneck"):
+            value = getattr(self, name)
+            if value < 1 or value & (value - 1):
+                raise InputError(f"StyleUNet {name}", expected="a power of two", received=str(value))
+        require_at_least("StyleUNet in_size", self.in_size, 4 * self.bottleneck)
+        require_at_least("StyleUNet out_size", self.out_size, 8 * self.bottleneck)
+        for name in ("in_channels", "channel_max", "style_size", "style_layers"):
+            require_at_least(f"StyleUNet {name}", getattr(self, name), 1)
+        require_at_least("StyleUNet channel_base", self.channel_base, max(self.in_size, self.out_size) // 2)
+        if not self.heads or min(head.channels for head in self.heads) < 1:
+            raise InputError(
+                "StyleUNet heads", expected="at least one, of one channel or more", received=str(self.heads)
+            )
+
+    def channels(self, side: int) -> int:
+        """Channels of a feature map of this side."""
+        return min(self.channel_max, self.channel_base // side)
+
+
+class Encoder(nn.Module):
+    """Feature maps of sides in_size/2, in_size/4, ..., bottleneck; the input is added again at every scale."""
+
+    def __init__(self, config: StyleUNetConfig) -> None:
+        super().__init__()
+        c = config.channels
+        side = config.in_size // 2
+        self.first = ConvLayer(config.in_channels, c(side), down=True)
+        self.from_image, self.blocks = nn.ModuleList(), nn.ModuleList()
+        while side > config.bottleneck:
+            self.from_image.append(ConvLayer(config.in_channels, c(side), kernel=1))
+            self.blocks.append(nn.Sequential(ConvLayer(c(side), c(side)), ConvLayer(c(side), c(side // 2), down=True)))
+            side //= 2
+        self.last = ConvLayer(c(side), c(side))
+        self.filter = FirFilter()
+
+    def forward(self, image: Tensor) -> dict[int, Tensor]:
+        """(B, in_channels, S, S) -> feature maps by their side."""
+        x = self.first(image)
+        features = {x.shape[-1]: x}
+        for from_image, block in zip(self.from_image, self.blocks, strict=True):
+            image = self.filter.halve(image)
+            x = block(x + from_image(image))
+            features[x.shape[-1]] = x
+        features[x.shape[-1]] = self.last(x)
+        return features
+
+
+class Merge(nn.Module):
+    """Skip connections, shared by both decoders: `conv(cat(x, encoder features of the same side))`.
+
+    The convolution of the two halves is summed, so that the encoder's half is done once for all decoders and heads. The
+    coarsest side has no decoder features yet, those finer than the encoder's finest have no encoder features: they pass
+    as they are.
+    """
+
+    def __init__(self, config: StyleUNetConfig) -> None:
+        super().__init__()
+        self.convs = nn.ModuleDict()
+        side = 2 * config.bottleneck
+        while side <= min(config.in_size // 2, config.out_size // 4):
+            self.convs[str(side)] = JoiningConv(config.channels(side))
+            side *= 2
+
+    def skips(self, features: dict[int, Tensor]) -> dict[int, Tensor]:
+        """Encoder features by side -> their half of each convolution, by side."""
+        return {int(side): conv.skip(features[int(side)]) for side, conv in self.convs.items()}
+
+    def forward(self, x: Tensor, skips: dict[int, Tensor]) -> Tensor:
+        side = x.shape[-1]
+        return self.convs[str(side)](x, skips[side]) if side in skips else x
+
+
+class DecoderStep(nn.Module):
+    """One scale of a decoder: features of side r to side 2r, and their part of the output, of side 4r."""
+
+    def __init__(self, config: StyleUNetConfig, side: int, channels: int) -> None:
+        super().__init__()
+        inputs, outputs, style = config.channels(side), config.channels(2 * side), config.style_size
+        noise_size = 2 * side if config.noise else None
+        self.up = StyledConv(inputs, outputs, style, up=True, noise_size=noise_size)
+        self.conv = StyledConv(outputs, outputs, style, noise_size=noise_size)
+        self.to_maps = ToMaps(outputs, channels, style, zero=config.zero_output)
+
+    def forward(self, x: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.conv(self.up(x, style), style)
+        return x, self.to_maps(x, style)
+
+
+class Decoder(nn.Module):
+    """Decoder of one side of the body: scales that all heads share, then the finest scale for each head."""
+
+    def __init__(self, config: StyleUNetConfig) -> None:
+        super().__init__()
+        self.heads = config.heads
+        self.coarse = nn.ModuleList()
+        side, finest = config.bottleneck, config.out_size // 4
+        while side < finest:
+            self.coarse.append(DecoderStep(config, side, sum(head.channels for head in config.heads)))
+            side *= 2
+        self.fine = nn.ModuleList(DecoderStep(config, finest, head.channels) for head in config.heads)
+        self.filter = FirFilter(gain=4.0)
+
+    def forward(
+        self, x: Tensor, skip: Callable[[Tensor], Tensor], style: Tensor, view_features: Tensor | None
+    ) -> list[Tensor]:
+        """Maps of each head.
+
+        Args:
+            x: (B, C, bottleneck, bottleneck) coarsest features.
+            skip: joins decoder features to the encoder's of the same side.
+            style: (style_size,).
+            view_features: (V, C, out_size/4, out_size/4) or None.
+
+        Returns:
+            (B, channels, out_size, out_size) for each head, (V, ...) where it sees the view.
+        """
+        maps = None
+        for step in self.coarse:
+            x, part = step(skip(x), style)
+            maps = part if maps is None else self.filter.double(maps) + part
+        coarse_maps = maps.split([head.channels for head in self.heads], dim=1)
+        outputs = []
+        for head, step, coarse in zip(self.heads, self.fine, coarse_maps, strict=True):
+            seen = x + view_features if head.sees_view and view_features is not None else x
+            outputs.append(self.filter.double(coarse) + step(skip(seen), style)[1])
+        return outputs
+
+
+class ViewEncoder(nn.Module):
+    """Maps of the cosine between normal and viewing direction to features that are added before the finest scale."""
+
+    def __init__(self, config: StyleUNetConfig) -> None:
+        super().__init__()
+        self.side = config.out_size // 4
+        channels = config.channels(self.side)
+        self.first = ConvLayer(1, max(1, channels // 2), down=True)
+        self.second = ConvLayer(max(1, channels // 2), channels, down=True)
+
+    def forward(self, cosines: Tensor) -> tuple[Tensor, Tensor]:
+        """(V, 2, S, S) cosines of front and back -> their features, (V, channels, out_size/4, out_size/4) each."""
+        features = self.second(self.first(cosines.flatten(0, 1)[:, None]))
+        features = F.interpolate(features, size=(self.side, self.side), mode="bilinear")
+        return features[0::2], features[1::2]
+
+
+class StyleUNet(nn.Module):
+    """Encoder and two decoders, for the front and the back.
+
+    Features x of side r go through `x <- conv_up(merge(x))`, `x <- conv(x)`, and the output is the sum over scales
+    `maps <- double(maps) + to_maps(x)`, so that the finest convolution runs at half the output's side.
+    The style is `mapping(1)`, one learnt vector.
+    """
+
+    def __init__(self, config: StyleUNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("style_seed", torch.ones(config.style_size), persistent=False)
+        self.mapping = nn.ModuleList(
+            EqualizedLinear(config.style_size, config.style_size, rate=STYLE_RATE) for _ in range(config.style_layers)
+        )
+        self.encoder = Encoder(config)
+        self.merge = Merge(config)
+        self.decoders = nn.ModuleList([Decoder(config), Decoder(config)])
+        self.view_encoder = ViewEncoder(config) if any(head.sees_view for head in config.heads) else None
+
+    def style(self) -> Tensor:
+        """(style_size,): what modulates every convolution of the decoders."""
+        w = self.style_seed
+        for layer in self.mapping:
+            w = F.leaky_relu(layer(w), SLOPE) * GAIN
+        return w
+
+    def forward(self, image: Tensor, view_cosines: Tensor | None = None) -> list[Tensor]:
+        """Maps of each head.
+
+        Args:
+            image: (B, in_channels, in_size, in_size).
+            view_cosines: (V, 2, in_size, in_size), cosine between the normal and the direction to the camera on the
+                front and the back; B = V, or B = 1 for V views of one pose. None: the heads that could see the view
+                do not.
+
+        Returns:
+            (B, 2, out_size, out_size, channels) for each head, with V in place of B where the head sees the view.
+        """
+        features = self.encoder(image.contiguous(memory_format=torch.channels_last))
+        view_features = (None, None)
+        if view_cosines is not None and self.view_encoder is not None:
+            view_features = self.view_encoder(view_cosines)
+        style, skips = self.style(), self.merge.skips(features)
+        coarsest = features[self.config.bottleneck]
+        sides = [
+            decoder(coarsest, lambda x: self.merge(x, skips), style, view)
+            for decoder, view in zip(self.decoders, view_features, strict=True)
+        ]
+        return [
+            torch.stack([maps.permute(0, 2, 3, 1) for maps in front_and_back], dim=1)
+            for front_and_back in zip(*sides, strict=True)
+        ]

@@ -1,0 +1,233 @@
+"""The teacher: residuals of all Gaussians of a body from front and back maps of its pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from avatar.models.networks.config import require_choice
+from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
+from smplxpp.core.errors import InputError
+
+POSITION, COLOUR = 3, 3
+OTHER = 7
+"""Channels of opacity (1), tangential log scales (2) and quaternion (4)."""
+
+
+@dataclass(frozen=True)
+class TeacherConfig:
+    """Sizes of the teacher. The defaults are the paper's.
+
+    Attributes:
+        networks: "separate", three StyleUNets for position, colour and the other attributes; or "shared", one whose
+            finest scale alone is split into shape (position and others) and colour.
+        semantics: how the semantic colours join the positions: "sum" (6 input channels) or "concatenate" (12).
+        sees_view: colour depends on the viewing direction.
+        position_scale: metres of displacement for an output of 1.
+        position_size: side in pixels of the output of a smaller network for the position alone, which has half the
+            channels, sees the input at half that size and is enlarged to `out_size`; 0: the position is one of the
+            others' outputs. Displacements are smoother than colours, and the smaller network learns them many times
+            faster.
+        centred: show the networks by how much a pose's map differs from the mean of the training frames, in units of
+            the differences' standard deviation; False: the map itself, in metres.
+        in_size, out_size, bottleneck, channel_base, channel_max, style_size, style_layers, noise, zero_output: of each
+            StyleUNet, see `StyleUNetConfig`.
+
+    Raises:
+        InputError: sizes that are no powers of two or do not fit each other, an unknown choice.
+    """
+
+    networks: str = "separate"
+    semantics: str = "sum"
+    sees_view: bool = True
+    position_scale: float = 0.05
+    position_size: int = 0
+    centred: bool = False
+    in_size: int = 512
+    out_size: int = 1024
+    bottleneck: int = 8
+    channel_base: int = 32768
+    channel_max: int = 512
+    style_size: int = 512
+    style_layers: int = 2
+    noise: bool = True
+    zero_output: bool = False
+
+    def __post_init__(self) -> None:
+        require_choice("teacher networks", self.networks, ("separate", "shared"))
+        require_choice("teacher semantics", self.semantics, ("sum", "concatenate"))
+        if not self.position_scale > 0:
+            raise InputError("teacher position_scale", expected="above 0 m", received=f"{self.position_scale:g}")
+        largest = min(2 * self.in_size, self.out_size)
+        if not 0 <= self.position_size <= largest:
+            raise InputError("teacher position_size", expected=f"from 0 to {largest}", received=str(self.position_size))
+        self.network_configs()
+
+    def network_configs(self) -> dict[str, StyleUNetConfig]:
+        """The StyleUNets by name."""
+        position, other, colour = (Head(POSITION),), (Head(OTHER),), Head(COLOUR, sees_view=self.sees_view)
+        if self.networks == "separate":
+            heads = {"position": position, "colour": (colour,), "other": other}
+        elif self.position_size:
+            heads = {"position": position, "all": (*other, colour)}
+        else:
+            heads = {"all": (Head(POSITION + OTHER), colour)}
+        configs = {name: self._network_config(its_heads) for name, its_heads in heads.items()}
+        if self.position_size:
+            configs["position"] = replace(
+                configs["position"],
+                in_size=self.position_size // 2,
+                out_size=self.position_size,
+                channel_base=max(1, self.channel_base // 2),
+                channel_max=max(1, self.channel_max // 2),
+            )
+        return configs
+
+    def _network_config(self, heads: tuple[Head, ...]) -> StyleUNetConfig:
+        return StyleUNetConfig(
+            in_channels=6 if self.semantics == "sum" else 12,
+            heads=heads,
+            in_size=self.in_size,
+            out_size=self.out_size,
+            bottleneck=self.bottleneck,
+            channel_base=self.channel_base,
+            channel_max=self.channel_max,
+            style_size=self.style_size,
+            style_layers=self.style_layers,
+            noise=self.noise,
+            zero_output=self.zero_output,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What the teacher adds to the attributes: as maps (B, 2, R, R, ...) or Gaussian by Gaussian (B, N, ...).
+
+    Attributes:
+        shape: (..., 10) position in units of `position_scale`, opacity, log scales and quaternion, side by side.
+        colour: (..., 3) added to the colour that does not depend on the view; V views in the place of B poses if the
+            teacher was given V view maps.
+        position_scale: metres.
+    """
+
+    shape: Tensor
+    colour: Tensor
+    position_scale: float
+
+    @property
+    def position(self) -> Tensor:
+        """(..., 3) metres along the axes of the canonical pose."""
+        return self.position_scale * self.shape[..., :3]
+
+    @property
+    def opacity_logit(self) -> Tensor:
+        """(...), added before the sigmoid."""
+        return self.shape[..., 3]
+
+    @property
+    def log_scales(self) -> Tensor:
+        """(..., 2), added to the logarithms of the tangential scales."""
+        return self.shape[..., 4:6]
+
+    @property
+    def quats(self) -> Tensor:
+        """(..., 4) wxyz, added before normalisation."""
+        return self.shape[..., 6:]
+
+    def sampled(self, sampler: MapSampler) -> Residuals:
+        """Maps looked up at the Gaussians of `sampler`."""
+        return Residuals(sampler(self.shape), sampler(self.colour), self.position_scale)
+
+
+def local_offsets(canonical_offsets: Tensor, canonical_from_local: Tensor) -> Tensor:
+    """Displacements in the triangles' frames, `du = R^T dU`.
+
+    Args:
+        canonical_offsets: (..., N, 3) metres along the canonical axes.
+        canonical_from_local: (N, 3, 3) rotation of each Gaussian's triangle in the canonical pose.
+
+    Returns:
+        (..., N, 3) metres.
+    """
+    return torch.einsum("nij,...ni->...nj", canonical_from_local, canonical_offsets)
+
+
+class Teacher(nn.Module):
+    """StyleUNets from position maps to residual maps (Animatable Gaussians' form, as TaoAvatar uses it)."""
+
+    def __init__(self, config: TeacherConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.networks = nn.ModuleDict({name: StyleUNet(c) for name, c in config.network_configs().items()})
+
+    def forward(self, positions: Tensor, semantics: Tensor, view_cosines: Tensor | None = None) -> Residuals:
+        """Residual maps of B poses.
+
+        Args:
+            positions: (B, 2, S, S, 3) posed coordinates without the root's motion, metres, on the front and back map of
+                the canonical pose; 0 on the background.
+            semantics: (B, 2, S, S, 3) or (1, 2, S, S, 3) semantic colours on the same maps.
+            view_cosines: (V, 2, S, S) cosine between the posed normal and the direction to the camera; V = B, or B = 1
+                and V views of one pose. None: no view is seen.
+
+        Returns:
+            Maps of shape (B, 2, R, R, channels), R the output size; colour (V, 2, R, R, 3).
+
+        Raises:
+            InputError: maps of another size.
+        """
+        size = self.config.in_size
+        B, V = len(positions), len(positions) if view_cosines is None else len(view_cosines)
+        _require_shape("position maps", positions, (B, 2, size, size, 3))
+        _require_shape("semantic maps", semantics, (B if len(semantics) != 1 else 1, 2, size, size, 3))
+        if view_cosines is not None:
+            _require_shape("view maps", view_cosines, (V if B == 1 else B, 2, size, size))
+        image = self._image(positions, semantics)
+        if "position" not in self.networks:
+            shape, colour = self.networks["all"](image, view_cosines)
+            return Residuals(shape, colour, self.config.position_scale)
+        position = self._position(image)
+        if "all" in self.networks:
+            other, colour = self.networks["all"](image, view_cosines)
+        else:
+            (colour,) = self.networks["colour"](image, view_cosines)
+            (other,) = self.networks["other"](image)
+        return Residuals(torch.cat([position, other], dim=-1), colour, self.config.position_scale)
+
+    def positions(self, positions: Tensor, semantics: Tensor) -> Tensor:
+        """The residuals of the position alone, (B, 2, R, R, 3) in units of `position_scale`.
+
+        Args:
+            positions, semantics: as in `forward`.
+        """
+        image = self._image(positions, semantics)
+        return self._position(image) if "position" in self.networks else self.networks["all"](image)[0][..., :POSITION]
+
+    def _image(self, positions: Tensor, semantics: Tensor) -> Tensor:
+        """(B, channels, S, S) input of the StyleUNets."""
+        if self.config.semantics == "sum":
+            image = positions + semantics
+        else:
+            image = torch.cat([positions, semantics.expand_as(positions)], dim=-1)
+        return image.permute(0, 1, 4, 2, 3).flatten(1, 2)
+
+    def _position(self, image: Tensor) -> Tensor:
+        """(B, 2, R, R, 3) of the position's own network."""
+        network, out = self.networks["position"], self.config.out_size
+        if image.shape[-1] != network.config.in_size:
+            image = F.interpolate(image, size=(network.config.in_size,) * 2, mode="area")
+        (maps,) = network(image)
+        if maps.shape[2] == out:
+            return maps
+        channels_first = maps.flatten(0, 1).permute(0, 3, 1, 2)
+        larger = F.interpolate(channels_first, size=(out, out), mode="bilinear", align_corners=False)
+        return larger.permute(0, 2, 3, 1).unflatten(0, maps.shape[:2])
+
+
+def _require_shape(subject: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise InputError(subject, expected=f"shape {shape}", received=f"shape {tuple(value.shape)}")

@@ -1,0 +1,99 @@
+"""Surfaces followed through a sequence: displacements of control points, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.networks.control_points import template_control_points
+from avatar.models.networks.sparse_rows import SparseRows
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion, Rig
+
+STILL = 1e-3
+"""Metres: motion off the clothes much below this costs nearly nothing."""
+
+
+class ControlCage(nn.Module):
+    """Interpolates displacements of K control points of a template to its vertices, part by part.
+
+    Args:
+        rig: of the template. count: K.
+    """
+
+    def __init__(self, rig: Rig, count: int) -> None:
+        super().__init__()
+        control = template_control_points(rig.template, count)
+        neighbours = torch.tensor(control.neighbours, device=rig.device)
+        self.count = len(control.vertices)
+        weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
+        self.rows = SparseRows(neighbours, weights, self.count)
+        self.register_buffer("off_clothes", ~rig.cloth_mask[torch.as_tensor(control.vertices, device=rig.device)])
+        # Two control points are neighbours if some vertex has them as its two nearest.
+        pairs = neighbours[:, :2].sort(dim=1).values
+        self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
+
+    def forward(self, controls: Tensor) -> Tensor:
+        """(K, 3) -> (V, 3) metres."""
+        return self.rows(controls)
+
+    def roughness(self, controls: Tensor) -> Tensor:
+        """Mean squared difference of neighbours, square metres."""
+        return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
+
+    def motion_off_clothes(self, controls: Tensor) -> Tensor:
+        """Mean distance, metres, by which points of body, hair and shoes leave skinning; 0 where there are none."""
+        moved = controls[self.off_clothes].square().sum(-1)
+        return ((moved + STILL**2).sqrt() - STILL).sum() / max(len(moved), 1)
+
+
+class TrackedAvatar(nn.Module):
+    """Gaussians on a mesh that control points move in one frame at a time (an `AvatarModel`).
+
+    Args:
+        rig: of the template. gaussians: on it; they stay as they are.
+        count: control points.
+    """
+
+    def __init__(self, rig: Rig, gaussians: BoundGaussians, count: int) -> None:
+        super().__init__()
+        self.rig = rig
+        self.gaussians = LearnedGaussians(gaussians)
+        self.cage = ControlCage(rig, count)
+        self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
+        """(K, 3) metres, of the frame that is being followed."""
+        self.to(rig.device)
+
+    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The avatar in a pose, displaced by the control points as they stand."""
+        displacements = self.cage(self.controls)
+        vertices = self.rig.pose(motion, displacements)
+        frames = triangle_frames(vertices, self.rig.faces)
+        bound = self.gaussians()
+        world = world_from_frames(bound, frames)
+        colors = view_colors(bound, frames, world.means.detach(), eyes)
+        return PosedAvatar(vertices, world, colors, bound, displacements)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A surface followed through frames.
+
+    Attributes:
+        row: of every frame. cage: interpolates the controls.
+        controls: (T, K, 3) metres, 0 in a frame whose surface the template is.
+    """
+
+    row: dict[int, int]
+    controls: Tensor
+    cage: ControlCage
+
+    def displacements(self, frame: int) -> Tensor:
+        """(V, 3) metres along the axes of the T-pose."""
+        return self.cage(self.controls[self.row[frame]])

@@ -1,0 +1,1 @@
+"""A template that torch can pose, and what a posed avatar is."""

@@ -1,0 +1,58 @@
+"""What every avatar gives for one pose, whatever network is behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, WorldGaussians
+from avatar.rig.rig import Motion, Rig
+
+
+@dataclass(frozen=True, eq=False)
+class PosedAvatar:
+    """An avatar in one pose, as C cameras see it.
+
+    Attributes:
+        vertices: (V, 3) posed mesh, world, metres.
+        gaussians: N of them in the world.
+        colors: (C, N, 3) sRGB, towards each camera.
+        bound: the same Gaussians in their triangles' frames, with this pose's residuals.
+        displacements: (V, 3) metres by which the mesh left the T-pose before skinning; None: skinning alone.
+    """
+
+    vertices: Tensor
+    gaussians: WorldGaussians
+    colors: Tensor
+    bound: BoundGaussians
+    displacements: Tensor | None = None
+
+
+class AvatarModel(Protocol):
+    """Anything that can be posed and drawn: teacher, student, baselines."""
+
+    rig: Rig
+
+    def __call__(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+        """The avatar in a pose.
+
+        Args:
+            eyes: (C, 3) centres of projection in the world, metres.
+        """
+
+
+@contextmanager
+def at_rest(model: nn.Module) -> Iterator[None]:
+    """No gradients, and the module in its evaluation mode; afterwards it trains as before."""
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(was_training)

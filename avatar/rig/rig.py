@@ -1,0 +1,143 @@
+"""A template that torch can pose: what drives it in one frame, and its skinning with displaced vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import torch
+from threadpoolctl import ThreadpoolController
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.template.template import Template
+
+THETA = 63
+"""Length of theta: 21 body joints, axis-angle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One pose of a template, ready for the networks and for skinning; float32.
+
+    Attributes:
+        frame: number of the training frame whose code the student takes; None for the null code.
+        pose: (63,) theta, radians. expression: (E,). jaw: (3,) axis-angle, radians.
+        rest: (V, 3) T-pose with this frame's expression and pose correctives, metres.
+        world_from_rest: (V, 3, 4) blended transforms of the vertices.
+        root_from_world: (4, 4) takes the root's motion away.
+    """
+
+    frame: int | None
+    pose: Tensor
+    expression: Tensor
+    jaw: Tensor
+    rest: Tensor
+    world_from_rest: Tensor
+    root_from_world: Tensor
+
+    def without_code(self) -> Motion:
+        """The same pose, driven by the null code."""
+        return replace(self, frame=None)
+
+
+class Rig:
+    """Skinning of a template in torch, with displacements of its vertices in the T-pose.
+
+    Args:
+        template: the clothed body.
+        device: of all tensors.
+    """
+
+    def __init__(self, template: Template, device: torch.device | str = "cpu") -> None:
+        self.template, self.device = template, torch.device(device)
+        self.faces = torch.tensor(template.faces, device=device)
+        self.vertices = self._tensor(template.vertices)
+        self.cloth_mask = torch.tensor(template.cloth_mask, device=device)
+        self.semantic_colors = self._tensor(template.semantic_colors / 255.0)
+        """(V, 3) in [0, 1]."""
+        self._weights = template.weights.dense().astype(np.float32)
+
+    @property
+    def expression_size(self) -> int:
+        return self.template.expression_basis.shape[2]
+
+    def motion(self, params: BodyParams, *, frame: int | None = None) -> Motion:
+        """What one pose does to the template.
+
+        Args:
+            params: one frame. frame: its number, where the student has a code for it.
+
+        Raises:
+            InputError: several frames, or parameters that the body refuses.
+        """
+        if len(params) != 1:
+            raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
+        # A BLAS thread that has done its part spins on; torch's threads, which come next, would wait for its core.
+        with _thread_pools().limit(limits=1, user_api="blas"):
+            posed = self.template.posed_body(params)
+            transforms = posed.posed_from_rest[0]
+            blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
+        rest = self.template.vertices.astype(np.float32)
+        rest[: self.template.body_vertex_count] = posed.rest_vertices[0]
+        expression = np.zeros(self.expression_size)
+        expression[: params.expression.shape[1]] = params.expression[0]
+        return Motion(
+            frame,
+            pose=self._tensor(params.body_pose[0]),
+            expression=self._tensor(expression),
+            jaw=self._tensor(params.jaw_pose[0]),
+            rest=self._tensor(rest),
+            world_from_rest=self._tensor(blended.reshape(-1, 3, 4)),
+            root_from_world=self._tensor(np.linalg.inv(transforms[0])),
+        )
+
+    def pose(self, motion: Motion, displacements: Tensor | None = None) -> Tensor:
+        """Vertices in the world, `x = (sum_j w_j G_j) (v + dv)`.
+
+        Args:
+            displacements: (V, 3) dv, metres along the axes of the T-pose; gradients reach them.
+
+        Returns:
+            (V, 3) metres.
+        """
+        rest = motion.rest if displacements is None else motion.rest + displacements
+        return _Skinning.apply(rest, motion.world_from_rest)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=self.device)
+
+
+@cache
+def _thread_pools() -> ThreadpoolController:
+    """Looks through all loaded libraries: once, not for every pose."""
+    return ThreadpoolController()
+
+
+class _Skinning(torch.autograd.Function):
+    """(V, 3) rest positions, (V, 3, 4) transforms -> (V, 3); gradients reach the positions.
+
+    Written as sums of columns: a batched product of (3, 3) matrices, or a sum over an axis of three, is several times
+    slower on a CPU.
+    """
+
+    @staticmethod
+    def forward(ctx, rest: Tensor, world_from_rest: Tensor) -> Tensor:
+        ctx.save_for_backward(world_from_rest)
+        return world_from_rest[..., 3] + _column_sum(rest, world_from_rest.unbind(-1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        (world_from_rest,) = ctx.saved_tensors
+        return _column_sum(gradient, world_from_rest[..., :3].unbind(-2)), None
+
+
+def _column_sum(factors: Tensor, columns: Sequence[Tensor]) -> Tensor:
+    """`sum_k factors_k columns_k` of (V, 3) factors and the first three (V, 3) columns."""
+    x, y, z = factors.split(1, dim=-1)
+    return torch.addcmul(torch.addcmul(columns[0] * x, columns[1], y), columns[2], z)

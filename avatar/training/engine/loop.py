@@ -1,0 +1,190 @@
+"""The loop that every training shares: metrics, evaluations, checkpoints, a limit of time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.metrics_log import append_metrics, truncate_metrics
+from avatar.training.engine.processes import Distributed
+from avatar.training.engine.resource_errors import explain_shortage
+from avatar.training.engine.tensorboard_log import TensorboardLog
+
+STATE_FILE = "state.safetensors"
+METRICS_FILE = "metrics.jsonl"
+TENSORBOARD_FOLDER = "tensorboard"
+
+
+class Task(Protocol):
+    """What is trained. A step depends on nothing but the state and its number: a resumed run is the same run.
+
+    Attributes:
+        distributed: the processes that train together. All take every step; the first alone evaluates and saves.
+    """
+
+    distributed: Distributed
+
+    def step(self, iteration: int) -> Mapping[str, Any]:
+        """Step number `iteration`, counted from 0; its metrics."""
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Figures of the state after `iteration` steps, as JSON values."""
+
+    def state(self) -> Mapping[str, Tensor]:
+        """All that the next step depends on."""
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `state` gave."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """How long and how often.
+
+    Attributes:
+        iterations: steps in all.
+        log_every, evaluate_every: steps between lines of metrics and between evaluations; both also come at the end,
+            and an evaluation at the start.
+        checkpoint_seconds: a kill loses at most the steps of this time.
+        max_seconds: stop with a checkpoint when this session has worked as long.
+        keep_end: keep a checkpoint of the end too: what comes after this training may be killed as well.
+        tensorboard: log for TensorBoard too.
+    """
+
+    iterations: int
+    log_every: int = 10
+    evaluate_every: int = 250
+    checkpoint_seconds: float = 30.0
+    max_seconds: float = float("inf")
+    keep_end: bool = False
+    tensorboard: bool = False
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the loop is.
+
+    Attributes:
+        iteration, iterations: steps done, steps in all.
+        seconds: spent in steps, all sessions together. session_seconds: of them, in this session.
+        rate: steps a second of this session.
+        metrics: of the last logged step. evaluation: figures, when this call follows an evaluation.
+    """
+
+    iteration: int
+    iterations: int
+    seconds: float
+    rate: float
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    evaluation: Mapping[str, Any] | None = None
+    session_seconds: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        return self.iteration >= self.iterations
+
+
+def run_training(
+    task: Task, config: LoopConfig, folder: Path, *, key: str, report: Callable[[Progress], None] = lambda p: None
+) -> Progress:
+    """Train, from the checkpoint in `folder` if there is one, else from the start.
+
+    `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. Evaluations do not count as time spent.
+    Where several processes train, all start from the first one's state, its clock is everyone's, and it alone reads,
+    evaluates and writes.
+
+    Args:
+        key: of configuration and inputs; a checkpoint goes on under its own key alone.
+        report: called by the first process after lines of metrics.
+
+    Returns:
+        Where training ended: before the last step only when `max_seconds` was over.
+
+    Raises:
+        InputError: a checkpoint of another key or version, which stays as it is; memory or disk ran out, or the task
+            diverged (`DivergedError`), and the last checkpoint is kept.
+        MissingExtraError: a log for TensorBoard without tensorboard.
+    """
+    together = task.distributed
+    state, metrics = folder / STATE_FILE, folder / METRICS_FILE
+    sinks: list[Callable[[Mapping[str, Any]], None]] = [partial(append_metrics, metrics)]
+    logged: Mapping[str, Any] = {}
+
+    def open_events() -> None:
+        if config.tensorboard:
+            events = TensorboardLog(folder / TENSORBOARD_FOLDER, redone=done + 1 if done else 0)
+            sinks.append(stack.enter_context(closing(events)).add)
+
+    def progress(evaluation: Mapping[str, Any] | None = None) -> Progress:
+        rate = (done - first) / spent if spent else 0.0
+        return Progress(done, config.iterations, spent_before + spent, rate, logged, evaluation, spent)
+
+    def log(kind: str, values: Mapping[str, Any]) -> None:
+        seconds = round(spent_before + spent, 3)
+        for sink in sinks:
+            sink({"kind": kind, "iteration": done, "seconds": seconds, **values})
+
+    def log_step() -> None:
+        log("step", {**logged, "iterations_per_second": round((done - first) / spent, 3)})
+        report(progress())
+
+    def evaluate() -> None:
+        figures = task.evaluate(done)
+        log("evaluation", figures)
+        report(progress(figures))
+
+    def save() -> None:
+        save_checkpoint(state, Checkpoint(done, spent_before + spent, key, task.state()))
+
+    with explain_shortage(folder), ExitStack() as stack:
+        done, spent_before = _begin(task, state, metrics, key)
+        first, spent, unsaved = done, 0.0, 0.0
+        together.from_first(open_events)
+        if not done:
+            together.from_first(evaluate)
+        while done < config.iterations and spent < config.max_seconds:
+            begin = time.perf_counter()
+            values = task.step(done)
+            took = together.from_first(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
+            done, spent, unsaved = done + 1, spent + took, unsaved + took
+            last = done == config.iterations
+            if done % config.log_every == 0 or last:
+                logged = values
+                together.from_first(log_step)
+            if done % config.evaluate_every == 0 or last:
+                together.from_first(evaluate)
+            if unsaved >= config.checkpoint_seconds and not last:
+                together.from_first(save)
+                unsaved = 0.0
+        if done < config.iterations or (config.keep_end and done > first):
+            together.from_first(save)
+        return progress()
+
+
+def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float]:
+    """Bring every process to the checkpoint, or to where the first one stands; steps done and seconds they took."""
+
+    def start() -> Checkpoint:
+        state.parent.mkdir(parents=True, exist_ok=True)
+        for left in (*state.parent.glob(f".{state.stem}.*"), *state.parent.glob(f".{metrics.stem}.*")):
+            left.unlink()  # half a file of a session that was killed while it wrote
+        checkpoint = load_checkpoint(state, key=key)
+        if checkpoint is not None and checkpoint.iteration:
+            truncate_metrics(metrics, checkpoint.iteration)
+            return checkpoint
+        metrics.unlink(missing_ok=True)  # before the first step the start is measured again
+        return checkpoint or Checkpoint(
+            0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()}
+        )
+
+    checkpoint = task.distributed.from_first(start)
+    task.restore(checkpoint.tensors)
+    return checkpoint.iteration, checkpoint.seconds

@@ -1,0 +1,229 @@
+"""What every training by gradients shares: micro-batches, schedules, Adam, a stop at the first NaN, exact state."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from avatar.training.engine.processes import Distributed
+from smplxpp.core.errors import InputError
+
+MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+class DivergedError(InputError):
+    """Training met a number that is not finite. Parameters and the last checkpoint are as before the step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserConfig:
+    """Adam and its learning rates over a training of T steps.
+
+    Attributes:
+        iterations: T.
+        schedule: share of a group's rate at step t, counted from 0. With f the group's `final`:
+            cosine `f + (1 - f) (1 + cos(pi t / T)) / 2` (Loshchilov and Hutter 2017), exponential `f^(t / T)`,
+            constant 1.
+        warmup: steps over which the rates also rise linearly from `1 / warmup` to 1; 0 for none.
+        betas, eps: Adam's.
+        clip: largest norm of all gradients together; longer ones are scaled down to it.
+        amp: networks in bfloat16 on CUDA, where the task says so with `GradientTask.autocast`. bfloat16 has float32's
+            range, so that no gradient needs scaling. Without effect on the CPU.
+    """
+
+    iterations: int
+    schedule: Literal["cosine", "exponential", "constant"] = "cosine"
+    warmup: int = 0
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    clip: float = math.inf
+    amp: bool = False
+
+    def __post_init__(self) -> None:
+        if self.schedule not in ("cosine", "exponential", "constant"):
+            raise InputError(
+                "optimiser: schedule", expected="cosine, exponential or constant", received=repr(self.schedule)
+            )
+        for name, value, fits, expected in (
+            ("iterations", self.iterations, self.iterations >= 1, "a number, at least 1"),
+            ("warmup", self.warmup, 0 <= self.warmup < math.inf, "a number of steps, at least 0"),
+            ("betas", self.betas, all(0.0 <= beta < 1.0 for beta in self.betas), "two numbers in [0, 1)"),
+            ("eps", self.eps, 0.0 < self.eps < math.inf, "a positive number"),
+            ("clip", self.clip, self.clip > 0.0, "a positive number"),
+        ):
+            if not fits:
+                raise InputError(f"optimiser: {name}", expected=expected, received=repr(value))
+
+    def share(self, iteration: int, final: float) -> float:
+        """Of a rate, at a step counted from 0."""
+        at = iteration / self.iterations
+        rising = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
+        if self.schedule == "cosine":
+            return rising * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * at)))
+        return rising * (final**at if self.schedule == "exponential" else 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterGroup:
+    """Tensors that one learning rate moves.
+
+    Attributes:
+        name: with the tensor's own, `name.own`, its key in checkpoints. Groups may share a name, not a key.
+        parameters: leaves that require a gradient, all of one device.
+        rate: Adam's step at the start. final: share of it at the end; the schedule says how it gets there.
+    """
+
+    name: str
+    parameters: Mapping[str, Tensor]
+    rate: float
+    final: float = 0.05
+
+    def __post_init__(self) -> None:
+        assert all(value.is_leaf and value.requires_grad for value in self.parameters.values()), self.name
+        if not 0.0 < self.rate < math.inf:
+            raise InputError(f"learning rate {self.name}", expected="a positive number", received=repr(self.rate))
+        if not 0.0 < self.final <= 1.0:
+            raise InputError(
+                f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.final)
+            )
+
+
+class GradientTask(ABC):
+    """A task of `run_training` that Adam solves: the mean loss of a step's micro-batches goes down.
+
+    A subclass says what the micro-batches of a step are (`items`) and what each costs (`loss`). Micro-batches of one
+    process are taken one after the other and their gradients added up, so that a step needs the memory of one; several
+    processes share them out.
+
+    Args:
+        groups: what is learned.
+        config: how.
+        distributed: the processes that train together; this one alone by default.
+    """
+
+    def __init__(
+        self, groups: Sequence[ParameterGroup], config: OptimiserConfig, distributed: Distributed | None = None
+    ) -> None:
+        self.groups, self.optimiser_config = tuple(groups), config
+        self.distributed = distributed or Distributed()
+        keyed = [(f"{group.name}.{name}", value) for group in groups for name, value in group.parameters.items()]
+        self.learned = dict(keyed)
+        assert len(self.learned) == len(keyed) > 0, "parameters need keys of their own"
+        self.device = keyed[0][1].device
+        self.optimiser = torch.optim.Adam(
+            [{"params": list(group.parameters.values()), "lr": group.rate} for group in groups],
+            betas=config.betas,
+            eps=config.eps,
+            fused=True,
+        )
+
+    @abstractmethod
+    def items(self, iteration: int) -> Sequence[Any]:
+        """The micro-batches of a step: one or more, decided by its number alone, the same on every process."""
+
+    @abstractmethod
+    def loss(self, item: Any) -> tuple[Tensor, Mapping[str, float]]:
+        """The loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
+
+    def share(self, iteration: int, group: ParameterGroup) -> float:
+        """Of a group's rate at a step: the configuration's schedule."""
+        return self.optimiser_config.share(iteration, group.final)
+
+    def name_of(self, item: Any) -> str:
+        """A micro-batch in the user's words: "frame 12, cameras Cam001 Cam002"."""
+        return str(item)
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Figures of the state after `iteration` steps; none by default."""
+        return {}
+
+    def autocast(self) -> torch.autocast:
+        """To put around networks, and nothing else: rasteriser and losses need float32. Cast what comes out."""
+        enabled = self.optimiser_config.amp and self.device.type == "cuda"
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
+
+    def step(self, iteration: int) -> Mapping[str, Any]:
+        """One step of Adam on the mean over the micro-batches.
+
+        Returns:
+            Means of the losses' numbers, each over the items that gave it, and the items' names.
+
+        Raises:
+            DivergedError: a loss or gradient is not finite, on any process; nothing has changed.
+            InputError: fewer items than processes.
+        """
+        items = self.items(iteration)
+        for group, told in zip(self.optimiser.param_groups, self.groups, strict=True):
+            group["lr"] = told.rate * self.share(iteration, told)
+        self.optimiser.zero_grad(set_to_none=True)
+        outcomes = self.distributed.share_out(items, lambda own: self._backward(own, len(items)))
+        for item, figures in zip(items, outcomes, strict=True):
+            if figures is None:
+                raise _diverged(iteration, self.name_of(item))
+        parameters = list(self.learned.values())
+        self.distributed.sum_gradients(parameters)
+        if self.optimiser_config.clip < math.inf:
+            torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.clip)
+        self.optimiser.step()
+        return {**_means(outcomes), "items": [self.name_of(item) for item in items]}
+
+    def state(self) -> Mapping[str, Tensor]:
+        """Parameters by `group.name`, and Adam's moments of each that has been moved."""
+        tensors = dict(self.learned)
+        for key, value in self.learned.items():
+            for moment, content in self.optimiser.state.get(value, {}).items():
+                tensors[f"adam.{moment}.{key}"] = content
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `state` gave, bit for bit."""
+        with torch.no_grad():
+            for key, value in self.learned.items():
+                value.copy_(tensors[key])
+                moments = {moment: tensors.get(f"adam.{moment}.{key}") for moment in MOMENTS}
+                self.optimiser.state[value] = {
+                    moment: _laid_out(content, value) for moment, content in moments.items() if content is not None
+                }
+
+    def _backward(self, item: Any, count: int) -> Mapping[str, float] | None:
+        """Add a micro-batch's share to the gradients; None if it is not finite."""
+        loss, figures = self.loss(item)
+        (loss / count).backward()
+        gradients = (value.grad for value in self.learned.values() if value.grad is not None)
+        return figures if _finite((loss, *gradients)) else None
+
+
+def _laid_out(content: Tensor, parameter: Tensor) -> Tensor:
+    """A copy on the parameter's device that lies in memory as the parameter does: fused Adam walks both together."""
+    if content.shape != parameter.shape:  # the number of steps
+        return content.to(parameter.device, copy=True)
+    return torch.empty_like(parameter).copy_(content)
+
+
+def _finite(values: Iterable[Tensor]) -> bool:
+    """A sum is NaN or infinite when any of its terms is."""
+    return bool(torch.isfinite(torch.stack([value.detach().sum() for value in values]).sum()))
+
+
+def _diverged(iteration: int, item: str) -> DivergedError:
+    return DivergedError(
+        f"training step {iteration}, {item}",
+        expected="a finite loss and finite gradients",
+        received="NaN or infinity",
+        remedy="look at its images, masks, parameters and cameras; lower the learning rates",
+    )
+
+
+def _means(outcomes: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of every number over the outcomes that have it, in the order of first appearance."""
+    columns: dict[str, list[float]] = {}
+    for figures in outcomes:
+        for name, value in figures.items():
+            columns.setdefault(name, []).append(value)
+    return {name: math.fsum(values) / len(values) for name, values in columns.items()}

@@ -1,0 +1,71 @@
+"""Trainings without rendering: networks that learn known displacements, many poses a step, at little cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from avatar.training.engine.optimization_task import GradientTask, OptimiserConfig, ParameterGroup
+from smplxpp.core.errors import InputError
+
+KNOWN_BYTES = 1 << 30
+"""Of inputs and known displacements that are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PretrainConfig:
+    """Choices of a training without rendering.
+
+    Attributes:
+        iterations: steps of Adam. batch: poses a step.
+        rate, final, warmup, betas: of Adam, see `OptimiserConfig`.
+    """
+
+    iterations: int
+    batch: int = 1
+    rate: float = 5e-4
+    final: float = 0.05
+    warmup: int = 0
+    betas: tuple[float, float] = (0.9, 0.999)
+
+    def __post_init__(self) -> None:
+        for name, least in (("iterations", 1), ("batch", 1), ("warmup", 0)):
+            if not getattr(self, name) >= least:
+                raise InputError(
+                    f"pretraining: {name}", expected=f"at least {least}", received=str(getattr(self, name))
+                )
+
+    @property
+    def evaluate_every(self) -> int:
+        """Nothing is measured on the way."""
+        return self.iterations
+
+    def optimiser(self) -> OptimiserConfig:
+        """Of these steps."""
+        return OptimiserConfig(iterations=self.iterations, warmup=self.warmup, betas=self.betas)
+
+    def shortened(self, share: float) -> PretrainConfig:
+        """With `share` of the steps."""
+        return replace(self, iterations=max(1, round(share * self.iterations)))
+
+
+class PretrainTask(GradientTask):
+    """One batch a step, in an order that changes from epoch to epoch."""
+
+    def __init__(self, groups: Sequence[ParameterGroup], config: PretrainConfig, count: int, seed: int) -> None:
+        super().__init__(groups, config.optimiser())
+        self.batch, self.count, self.seed = min(config.batch, count), count, seed
+
+    def items(self, iteration: int) -> Sequence[tuple[int, ...]]:
+        """The numbers of the poses of a step: each at most once an epoch, what batches leave over in another one."""
+        per_epoch = self.count // self.batch
+        epoch, place = divmod(iteration, per_epoch)
+        order = np.random.default_rng((self.seed, 3, epoch)).permutation(self.count)
+        return [tuple(order[place * self.batch : (place + 1) * self.batch].tolist())]
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Nothing: no view is rendered."""
+        return {"mean": {}}

@@ -1,0 +1,48 @@
+"""Memory or disk that runs out, told as what to do about it."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from smplxpp.core.errors import InputError
+
+NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
+"""In the words of CUDA's libraries and of the CPU allocators, which have no exception of their own."""
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def explain_shortage(folder: Path) -> Iterator[None]:
+    """Turn errors of memory and disk within the block into an `InputError`; all others pass.
+
+    Args:
+        folder: where checkpoints and results go.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        words = str(error)
+        known = isinstance(error, MemoryError | torch.cuda.OutOfMemoryError)
+        if not (known or any(part in words.lower() for part in NO_MEMORY)):
+            raise
+        raise InputError(
+            "memory",
+            expected="room for a step of the training",
+            received=words.splitlines()[0] if words else type(error).__name__,
+            remedy="end other programs and give the same command, which goes on from the last checkpoint; or take a "
+            "smaller preset, smaller images (--scale) or fewer Gaussians",
+        ) from error
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        raise InputError(
+            f"disk of {folder}",
+            expected="room for checkpoints and results",
+            received=error.strerror or str(error),
+            remedy="free some space and give the same command, which goes on from the last checkpoint",
+        ) from error

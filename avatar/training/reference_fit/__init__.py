@@ -1,0 +1,1 @@
+"""One frame's photographs turn a posed template into Gaussians."""

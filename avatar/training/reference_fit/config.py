@@ -1,0 +1,68 @@
+"""What decides a reference fit, and presets that differ in time and detail."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from avatar.gaussians.sampling import SamplingConfig
+from avatar.training.engine.learning_rates import LearningRates
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """Choices of a reference fit.
+
+    Attributes:
+        sampling: number of Gaussians and where they start.
+        iterations: steps; each renders one view.
+        rates: learning rates.
+        dssim: share of `1 - SSIM` in the loss, the rest is L1.
+        alpha: weight of the L1 between rendered opacity and mask. Without it dark hair on a black background could be
+            holes.
+        scale_penalty, offset_penalty: weights of GaussianAvatars' penalties.
+        eps2d: pixels squared that the rasteriser blurs every Gaussian by. 1/12 is the variance of a pixel's own square;
+            viewers use 0.3, which widens silhouettes by a pixel, and the surface would have to shrink to meet them.
+        margin: pixels kept around the silhouette of a training view.
+        evaluations: how often quality is measured, spread evenly.
+        seed: of the views' order. The Gaussians' places have their own in `sampling`.
+    """
+
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    iterations: int = 800
+    rates: LearningRates = field(default_factory=LearningRates)
+    dssim: float = 0.2
+    alpha: float = 0.1
+    scale_penalty: float = 1.0
+    offset_penalty: float = 1.0
+    eps2d: float = 0.1
+    margin: int = 12
+    evaluations: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least, most in (
+            ("iterations", 1, math.inf),
+            ("dssim", 0.0, 1.0),
+            ("alpha", 0.0, math.inf),
+            ("scale_penalty", 0.0, math.inf),
+            ("offset_penalty", 0.0, math.inf),
+            ("eps2d", 0.0, math.inf),
+            ("margin", 0, math.inf),
+            ("evaluations", 1, math.inf),
+            ("seed", 0, math.inf),
+        ):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and least <= value <= most):
+                limit = f" and at most {most:g}" if math.isfinite(most) else ""
+                raise InputError(f"fit: {name}", expected=f"a number, at least {least:g}{limit}", received=repr(value))
+
+
+PRESETS: dict[str, FitConfig] = {
+    "quick": FitConfig(sampling=SamplingConfig(count=60_000), iterations=200),
+    "default": FitConfig(sampling=SamplingConfig(count=150_000), iterations=800),
+    "paper": FitConfig(sampling=SamplingConfig(count=270_000, head_share=70 / 270), iterations=10_000),
+}
+"""quick shows whether all fits together; default ends where a dozen cameras have no more to give to views held out;
+paper has TaoAvatar's numbers."""

@@ -1,0 +1,68 @@
+"""Colours to start from: what the photographs show where each Gaussian lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
+from torch import Tensor
+
+from avatar.data.views import View
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh
+
+DEPTH_TOLERANCE = 0.015
+"""Metres that a point may lie behind the surface and still count as seen."""
+MIN_COSINE = 0.2
+"""Surfaces seen at a flatter angle than this give no colour: their pixels belong to the silhouette."""
+MIN_OPACITY = 0.99
+
+
+def colors_from_views(
+    points: np.ndarray, normals: np.ndarray, fallback: Tensor, *, mesh: TriangleMesh, views: Sequence[View]
+) -> tuple[Tensor, np.ndarray]:
+    """Mean colour of points over the views that see them, weighted by the pixels a square metre has there.
+
+    `c = sum_v w_v I_v(p) / sum_v w_v`, `w_v = cos^2 (f / distance)^2` where the z-buffer of the mesh shows the point,
+    no silhouette edge is within a pixel, and the mask is opaque; 0 elsewhere.
+
+    Args:
+        points, normals: (N, 3) in the world; unit normals.
+        fallback: (N, 3) colours of the points that no view sees.
+        mesh: what hides points from cameras.
+
+    Returns:
+        (N, 3) float32 colours, and (N,) bool: which points some view saw.
+    """
+    total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
+    for view in views:
+        camera = view.camera
+        x, y, depth = camera.screen_from_world(points).T[:3]
+        front = rasterize_mesh(mesh, camera).depth
+        # Nearest surface around the pixel, and whether background is among its neighbours.
+        nearest, farthest = minimum_filter(front, 3), maximum_filter(front, 3)
+        inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        column = np.where(inside, x, 0).astype(int)
+        row = np.where(inside, y, 0).astype(int)
+        away = camera.position - points
+        distance = np.linalg.norm(away, axis=1)
+        cosine = (away * normals).sum(1) / distance
+        opacity = view.opacity().cpu().numpy()
+        seen = (
+            inside & (cosine > MIN_COSINE) & np.isfinite(farthest[row, column]) & (opacity[row, column] > MIN_OPACITY)
+        )
+        seen &= depth <= nearest[row, column] + DEPTH_TOLERANCE
+        index = np.flatnonzero(seen)
+        image = view.foreground.cpu().numpy() / 255.0
+        at = np.stack([y[index] - 0.5, x[index] - 0.5])
+        w = (cosine[index] * camera.K[0, 0] / distance[index]) ** 2
+        total[index] += w[:, None] * np.stack(
+            [map_coordinates(image[..., k], at, order=1, mode="nearest") for k in range(3)], axis=1
+        )
+        weight[index] += w
+    seen = weight > 0
+    colors = fallback.detach().cpu().numpy().copy()
+    colors[seen] = total[seen] / weight[seen, None]
+    return torch.tensor(colors, dtype=torch.float32, device=fallback.device), seen

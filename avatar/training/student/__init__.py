@@ -1,0 +1,1 @@
+"""The student: pretraining, bake, compensation, pruning."""

@@ -1,0 +1,129 @@
+"""The bake: what the teacher does in maps becomes motion of the student's mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
+from avatar.models.networks.config import require_choice
+from avatar.models.student import Student
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.rig.rig import Motion
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.student.distillation import TeacherSource
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeConfig(ViewConfig):
+    """Choices of the bake: `L_bak = L_rec + a L_non + b L_sem`.
+
+    Attributes:
+        iterations: 30k in the paper. attributes: the paper refines them.
+        pretrain: `L_non` alone before the iterations, without rendering; None in the paper.
+        imagined: poses between those of the training frames that the pretraining asks the teacher about.
+        images: what renderings are compared with: the "teacher"'s, or "photographs".
+        nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
+        tau: radians a metre, of the semantic labels.
+        code_rate: Adam's step of the frame codes, as a multiple of `rate`.
+        null_share: of the poses that are shown with the null code, so that it means something.
+        pose_noise: radians, standard deviation on the theta that the field sees; skinning has the true pose.
+    """
+
+    iterations: int = 30_000
+    attributes: float = 0.5
+    images: str = "teacher"
+    pretrain: PretrainConfig | None = None
+    imagined: int = 0
+    nonrigid: float = 0.1
+    semantic: float = 1.0
+    tau: float = TAU
+    code_rate: float = 1.0
+    null_share: float = 0.0
+    pose_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("bake: images", self.images, ("teacher", "photographs"))
+        for name in ("imagined", "nonrigid", "semantic", "code_rate", "pose_noise"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"bake: {name}", expected="at least 0", received=repr(getattr(self, name)))
+        if not 0.0 <= self.null_share <= 1.0:
+            raise InputError("bake: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+
+
+class BakeTask(ViewTask):
+    """Field, frame codes and local attributes learn from the teacher; without one, from the photographs alone.
+
+    Args:
+        student: with a field, or without one, when only its attributes learn.
+        teacher: frozen; None: `L_rec` alone, on photographs.
+    """
+
+    def __init__(
+        self,
+        sequence: AvatarSequence,
+        student: Student,
+        config: BakeConfig,
+        *,
+        teacher: TeacherAvatar | None = None,
+        **options: Any,
+    ) -> None:
+        groups = []
+        if student.field is not None:
+            groups = [
+                ParameterGroup("field", dict(student.field.named_parameters()), config.rate, config.final),
+                ParameterGroup("codes", {"codes": student.codes.codes}, config.rate * config.code_rate, config.final),
+            ]
+        super().__init__(sequence, student, config, groups, **options)
+        self.student, self.config, self.source = student, config, None
+        if teacher is not None:
+            self.source = TeacherSource(
+                teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)
+            )
+            teacher_config = teacher.config
+            self.displacement_loss = DisplacementLoss(
+                sequence.rig, teacher.frame, teacher_config.out_size, teacher_config.position_scale
+            )
+            self.labels = semantic_labels(sequence.rig, student.gaussians(), tau=config.tau)
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """Of one frame."""
+        motion = self._seen(self.sequence.motion(item.frame))
+        views = self.views(item)
+        posed = self.student(motion, eyes_of(views))
+        if self.source is None:
+            total, terms, _ = self.compared(posed, views)
+            return total, {"loss": float(total.detach()), **terms}
+        semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
+        lessons = self.source.lessons(item.frame, views) if semantic or imitates else []
+        targets = [lesson.target for lesson in lessons] if imitates else None
+        total, terms, renderings = self.compared(posed, views, targets, extra=self.labels if semantic else None)
+        if semantic:
+            pairs = zip(renderings, lessons, strict=True)
+            differences = [(drawn.extra - lesson.labels).abs().mean() for drawn, lesson in pairs]
+            terms["semantic"] = float(torch.stack(differences).mean().detach())
+            total = total + self.config.semantic * torch.stack(differences).mean()
+        if self.config.nonrigid and posed.displacements is not None:
+            nonrigid = self.displacement_loss(posed.displacements, self.source.displacements(item.frame))
+            terms["nonrigid"] = float(nonrigid.detach())
+            total = total + self.config.nonrigid * nonrigid
+        return total, {"loss": float(total.detach()), **terms}
+
+    def _seen(self, motion: Motion) -> Motion:
+        """The pose as the field is shown it."""
+        noise = self.generator(motion.frame)
+        if self.config.null_share and noise.random() < self.config.null_share:
+            motion = motion.without_code()
+        if self.config.pose_noise:
+            moved = torch.tensor(noise.normal(size=len(motion.pose)) * self.config.pose_noise)
+            motion = replace(motion, pose=motion.pose + moved.to(motion.pose))
+        return motion

@@ -1,0 +1,75 @@
+"""The compensation: blend shapes of the Gaussians learn what the baked mesh leaves over; the field stays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.models.student import Student
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.photometric_task import ViewConfig, ViewTask, pixel_size
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompensateConfig(ViewConfig):
+    """Choices of the compensation.
+
+    Attributes:
+        iterations: 100k, and items: 4, in the paper.
+        rate: of the mapping networks. position_rate: of U, pixels. color_rate: of C, colours in [0, 1].
+        null_share: of the poses that are shown with the null code.
+        seeded: the blend shapes start from what the field left over of the surface that the teacher followed, see
+            `seed_blend_shapes`; False: from zero, as in the paper.
+    """
+
+    iterations: int = 100_000
+    items: int = 4
+    position_rate: float = 0.02
+    color_rate: float = 1e-3
+    null_share: float = 0.0
+    seeded: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.null_share <= 1.0:
+            raise InputError("compensation: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+
+
+class CompensateTask(ViewTask):
+    """U, C and the mapping networks H and B learn from photographs by `L_rec`; field and codes are frozen.
+
+    Args:
+        student: with blend shapes.
+    """
+
+    def __init__(self, sequence: AvatarSequence, student: Student, config: CompensateConfig, **options: Any) -> None:
+        shapes = student.blend_shapes
+        if shapes is None:
+            raise InputError("student of the compensation", expected="blend shapes", received="none")
+        for frozen in (student.field, student.codes):
+            if frozen is not None:
+                frozen.requires_grad_(False)
+        mapping = {f"head.{name}": value for name, value in shapes.head.named_parameters()}
+        mapping |= {f"body.{name}": value for name, value in shapes.body.named_parameters()}
+        groups = [
+            ParameterGroup("mapping", mapping, config.rate, config.final),
+            ParameterGroup("positions", {"U": shapes.U}, config.position_rate * pixel_size(sequence), config.final),
+            ParameterGroup("colors", {"C": shapes.C}, config.color_rate, config.final),
+        ]
+        super().__init__(sequence, student, config, groups, **options)
+        self.student, self.config = student, config
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """Of one frame."""
+        views = self.views(item)
+        motion = self.sequence.motion(item.frame)
+        if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
+            motion = motion.without_code()
+        posed = self.student(motion, eyes_of(views))
+        total, terms, _ = self.compared(posed, views)
+        return total, {"loss": float(total.detach()), **terms}

@@ -1,0 +1,105 @@
+"""What the teacher says of the training frames: renderings, labels and maps, kept while they fit in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import torch
+from torch import Tensor
+
+from avatar.data.byte_cache import ByteCache
+from avatar.data.sequence import AvatarSequence, eyes_of
+from avatar.data.views import View
+from avatar.losses.deformation import semantic_labels
+from avatar.losses.reconstruction import Target
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.render.avatar_view import render_view
+from avatar.render.mesh_maps import MeshMapsTensor, front_back_maps
+
+SEEN = 0.5
+"""Opacity from which a blended normal counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What the student is to imitate in one view.
+
+    Attributes:
+        target: the teacher's image, opacity and, if asked for, normals. labels: (H, W, 3) its semantic map.
+    """
+
+    target: Target
+    labels: Tensor
+
+
+class TeacherSource:
+    """The frozen teacher, asked for lessons; the latest used are kept, in half precision.
+
+    Args:
+        teacher: its weights are not changed. sequence: of the frames.
+        background: (3,) behind the person. eps2d: see `rasterize`.
+        tau: of the semantic labels. normals: whether lessons have them.
+        max_bytes: of what is kept.
+    """
+
+    def __init__(
+        self,
+        teacher: TeacherAvatar,
+        sequence: AvatarSequence,
+        *,
+        eps2d: float,
+        tau: float,
+        normals: bool,
+        max_bytes: int = 2 << 30,
+    ) -> None:
+        self.teacher, self.sequence = teacher.requires_grad_(False), sequence
+        self.eps2d, self.normals = eps2d, normals
+        self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
+        self._kept = ByteCache(max_bytes)
+
+    def displacements(self, frame: int) -> Tensor:
+        """(2, R, R, 3) metres, the teacher's position maps dU of a frame; the surface itself where it was followed."""
+
+        def make() -> tuple[Tensor, ...]:
+            if self.teacher.track is not None:
+                return (self._maps.interpolate(self.teacher.track.displacements(frame)).half(),)
+            return (self.teacher.displacement_maps([self.sequence.motion(frame)])[0].half(),)
+
+        return self._kept.get(("maps", frame), make)[0].float()
+
+    @cached_property
+    def _maps(self) -> MeshMapsTensor:
+        """The T-pose's, as large as the teacher's."""
+        rig, teacher = self.sequence.rig, self.teacher
+        return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
+
+    def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
+        """What the teacher shows in views of a frame."""
+        keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
+        # Taken before others are put in, which may push them out.
+        lessons = {k: self._kept.get(key, tuple) for k, key in enumerate(keys) if key in self._kept}
+        missing = [k for k in range(len(keys)) if k not in lessons]
+        if missing:
+            with torch.no_grad():
+                eyes = eyes_of([views[k] for k in missing])
+                posed = self.teacher(self.sequence.motion(frame), eyes)
+                for index, k in enumerate(missing):
+                    draw = partial(self._draw, posed, index, views[k])
+                    lessons[k] = self._kept.get(keys[k], draw)
+        return [_lesson(lessons[k]) for k in range(len(keys))]
+
+    def _draw(self, posed, index: int, view: View) -> tuple[Tensor, ...]:
+        seen = render_view(
+            posed, index, view, self.sequence.background, eps2d=self.eps2d, normals=self.normals, extra=self.labels
+        )
+        tensors = [seen.image, seen.alpha, seen.extra]
+        if self.normals:
+            tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
+        return tuple(tensor.half() for tensor in tensors)
+
+
+def _lesson(tensors: tuple[Tensor, ...]) -> Lesson:
+    image, alpha, labels, *normals = (tensor.float() for tensor in tensors)
+    return Lesson(Target(image, alpha, normals[0] if normals else None), labels)

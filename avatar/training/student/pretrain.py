@@ -1,0 +1,124 @@
+"""Networks that learn known displacements before anything is rendered: many poses a step, at little cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.data.byte_cache import ByteCache
+from avatar.data.sequence import AvatarSequence
+from avatar.models.front_back_assignment import map_sides
+from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.student import Student
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.render.mesh_maps import vertex_normals
+from avatar.rig.rig import Motion
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
+
+BEYOND = 0.25
+"""Imagined poses reach beyond the two that they lie between by this share of the way."""
+HIDDEN = 0.01
+"""Metres behind the maps' surface from which a point is not the one that they show."""
+
+
+class PretrainFieldTask(PretrainTask):
+    """`L_non` where the field is evaluated: its displacements against the teacher's at the same points.
+
+    Those of a training frame are the surface that was followed, where there is one, else the teacher's maps. The
+    teacher can be asked about any pose. Imagined ones, on the lines between the poses of two training frames and a
+    little beyond, are shown with the null code, which so learns what lies between the frames.
+
+    Args:
+        student: with a field. teacher: whose maps are learned.
+        code_rate: rate of the frame codes, as a multiple of the field's.
+        null_share: of the training poses that are shown with the null code too.
+        imagined: number of imagined poses.
+    """
+
+    def __init__(
+        self,
+        sequence: AvatarSequence,
+        student: Student,
+        teacher: TeacherAvatar,
+        config: PretrainConfig,
+        seed: int,
+        *,
+        code_rate: float,
+        null_share: float,
+        imagined: int,
+    ) -> None:
+        groups = [
+            ParameterGroup("field", dict(student.field.named_parameters()), config.rate, config.final),
+            ParameterGroup("codes", {"codes": student.codes.codes}, config.rate * code_rate, config.final),
+        ]
+        frames = sequence.train_frames
+        super().__init__(groups, config, len(frames) + imagined, seed)
+        self.sequence, self.student, self.teacher = sequence, student, teacher
+        self.null_share = null_share
+        self._lookup = _MapLookup(teacher, student.field.points)
+        self._known = ByteCache(KNOWN_BYTES)
+        self.iteration = 0
+
+    def items(self, iteration: int) -> Sequence[tuple[int, ...]]:
+        self.iteration = iteration
+        return super().items(iteration)
+
+    def name_of(self, item: tuple[int, ...]) -> str:
+        frames = self.sequence.train_frames
+        return "poses " + " ".join(str(frames[k]) if k < len(frames) else f"imagined {k - len(frames)}" for k in item)
+
+    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
+        """Of a batch of poses."""
+        frames = self.sequence.train_frames
+        draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
+        shown = [
+            frames[k] if k < len(frames) and draw >= self.null_share else None
+            for k, draw in zip(item, draws, strict=True)
+        ]
+        pose, known = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
+        found = self.student.field.at_points(pose, self.student.codes(shown))
+        loss = (found - known).abs().sum(-1).mean() / self.teacher.config.position_scale
+        return loss, {"loss": float(loss.detach())}
+
+    def _of(self, number: int) -> tuple[Tensor, ...]:
+        """theta (63,), and the teacher's displacements (K, 3) metres at the field's points."""
+
+        def make() -> tuple[Tensor, ...]:
+            motion, track = self._motion(number), self.teacher.track
+            if motion.frame is not None and track is not None:
+                return motion.pose, track.displacements(motion.frame)[self.student.field.points]
+            return motion.pose, self._lookup(self.teacher.displacement_maps([motion]))[0]
+
+        return self._known.get(number, make)
+
+    def _motion(self, number: int) -> Motion:
+        frames, sequence = self.sequence.train_frames, self.sequence
+        if number < len(frames):
+            return sequence.motion(frames[number])
+        noise = np.random.default_rng((self.seed, 5, number))
+        a, b = (sequence.capture.params(frames[k]) for k in noise.integers(len(frames), size=2))
+        share = noise.uniform(-BEYOND, 1.0 + BEYOND)
+        return sequence.rig.motion(replace(a, body_pose=a.body_pose + share * (b.body_pose - a.body_pose)))
+
+
+class _MapLookup:
+    """The teacher's displacements at vertices of the template.
+
+    Clothes under other clothes take what is shown in front of them: layers move together. Skin that is not shown stays.
+    """
+
+    def __init__(self, teacher: TeacherAvatar, points: Tensor) -> None:
+        rig, size = teacher.rig, teacher.config.out_size
+        vertices, normals = rig.vertices[points], vertex_normals(rig.vertices, rig.faces)[points]
+        sides = map_sides(rig, teacher.frame, size, vertices, normals)
+        self.sampler = MapSampler(teacher.frame, size, vertices, sides.front)
+        self.stays = (sides.behind > HIDDEN) & ~rig.cloth_mask[points]
+
+    def __call__(self, maps: Tensor) -> Tensor:
+        """(B, 2, R, R, 3) -> (B, K, 3)."""
+        return self.sampler(maps).masked_fill(self.stays[:, None], 0.0)

@@ -1,0 +1,71 @@
+"""A trained student made small: blend shapes of the Gaussians that need them, within a number of bytes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from avatar.data.sequence import AvatarSequence
+from avatar.models.networks.blend_shapes import STORED_BYTES
+from avatar.models.student import Student
+from smplxpp.core.errors import InputError
+
+HEADER_BYTES = 16_384
+"""More than the names and shapes of a model file take."""
+
+
+def coefficient_std(student: Student, sequence: AvatarSequence) -> Tensor:
+    """(parts, n) standard deviations of the blend shapes' coefficients over the training frames.
+
+    Args:
+        student: with blend shapes.
+    """
+    shapes = student.blend_shapes
+    rows = []
+    with torch.no_grad():
+        for frame in sequence.train_frames:
+            motion = sequence.motion(frame)
+            jaw = motion.jaw[None] if shapes.config.jaw else None
+            rows.append(shapes.coefficients(motion.expression[None], motion.pose[None], jaw)[0])
+    return torch.stack(rows).std(dim=0, correction=0)
+
+
+def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> tuple[Student, float]:
+    """The student with as many Gaussians' blend shapes as a compact file of `max_bytes` has room for.
+
+    Those that move and colour most over the training frames keep theirs (`BlendShapes.pruned`).
+
+    Returns:
+        The smaller student, and the share of the Gaussians that keep their blend shapes; itself and 1 if all fit.
+
+    Raises:
+        InputError: the Gaussians and networks alone are larger.
+    """
+    shapes = student.blend_shapes
+    count, stored = shapes.count, student.state_dict()
+    one = 2 * 3 * shapes.config.shapes * STORED_BYTES + 4  # U, C and the Gaussian's index in `active`
+    tensors = {
+        name: value
+        for name, value in stored.items()
+        if name not in ("blend_shapes.U", "blend_shapes.C", "blend_shapes.active")
+    }
+    rest = HEADER_BYTES + sum(value.numel() * _compact_size(value) for value in tensors.values())
+    keep = min(1.0, (max_bytes - rest) / (one * count))
+    if keep * count < 1:
+        raise InputError(
+            "size of the compact student",
+            expected=f"room for {rest / 1e6:.1f} MB of Gaussians and networks",
+            received=f"{max_bytes / 1e6:.1f} MB",
+            remedy="allow more, or train with fewer Gaussians",
+        )
+    if keep == 1.0:
+        return student, 1.0
+    keep = math.floor(keep * count) / count
+    return student.with_blend_shapes(shapes.pruned(coefficient_std(student, sequence), keep=keep)).eval(), keep
+
+
+def _compact_size(value: Tensor) -> int:
+    """Bytes of a number in a compact model file."""
+    return STORED_BYTES if value.is_floating_point() else min(4, value.element_size())

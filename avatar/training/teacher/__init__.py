@@ -1,0 +1,1 @@
+"""The teacher: pretraining and training."""

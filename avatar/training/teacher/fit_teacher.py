@@ -1,0 +1,78 @@
+"""The teacher's training: residual maps that make the Gaussians of every frame look like its photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.models.networks.teacher import Residuals
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.rig.posed import PosedAvatar
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.tracking.track import TrackConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitTeacherConfig(ViewConfig):
+    """Choices of the teacher's training.
+
+    Attributes:
+        iterations: 600k in the paper.
+        pretrain: before them, without rendering: to zero residuals (5k steps in Animatable Gaussians), or with `track`
+            to the displacements that were found. None: the networks start as they are.
+        track: follow the surface first; None: the paper's way.
+        view_jitter: standard deviation of the noise on the directions that colour sees, as a share of the distance.
+        displacement: weight of `mean |dU|^2` over the Gaussians, in units of the map.
+    """
+
+    iterations: int = 600_000
+    pretrain: PretrainConfig | None = field(default_factory=lambda: PretrainConfig(iterations=5_000))
+    view_jitter: float = 0.1
+    displacement: float = 0.0
+    track: TrackConfig | None = None
+
+
+class TeacherTask(ViewTask):
+    """`L_rec` of the teacher's renderings."""
+
+    def __init__(
+        self, sequence: AvatarSequence, teacher: TeacherAvatar, config: FitTeacherConfig, **options: Any
+    ) -> None:
+        networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
+        super().__init__(sequence, teacher, config, [networks], **options)
+        self.teacher, self.config = teacher, config
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """Of one frame: the networks run once for all its cameras."""
+        views = self.views(item)
+        motion, eyes = self.sequence.motion(item.frame), eyes_of(views)
+        maps = self._maps(item, eyes)
+        posed = self.teacher.posed(motion, eyes, maps)
+        total, terms, _ = self.compared(posed, views)
+        if self.config.displacement:
+            moved = maps.shape[..., :3].square().mean()
+            total = total + self.config.displacement * moved
+        return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
+
+    def _maps(self, item: Item, eyes: Tensor) -> Residuals:
+        motion = self.sequence.motion(item.frame)
+        noise = self.generator(item.frame).normal(size=eyes.shape) * self.config.view_jitter
+        center = motion.root_from_world.inverse()[:3, 3]
+        away = (eyes - center).norm(dim=-1, keepdim=True)
+        jittered = eyes + away * torch.tensor(noise, dtype=eyes.dtype, device=eyes.device)
+        with self.autocast():
+            maps = self.teacher.residual_maps(motion, jittered)
+        return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)
+
+
+def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> float:
+    """Mean length of the Gaussians' displacement, mm."""
+    with torch.no_grad():
+        return 1e3 * float((posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean())

@@ -1,0 +1,70 @@
+"""The teacher's networks learn the surface that was followed, or zero residuals, before anything is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.data.byte_cache import ByteCache
+from avatar.data.sequence import AvatarSequence
+from avatar.gaussians.binding import on_triangles
+from avatar.models.networks.teacher import Residuals
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked_surface import Track
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
+
+
+class PretrainTeacherTask(PretrainTask):
+    """Displacements that are known, `mean |dU - known|` where the Gaussians look the maps up; or all residuals zero.
+
+    Args:
+        teacher: whose networks learn.
+        track: the displacements that are known, of a teacher whose other residuals start at zero; None: every residual
+            is to be zero.
+    """
+
+    def __init__(
+        self, sequence: AvatarSequence, teacher: TeacherAvatar, config: PretrainConfig, seed: int, track: Track | None
+    ) -> None:
+        networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
+        super().__init__([networks], config, len(sequence.train_frames), seed)
+        self.sequence, self.teacher, self.track = sequence, teacher, track
+        self._known = ByteCache(KNOWN_BYTES)
+
+    def name_of(self, item: tuple[int, ...]) -> str:
+        return "frames " + " ".join(str(self.sequence.train_frames[k]) for k in item)
+
+    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
+        """Of a batch of frames."""
+        frames = [self.sequence.train_frames[k] for k in item]
+        if self.track is None:
+            maps = [self._all_residuals(frame) for frame in frames]
+            loss = sum(m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps) / len(maps)
+            return loss, {"loss": float(loss.detach())}
+        inputs, known = zip(*(self._of(frame) for frame in frames), strict=True)
+        with self.autocast():
+            found = self.teacher.networks.positions(torch.cat(inputs), self.teacher.semantics)
+        units = torch.stack(known) / self.teacher.config.position_scale
+        loss = (self.teacher.sampler(found.float()) - units).abs().sum(-1).mean()
+        return loss, {"loss": float(loss.detach())}
+
+    def _of(self, frame: int) -> tuple[Tensor, ...]:
+        """Input map, and the known displacements of the Gaussians, (N, 3) metres along the axes of the T-pose."""
+
+        def make() -> tuple[Tensor, ...]:
+            corners = self.track.displacements(frame)[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
+            inputs = self.teacher.position_input(self.sequence.motion(frame))
+            return inputs, on_triangles(corners, self.teacher.gaussians.barycentric)
+
+        return self._known.get(frame, make)
+
+    def _all_residuals(self, frame: int) -> Residuals:
+        cameras = self.sequence.cameras(frame, 0, 1, self.seed)
+        eyes = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
+        eyes = torch.tensor(eyes, dtype=torch.float32, device=self.sequence.device)
+        with self.autocast():
+            return self.teacher.residual_maps(self.sequence.motion(frame), eyes)

@@ -1,0 +1,1 @@
+"""The surface followed through the training frames."""

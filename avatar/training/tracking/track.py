@@ -1,0 +1,206 @@
+"""Following the surface: displacements of every training frame, found one after the other from coarse to fine.
+
+Cloth that swings moves by many pixels, and a pattern repeats within few: gradients of images lead a network that learns
+all frames at once into the wrong stripe. From one frame to the next the way is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.data.views import View
+from avatar.losses.reconstruction import ReconstructionWeights
+from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from smplxpp.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Level:
+    """A part of the steps of a frame.
+
+    Attributes:
+        halvings: of the images. steps: of Adam. rate: metres, at its first step; it falls to `LEVEL_END` of that.
+    """
+
+    halvings: int
+    steps: int
+    rate: float
+
+
+LEVEL_END = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackConfig:
+    """Choices of the tracking.
+
+    Attributes:
+        levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
+        control_points: on the template. views: cameras a step.
+        smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
+        still: weight of the mean distance that control points off the clothes move, a metre: parameters say where the
+            body is, and few pixels cannot tell better. Not applied to a template without clothes.
+        extrapolation: share of the motion between the two frames before that a frame starts with.
+        weights: of the losses.
+        reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
+            comes first.
+        seed: of the order of views.
+    """
+
+    levels: tuple[Level, ...] = (Level(2, 20, 5e-3), Level(1, 16, 4e-3), Level(0, 20, 2e-3))
+    control_points: int = 2400
+    views: int = 4
+    smoothness: float = 80.0
+    still: float = 0.0
+    extrapolation: float = 1.0
+    weights: ReconstructionWeights = field(
+        default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
+    )
+    reference: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.rate <= 0 for level in self.levels):
+            raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
+        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("still", 0), ("extrapolation", 0)):
+            if not getattr(self, name) >= least:
+                raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
+
+    @property
+    def steps(self) -> int:
+        """Of one frame."""
+        return sum(level.steps for level in self.levels)
+
+    def shortened(self, share: float) -> TrackConfig:
+        """With `share` of the steps of every level."""
+        levels = tuple(replace(level, steps=max(1, round(share * level.steps))) for level in self.levels)
+        return replace(self, levels=levels)
+
+
+class TrackTask(ViewTask):
+    """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels."""
+
+    def __init__(self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, **options: Any) -> None:
+        frames = sequence.train_frames
+        if config.reference is not None and config.reference not in frames:
+            raise InputError(
+                "tracking: reference", expected="a training frame, or None", received=f"frame {config.reference}"
+            )
+        first = frames[0] if config.reference is None else config.reference
+        self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
+        self.row = {frame: row for row, frame in enumerate(frames)}
+        shared = ViewConfig(
+            iterations=len(frames) * config.steps,
+            views=config.views,
+            weights=config.weights,
+            seed=config.seed,
+            betas=(0.8, 0.95),
+            evaluations=1,
+        )
+        super().__init__(
+            sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], **options
+        )
+        self.avatar, self.track_config = avatar, config
+        self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
+
+    def items(self, iteration: int) -> Sequence[Item]:
+        """One frame, until its steps are done."""
+        self.iteration = iteration
+        place, step = divmod(iteration, self.track_config.steps)
+        now = self._item(place, step)
+        if iteration + 1 < self.config.iterations:
+            self.sequence.expect([self._item(*divmod(iteration + 1, self.track_config.steps))])
+        return [now]
+
+    def _item(self, place: int, step: int) -> Item:
+        frame = self.order[place]
+        return Item(frame, self.sequence.cameras(frame, step, self.track_config.views, self.track_config.seed))
+
+    def share(self, iteration: int, group: ParameterGroup) -> float:
+        """The rate itself: the level's, falling exponentially."""
+        level, step = self._level(iteration)
+        return level.rate * LEVEL_END ** (step / level.steps)
+
+    def _level(self, iteration: int) -> tuple[Level, int]:
+        """The level of a step, and the step's number within it."""
+        step = iteration % self.track_config.steps
+        for level in self.track_config.levels:
+            if step < level.steps:
+                return level, step
+            step -= level.steps
+        raise AssertionError("steps are those of the levels")
+
+    def views(self, item: Item) -> list[View]:
+        """At the level's size."""
+        views = super().views(item)
+        for _ in range(self._level(self.iteration)[0].halvings):
+            views = [view.halved() for view in views]
+        return views
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """`L_rec`, the roughness of the displacements, and how far the body moves."""
+        views = self.views(item)
+        posed = self.avatar(self.sequence.motion(item.frame), eyes_of(views))
+        total, terms, _ = self.compared(posed, views)
+        cage, controls = self.avatar.cage, self.avatar.controls
+        total = total + self.track_config.smoothness * cage.roughness(controls)
+        if self.track_config.still and not cage.off_clothes.all():
+            total = total + self.track_config.still * cage.motion_off_clothes(controls)
+        return total, {"loss": float(total.detach()), **terms}
+
+    def step(self, iteration: int) -> Mapping[str, Any]:
+        """A step of the frame's; the first one leaves the frame before."""
+        place, step = divmod(iteration, self.track_config.steps)
+        if step == 0:
+            with torch.no_grad():
+                self.avatar.controls.copy_(self._start(place))
+            self.optimiser.state.clear()
+        metrics = super().step(iteration)
+        with torch.no_grad():
+            self.solved[self.row[self.order[place]]] = self.avatar.controls
+        return metrics
+
+    def _start(self, place: int) -> Tensor:
+        """Displacements that a frame begins with: the nearest done frame's, carried on."""
+        frame, done = self.order[place], self.order[:place]
+        if not done:
+            return torch.zeros_like(self.avatar.controls)
+        near = min(done, key=lambda other: abs(other - frame))
+        start = self.solved[self.row[near]]
+        behind = [other for other in done if (other - near) * (near - frame) > 0]
+        if behind:
+            far = min(behind, key=lambda other: abs(other - near))
+            carried = self.track_config.extrapolation * (frame - near) / (near - far)
+            start = start + carried * (start - self.solved[self.row[far]])
+        return start
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Nothing: the control points are those of one frame."""
+        return {"mean": {}}
+
+    def state(self) -> Mapping[str, Tensor]:
+        """The frames that are done too."""
+        return {**super().state(), "solved": self.solved}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `state` gave."""
+        super().restore(tensors)
+        self.solved.copy_(tensors["solved"])
+
+    def track(self) -> Track:
+        """What was found, less what was found in the reference frame.
+
+        There the template is the surface: what images ask of it is an error of the Gaussians, in all frames alike.
+        """
+        solved = self.solved.clone()
+        if self.track_config.reference is not None:
+            solved -= self.solved[self.row[self.track_config.reference]]
+        return Track(self.row, solved, self.avatar.cage)

@@ -1,0 +1,1 @@
+"""Variants of the system trained on one capture and measured by one protocol."""

@@ -1,7 +1,0 @@
-"""Whether a capture can be trained on: files, masks, parameters, and the calibration against the silhouettes."""
-
-from pipelines.capture_check.check import CaptureCheck, CheckConfig, check_capture
-from pipelines.capture_check.findings import Finding
-from pipelines.capture_check.report import write_check_report
-
-__all__ = ["CaptureCheck", "CheckConfig", "Finding", "check_capture", "write_check_report"]

@@ -1,0 +1,1 @@
+"""Captures checked and converted."""

@@ -1,0 +1,162 @@
+"""The calibration against the silhouettes: which cameras and frames do not fit, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipelines.captures.check.diagnosis import Diagnosis, diagnose
+from pipelines.captures.check.findings import Finding
+from pipelines.captures.check.mistakes import Mistake, Sample
+from pipelines.captures.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, summary
+from pipelines.captures.check.views import ViewCheck
+from smplxpp.core.camera import Camera
+
+# A frame does not fit by itself if it is bad in this share of its cameras. Single frames and cameras are to blame if
+# they are this much worse than the median.
+_MOST, _WORSE = 0.6, 2.5
+_SAMPLE_CAMERAS, _SAMPLE_FRAMES = 4, 3
+
+Sampler = Callable[[str, int], Sample | None]
+
+
+def by_camera(views: Iterable[ViewCheck]) -> dict[str, FitSummary]:
+    """Figures of each camera that sees the body."""
+    return _summaries(views, lambda view: view.camera)
+
+
+def by_frame(views: Iterable[ViewCheck]) -> dict[int, FitSummary]:
+    """Figures of each frame in which the body is seen."""
+    return _summaries(views, lambda view: view.frame)
+
+
+def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], sampler: Sampler) -> Iterator[Finding]:
+    """Single frames that do not fit, single cameras that do not, or all: with the mistake that would explain it.
+
+    Args:
+        views: all that were looked at.
+        rig: cameras by name, of the masks' sizes.
+        sampler: gives the view of a camera and a frame to try corrections on.
+    """
+    frames = by_frame(views)
+    lost = {frame for frame in _outliers(frames) if frames[frame].views > 1}
+    lost = {frame for frame in lost if frames[frame].bad >= _MOST * frames[frame].views}
+    rest = [view for view in views if view.frame not in lost]
+    cameras = by_camera(rest)
+    for frame in sorted(lost):
+        s = frames[frame]
+        words = f"frame {frame}: the body does not fit the masks in {s.bad} of {s.views} cameras ({_figures(s)})"
+        yield Finding("calibration-frame", words, None, frame)
+    bad = [name for name, s in cameras.items() if s.verdict == "bad"]
+    if bad and 2 * len(bad) >= len(cameras):
+        yield _everywhere(rest, bad, cameras, sampler)
+        return
+    to_blame = _outliers(cameras)
+    for name in to_blame:
+        yield _one_camera(name, rest, cameras[name], sampler, rig)
+    doubtful = [name for name, s in cameras.items() if s.verdict != "good" and name not in to_blame]
+    if doubtful:
+        yield _loose(doubtful, rest, cameras, sampler)
+
+
+def _outliers(fits: Mapping[Any, FitSummary]) -> list[Any]:
+    """Bad ones that are much worse than most: with rough parameters all are, and none is to blame."""
+    if not fits:
+        return []
+    usual = float(np.median([fit.outside for fit in fits.values()]))
+    return [
+        key
+        for key, fit in fits.items()
+        if fit.verdict == "bad" and usual < OUTSIDE_BAD and (fit.outside > _WORSE * usual or fit.iou < IOU_BAD)
+    ]
+
+
+def blind_cameras(views: Iterable[ViewCheck]) -> Iterator[Finding]:
+    """Cameras whose every mask is empty, and into which the body does not project either."""
+    blind: dict[str, bool] = {}
+    for view in views:
+        nobody = view.mask_share is not None and view.mask_share < MIN_SHARE and not view.fit and not view.findings
+        blind[view.camera] = blind.get(view.camera, True) and nobody
+    for name in (name for name, nobody in blind.items() if nobody):
+        yield Finding("camera-sees-nobody", f"camera {name}: its masks are empty, it never sees the person", name)
+
+
+def _everywhere(
+    views: Sequence[ViewCheck], bad: Sequence[str], cameras: Mapping[str, FitSummary], sampler: Sampler
+) -> Finding:
+    chosen = spread(bad, _SAMPLE_CAMERAS)
+    result = diagnose(_samples(views, chosen, sampler))
+    which = "any camera" if len(bad) == len(cameras) else f"{len(bad)} of {len(cameras)} cameras"
+    words = f"the body does not fit the masks of {which} ({_figures(summary(v.fit for v in views if v.fit))})"
+    words, advice = _explained(words, result)
+    return Finding("calibration", words, advice=advice)
+
+
+def _one_camera(
+    name: str,
+    views: Sequence[ViewCheck],
+    fit: FitSummary,
+    sampler: Sampler,
+    rig: Mapping[str, Camera],
+) -> Finding:
+    swaps = [
+        Mistake(
+            f"its images are those of camera {other.name}",
+            f"exchange the folders, or the calibrations, of {name} and {other.name}",
+            camera=lambda _, other=other: other,
+        )
+        for other in rig.values()
+        if other.name != name and (other.width, other.height) == (rig[name].width, rig[name].height)
+    ]
+    words = f"camera {name}: the body does not fit its masks ({_figures(fit)})"
+    words, advice = _explained(words, diagnose(_samples(views, [name], sampler), swaps))
+    return Finding("calibration-camera", words, name, advice=advice)
+
+
+def _loose(
+    doubtful: Sequence[str], views: Sequence[ViewCheck], cameras: Mapping[str, FitSummary], sampler: Sampler
+) -> Finding:
+    median = float(np.median([cameras[name].outside for name in doubtful]))
+    which = "every camera" if len(doubtful) == len(cameras) else ", ".join(doubtful)
+    words = f"the body sticks out of the masks of {which}, by {median:.1%} of its area at the median"
+    words, advice = _explained(words, diagnose(_samples(views, spread(doubtful, _SAMPLE_CAMERAS), sampler)))
+    return Finding("calibration-loose", words, advice=advice)
+
+
+def _explained(words: str, result: Diagnosis | None) -> tuple[str, str]:
+    """Words and advice; the diagnosis goes first where there is one."""
+    if result is None:
+        return words, ""
+    after = f"{result.after.outside:.0%} outside, overlap {result.after.iou:.2f}"
+    return f"{words}. It would fit if {result.mistake.words} ({after})", result.mistake.advice
+
+
+def _samples(views: Sequence[ViewCheck], cameras: Sequence[str], sampler: Sampler) -> list[Sample]:
+    """A few views of each camera to try corrections on."""
+    found = []
+    for name in cameras:
+        frames = [view.frame for view in views if view.camera == name and view.fit is not None]
+        found += [sampler(name, frame) for frame in spread(frames, _SAMPLE_FRAMES)]
+    return [sample for sample in found if sample is not None]
+
+
+def spread(items: Sequence, count: int) -> list:
+    """At most `count` of the items, evenly spread, the first and the last among them."""
+    if not len(items):
+        return []
+    chosen = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return [items[k] for k in chosen]
+
+
+def _figures(s: FitSummary) -> str:
+    return f"{s.outside:.0%} of it outside of them, overlap {s.iou:.2f}"
+
+
+def _summaries(views: Iterable[ViewCheck], key: Callable[[ViewCheck], str | int]) -> dict:
+    groups: dict[str | int, list] = {}
+    for view in views:
+        if view.fit is not None:
+            groups.setdefault(key(view), []).append(view.fit)
+    return {name: summary(fits) for name, fits in groups.items()}

@@ -1,0 +1,212 @@
+"""check_capture: everything about a capture that would spoil a training run, found before it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.captures.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings, spread
+from pipelines.captures.check.files import missing_findings, split_findings
+from pipelines.captures.check.findings import Finding
+from pipelines.captures.check.mistakes import Sample
+from pipelines.captures.check.parameters import parameter_findings, read_parameters
+from pipelines.captures.check.silhouettes import FitSummary
+from pipelines.captures.check.views import OPAQUE, ViewCheck, check_view
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+
+Progress = Callable[[int, int], None]
+# Frames before and after that are tried where images and parameters may not be of one clock.
+_SHIFTS = (-3, -2, -1, 1, 2, 3)
+# Posed bodies held in memory.
+_KEPT = 32
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """How much is looked at.
+
+    Attributes:
+        frames: frames whose images are opened; None: as many, evenly spread, as make `max_views` views. Missing
+            files and parameters are told of all frames in any case.
+        max_views: see `frames`.
+        size: pixels of the longer side at which masks and silhouettes are compared.
+    """
+
+    frames: tuple[int, ...] | None = None
+    max_views: int = 2000
+    size: int = 640
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureCheck:
+    """What was found.
+
+    Attributes:
+        capture: as opened.
+        small: the same at the size of the comparison.
+        findings: what is wrong; empty for a sound capture.
+        views: all views that were opened.
+        vertices: gives those of the posed body in a frame, (V, 3), or None.
+        faces: (F, 3) of the body.
+    """
+
+    capture: Capture
+    small: Capture
+    findings: tuple[Finding, ...]
+    views: tuple[ViewCheck, ...]
+    vertices: Callable[[int], np.ndarray | None]
+    faces: np.ndarray
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything has to be done before training."""
+        return any(finding.status == "fail" for finding in self.findings)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Frames whose images were opened."""
+        return tuple(dict.fromkeys(view.frame for view in self.views))
+
+    def cameras(self) -> dict[str, FitSummary]:
+        """Body against masks, by camera."""
+        return by_camera(self.views)
+
+    def frame_fits(self) -> dict[int, FitSummary]:
+        """Body against masks, by frame."""
+        return by_frame(self.views)
+
+
+def check_capture(
+    capture: Capture,
+    body: BodyModel,
+    config: CheckConfig | None = None,
+    *,
+    progress: Progress = lambda done, count: None,
+) -> CaptureCheck:
+    """Look at files, splits, masks, parameters, and at the posed body's silhouette against the masks.
+
+    Args:
+        capture: as opened.
+        body: the model that the parameters are for.
+        config: how much to look at.
+        progress: called with the number of views that were opened and of all that will be.
+
+    Raises:
+        InputError: frames that the capture does not have.
+    """
+    config = config or CheckConfig()
+    frames = _chosen_frames(capture, config)
+    findings = [*missing_findings(capture), *split_findings(capture)]
+    params = read_parameters(capture)
+    findings += parameter_findings(capture, params, body)
+    poser = _Poser(body, params)
+    small = capture.resized(_scale(capture, config.size))
+    views: list[ViewCheck] = []
+    wanted = small.views(frames=frames)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for frame, group in groupby(wanted, key=lambda view: view[1]):
+            vertices = poser.vertices(frame)
+            posed = None if vertices is None else (vertices, body.faces)
+            cameras = [camera for camera, _ in group]
+            views += pool.map(lambda camera, f=frame, b=posed: check_view(small, camera, f, b), cameras)
+            progress(len(views), len(wanted))
+    findings += [finding for view in views for finding in view.findings]
+    findings += [*poser.findings, *_plain_background(views), *blind_cameras(views)]
+    findings += calibration_findings(views, small.cameras, lambda camera, frame: _sample(small, poser, camera, frame))
+    shown = tuple(_relative(finding, capture.root) for finding in dict.fromkeys(findings))
+    return CaptureCheck(capture, small, shown, tuple(views), poser.vertices, body.faces)
+
+
+class _Poser:
+    """The posed body by frame; what cannot be posed becomes a finding."""
+
+    def __init__(self, body: BodyModel, params: dict[int, BodyParams]) -> None:
+        self.body, self.params = body, params
+        self.findings: list[Finding] = []
+        self._posed: OrderedDict[int, np.ndarray | None] = OrderedDict()
+
+    def vertices(self, frame: int) -> np.ndarray | None:
+        """(V, 3), None without usable parameters. The last few are kept."""
+        if frame not in self._posed:
+            self._posed[frame] = self._pose(frame)
+            if len(self._posed) > _KEPT:
+                self._posed.popitem(last=False)
+        return self._posed[frame]
+
+    def _pose(self, frame: int) -> np.ndarray | None:
+        if frame not in self.params:
+            return None
+        try:
+            return self.body.forward(self.params[frame]).vertices[0]
+        except InputError as error:
+            self.findings.append(Finding("params-body", f"frame {frame}: {error}", None, frame))
+            return None
+
+
+def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | None:
+    vertices = poser.vertices(frame)
+    if vertices is None:
+        return None
+    p = poser.params[frame]
+    root = poser.body.rest_joints(p)[0, 0]
+    neighbours = {k: poser.vertices(frame + k) for k in _SHIFTS}
+    return Sample(
+        camera=small.cameras[camera],
+        mask=small.mask(camera, frame) > OPAQUE,
+        vertices=vertices,
+        faces=poser.body.faces,
+        transl=p.transl[0],
+        pivot_shift=matrix_from_rotvec(p.global_orient[0]) @ root - root,
+        neighbours={k: v for k, v in neighbours.items() if v is not None},
+    )
+
+
+def _chosen_frames(capture: Capture, config: CheckConfig) -> list[int]:
+    if config.frames is None:
+        return spread(capture.frames, max(2, config.max_views // max(1, len(capture.cameras))))
+    unknown = sorted(set(config.frames) - set(capture.frames))
+    if unknown:
+        raise InputError(
+            "--frames",
+            expected=f"frames from {min(capture.frames, default=0)} to {max(capture.frames, default=0)} that exist",
+            received=f"{unknown[:5]}",
+        )
+    return sorted(set(config.frames))
+
+
+def _scale(capture: Capture, size: int) -> float:
+    """Of a whole number to one where there is anything to reduce: reduced images are then means over areas."""
+    longest = max((max(camera.width, camera.height) for camera in capture.cameras.values()), default=1)
+    return 1.0 / max(1, math.ceil(longest / size))
+
+
+def _plain_background(views: Sequence[ViewCheck]) -> list[Finding]:
+    """Photographs that all lie on one plain colour were composited, whatever the capture declares."""
+    colours = [view.plain for view in views if view.plain is not None]
+    if len(colours) < 0.9 * len(views) or not colours:
+        return []
+    common = np.median(colours, axis=0)
+    if np.abs(np.array(colours) - common).max() > 16:
+        return []
+    words = f"images are declared as photographs, but all lie on plain RGB {common.astype(int).tolist()}"
+    shares = (common / 255.0).round(3).tolist()
+    return [Finding("background-plain", words, advice=f'declare it in capture.json: `"background": {shares}`')]
+
+
+def _relative(finding: Finding, root: Path) -> Finding:
+    """With file names from the capture's folder on."""
+    return Finding(
+        finding.kind, finding.message.replace(f"{root}{os.sep}", ""), finding.camera, finding.frame, finding.advice
+    )

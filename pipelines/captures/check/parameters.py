@@ -1,0 +1,112 @@
+"""Body parameters that no person has, or that are in other units than the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pipelines.captures.check.findings import Finding
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import POSE_BLOCKS, BodyParams
+
+BETA_LIMIT = 5.0
+_BETAS_VARY = 0.01
+# Coefficients of learned expressions, and weights of named blend shapes, whose own range is 0 to 1.
+_EXPRESSION_LIMITS = (-8.0, 8.0)
+_BLEND_SHAPE_LIMITS = (-1.0, 2.0)
+# More than a full turn: nobody's rotation vector; 7 degrees of a joint, though, are common.
+_ANGLE_LIMIT = 7.0
+_SPEED_LIMIT = 12.0
+_STEP_LIMIT = 0.5
+# Beyond this many times the rig's radius, and some, the person is outside of any room.
+_FAR, _FAR_METRES = 4.0, 10.0
+_UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (100.0, "hectometres"))
+
+
+def read_parameters(capture: Capture) -> dict[int, BodyParams]:
+    """The parameters of every frame whose parameters can be read."""
+    found = {}
+    for frame in capture.frames:
+        try:
+            params = capture.params(frame)
+        except InputError:  # already among the missing ones
+            continue
+        if params is not None:
+            found[frame] = params
+    return found
+
+
+def parameter_findings(capture: Capture, params: dict[int, BodyParams], body: BodyModel) -> list[Finding]:
+    """Shapes, expressions and angles out of range, other units, jumps."""
+    found: list[Finding] = []
+    for frame, p in params.items():
+        found += _out_of_range(frame, p, body)
+    found += _varying_betas(params)
+    if params:
+        units = list(_wrong_units(capture, params))
+        found += units or _jumps(capture, params)
+    return found
+
+
+def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Finding]:
+    largest = float(np.abs(p.betas).max(initial=0.0))
+    if largest > BETA_LIMIT:
+        yield Finding("params-betas", f"frame {frame}: betas reach {largest:.3g}", None, frame)
+    named = not body.expression_names[:1] == ("expression_00",)
+    low, high = _BLEND_SHAPE_LIMITS if named else _EXPRESSION_LIMITS
+    least, most = float(p.expression.min(initial=0.0)), float(p.expression.max(initial=0.0))
+    if least < low or most > high:
+        message = f"frame {frame}: expression from {least:.3g} to {most:.3g}, within {low:g} to {high:g} is possible"
+        yield Finding("params-expression", message, None, frame)
+    # Hands of fewer than 45 numbers are coefficients, no angles.
+    blocks = {name: getattr(p, name) for name, joints in POSE_BLOCKS if getattr(p, name).shape[1] == 3 * joints}
+    name, angle = max(((n, float(np.abs(v).max(initial=0.0))) for n, v in blocks.items()), key=lambda item: item[1])
+    if angle > _ANGLE_LIMIT:
+        unit = ", as degrees would" if angle > 30 else ""
+        yield Finding("params-angles", f"frame {frame}: {name} reaches {angle:.3g} radians{unit}", None, frame)
+
+
+def _varying_betas(params: dict[int, BodyParams]) -> Iterator[Finding]:
+    if len({p.betas.shape for p in params.values()}) == 1 and len(params) > 1:
+        betas = np.concatenate([p.betas for p in params.values()])
+        spread = float(np.ptp(betas, axis=0).max(initial=0.0))
+        if spread > _BETAS_VARY:
+            yield Finding("params-betas-vary", f"betas differ by up to {spread:.3g} between frames")
+
+
+def _wrong_units(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Finding]:
+    positions = np.array([camera.position for camera in capture.cameras.values()])
+    if not len(positions):
+        return
+    center = np.median(positions, axis=0)
+    radius = float(np.median(np.linalg.norm(positions - center, axis=1)))
+    transl = np.concatenate([p.transl for p in params.values()])
+    limit = _FAR * radius + _FAR_METRES
+
+    def distance(scale: float) -> float:
+        return float(np.median(np.linalg.norm(transl * scale - center, axis=1)))
+
+    if distance(1.0) > limit:
+        fitting = next((name for scale, name in _UNITS if distance(scale) < 2 * radius + 1.0), None)
+        hint = f"; in {fitting} it would be among the cameras" if fitting else ""
+        yield Finding(
+            "params-units",
+            f"transl puts the person {distance(1.0):.4g} m from the cameras' middle, {radius:.3g} m around which they "
+            f"stand{hint}",
+        )
+    elif radius > 100.0:
+        yield Finding("params-units", f"the cameras stand {radius:.4g} m around their middle: are they in millimetres?")
+
+
+def _jumps(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Finding]:
+    frames = np.array(sorted(params))
+    transl = np.concatenate([params[int(frame)].transl for frame in frames])
+    steps = np.linalg.norm(np.diff(transl, axis=0), axis=1)
+    limit = _SPEED_LIMIT / capture.fps if capture.fps else _STEP_LIMIT
+    for k in np.flatnonzero((np.diff(frames) == 1) & (steps > limit)):
+        message = f"frame {frames[k + 1]}: transl jumps by {steps[k]:.3g} m from frame {frames[k]}"
+        speed = f", {steps[k] * capture.fps:.3g} m/s" if capture.fps else ""
+        yield Finding("params-jump", message + speed, None, int(frames[k + 1]))

@@ -1,0 +1,253 @@
+"""convert_capture: any capture that can be opened, written down in our layout or in ActorsHQ's.
+
+Images come out as pinholes' images. What needs no change is copied byte for byte; what is copied or written appears
+whole or not at all, and a conversion that was interrupted goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pipelines.captures.convert_views import ViewWriter
+from smplxpp.capture import Capture
+from smplxpp.capture.meshes import PosedTopology
+from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv
+from smplxpp.core.atomic import atomic_path, atomic_write_bytes, atomic_write_text
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+
+Progress = Callable[[int, int], None]
+_RECORD = "conversion.json"
+
+
+@dataclass(frozen=True)
+class ConvertConfig:
+    """What to write.
+
+    Attributes:
+        layout: "simple" is ours; "actorshq" holds images on black, masks, cameras and parameters.
+        scale: resolution of the images as a factor.
+        frames, cameras: what is kept; None: all.
+        quality: of JPEG images that cannot be copied.
+
+    Raises:
+        InputError: an unknown layout, a scale that is not above 0, a quality out of range.
+    """
+
+    layout: Literal["simple", "actorshq"] = "simple"
+    scale: float = 1.0
+    frames: tuple[int, ...] | None = None
+    cameras: tuple[str, ...] | None = None
+    quality: int = 95
+
+    def __post_init__(self) -> None:
+        if self.layout not in ("simple", "actorshq"):
+            raise InputError("--layout", expected="simple or actorshq", received=repr(self.layout))
+        if not 0 < self.scale <= 4:
+            raise InputError("--scale", expected="a factor above 0, at most 4", received=str(self.scale))
+        if not 1 <= self.quality <= 100:
+            raise InputError("--quality", expected="1 to 100", received=str(self.quality))
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What was done.
+
+    Attributes:
+        out: folder of the new capture.
+        views: that are in it.
+        copied, encoded, kept: files copied as they were, written anew, and there already from an earlier call.
+        left_out: what could not be converted, in words.
+    """
+
+    out: Path
+    views: int
+    copied: int
+    encoded: int
+    kept: int
+    left_out: tuple[str, ...]
+
+
+def convert_capture(
+    capture: Capture, out: Path, config: ConvertConfig | None = None, *, progress: Progress = lambda done, count: None
+) -> Conversion:
+    """Write a capture anew.
+
+    Rays and pixels are those that the capture gives out: undistorted, resized. Views whose files are damaged are left
+    out and named. Cameras and description are written last, so that an unfinished folder opens as no capture.
+
+    Args:
+        capture: at full size.
+        out: a new or an empty folder, or that of the same conversion, interrupted.
+        config: what to write.
+        progress: called with the number of views done and of all.
+
+    Raises:
+        InputError: cameras or frames that the capture does not have, or a folder with something else in it.
+    """
+    config = config or ConvertConfig()
+    cameras, frames = _chosen(capture, config)
+    out = Path(out).absolute()
+    _claim(capture, out, config)
+    source = capture if config.scale == 1.0 else capture.resized(config.scale)
+    root = out if config.layout == "simple" else out / "1x"
+    writer = ViewWriter(source, root, config.layout, config.quality)
+    views = source.views(cameras, frames)
+    outcomes = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for outcome in pool.map(writer.write, *zip(*views, strict=True)) if views else ():
+            outcomes.append(outcome)
+            progress(len(outcomes), len(views))
+    left_out = [outcome.problem for outcome in outcomes if outcome.problem]
+    left_out += _write_params(capture, out, frames, config)
+    if config.layout == "simple":
+        _write_geometry(capture, out, frames)
+        _write_ours(source, out, cameras, frames)
+    else:
+        write_calibration_csv(root / "calibration.csv", [RigCamera(source.cameras[c], "body", False) for c in cameras])
+    copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))
+    done = sum(not outcome.problem for outcome in outcomes)
+    return Conversion(out, done, copied, encoded, kept, tuple(left_out))
+
+
+def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[int]]:
+    for name, wanted, have in (
+        ("--cameras", config.cameras, tuple(capture.cameras)),
+        ("--frames", config.frames, capture.frames),
+    ):
+        unknown = [item for item in wanted or () if item not in have]
+        if unknown or wanted == () or not have:
+            raise InputError(
+                name,
+                expected=f"some of {', '.join(map(str, have[:12]))}{' ...' if len(have) > 12 else ''}",
+                received=", ".join(map(str, unknown[:5])) or "none",
+            )
+    cameras = [name for name in capture.cameras if config.cameras is None or name in config.cameras]
+    frames = [frame for frame in capture.frames if config.frames is None or frame in set(config.frames)]
+    return cameras, frames
+
+
+def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
+    """Make sure that the folder is for this conversion, and say so in it."""
+    root = capture.root.resolve()
+    if out.resolve() == root or root in out.resolve().parents or out.resolve() in root.parents:
+        raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
+    record = json.loads(json.dumps({"source": str(root), "format": capture.format, **asdict(config)}))
+    path = out / _RECORD
+    if path.is_file():
+        stands = json.loads(path.read_text())
+        if stands != record:
+            differ = sorted(key for key in record if record[key] != stands.get(key))
+            raise InputError(
+                "--out",
+                expected="a new folder, or the one of this very conversion",
+                received=f"{out}, where a conversion with other {', '.join(differ)} stands",
+                remedy="name another folder",
+            )
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("--out", expected="a new or an empty folder", received=str(out), remedy="name another folder")
+    atomic_write_text(path, json.dumps(record, indent=1) + "\n")
+
+
+def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: ConvertConfig) -> list[str]:
+    """Parameters of the frames, and words about those that cannot be read."""
+    params: dict[int, BodyParams] = {}
+    left_out = []
+    for frame in frames:
+        try:
+            found = capture.params(frame)
+        except InputError as error:
+            left_out.append(str(error))
+            continue
+        if found is not None:
+            params[frame] = found
+    if not params:
+        return left_out
+    if config.layout == "actorshq":
+        _write_rows(out / "smpl_params.npz", params)
+    elif list(params) == list(range(len(params))):
+        BodyParams.concatenate(list(params.values())).save(out / "params" / "params.npz")
+    else:  # a row for each number would leave gaps
+        for frame, p in params.items():
+            p.save(out / "params" / f"{frame:06d}.npz")
+    return left_out
+
+
+def _write_rows(path: Path, params: dict[int, BodyParams]) -> None:
+    """Row n is frame n; NaN where a frame has none, which spoils that frame alone."""
+    joined = BodyParams.concatenate(list(params.values()))
+    rows = np.array(list(params))
+    arrays: dict[str, Any] = {"flat_hand_mean": np.bool_(joined.flat_hand_mean)}
+    for name in ARRAY_NAMES:
+        values = getattr(joined, name)
+        arrays[name] = np.full((rows.max() + 1, values.shape[1]), np.nan)
+        arrays[name][rows] = values
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
+    """True surfaces, and the scans that a template is built from."""
+    meshes = capture.recording.meshes
+    if isinstance(meshes, PosedTopology):
+        atomic_write_bytes(out / "geometry" / "topology.npz", meshes.topology.read_bytes())
+        for frame in frames:
+            path = meshes.files.path(frame)
+            if path is not None:
+                atomic_write_bytes(out / "geometry" / f"frame_{frame:06d}.npz", path.read_bytes())
+    elif meshes is not None:
+        for frame in frames:
+            mesh = meshes.read(frame)
+            if mesh is not None:
+                with atomic_path(out / "scans" / f"scan_{frame:06d}.ply") as temporary:
+                    write_ply(temporary, mesh)
+    if capture.format == "simple":
+        for frame in frames:
+            for path in sorted((capture.root / "scans").glob(f"scan_{frame:06d}*")):
+                atomic_write_bytes(out / "scans" / path.name, path.read_bytes())
+
+
+def _write_ours(capture: Capture, out: Path, cameras: Sequence[str], frames: Sequence[int]) -> None:
+    """cameras.json and capture.json."""
+    entries = [
+        {
+            "name": name,
+            "w": camera.width,
+            "h": camera.height,
+            "K": camera.K.tolist(),
+            "R": camera.cam_from_world[:3, :3].tolist(),
+            "T": camera.cam_from_world[:3, 3].tolist(),
+        }
+        for name, camera in capture.cameras.items()
+        if name in cameras
+    ]
+    splits, recording = capture.splits.restricted(cameras, frames), capture.recording
+    description: dict[str, Any] = {"name": capture.name}
+    if capture.fps is not None:
+        description["fps"] = capture.fps
+    description |= {
+        "background": None if recording.background is None else list(recording.background),
+        "label_set": capture.label_set,
+        "train_views": list(splits.train_cameras),
+        "novel_views": list(splits.novel_view_cameras),
+        "train_frames": _ranges(splits.train_frames, frames),
+        "novel_pose_frames": _ranges(splits.novel_pose_frames, frames),
+    }
+    atomic_write_text(out / "cameras.json", json.dumps({"cameras": entries}, indent=1) + "\n")
+    atomic_write_text(out / "capture.json", json.dumps(description, indent=1) + "\n")
+
+
+def _ranges(chosen: Sequence[int], frames: Sequence[int]) -> list[list[int]]:
+    """[first, last] of every run of `frames` that is chosen."""
+    marks = np.concatenate([[0], np.isin(frames, chosen).astype(np.int8), [0]])
+    starts, ends = np.flatnonzero(np.diff(marks) == 1), np.flatnonzero(np.diff(marks) == -1) - 1
+    return [[int(frames[first]), int(frames[last])] for first, last in zip(starts, ends, strict=True)]

@@ -1,0 +1,88 @@
+"""Progress of a run of stages in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+if TYPE_CHECKING:
+    from avatar.training.engine.loop import Progress as TrainingProgress
+
+
+@contextmanager
+def stage_progress(count: int, *, enabled: bool = True) -> Iterator[Callable[[str, bool], None]]:
+    """A bar over `count` stages; yields `step(name, done)` to call before (False) and after (True) each."""
+    columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not enabled) as progress:
+        task = progress.add_task("start", total=count)
+
+        def step(name: str, done: bool) -> None:
+            progress.update(task, description=name, advance=1 if done else 0)
+
+        yield step
+
+
+@contextmanager
+def counted_progress(what: str, *, enabled: bool = True) -> Iterator[Callable[[int, int], None]]:
+    """A bar over things that are counted; yields `show(done, count)`."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
+        task = progress.add_task(what, total=None)
+
+        def show(done: int, count: int) -> None:
+            progress.update(task, completed=done, total=count)
+
+        yield show
+
+
+@contextmanager
+def training_progress(
+    name: str, total: int, *, held_out: bool = True, enabled: bool = True
+) -> Iterator[Callable[[TrainingProgress], None]]:
+    """A bar with loss, PSNR, speed and the time that is left; yields what a training reports to.
+
+    Args:
+        held_out: whether views are measured that training does not see, where an evaluation does not say so itself.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=10),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    quality: dict[str, Any] = {}
+    bar = Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0)
+    task = bar.add_task(name, total=total, figures="")
+
+    def show(state: TrainingProgress) -> None:
+        bar.start()  # not before: a training that stands reports nothing
+        if state.evaluation is not None:
+            quality.update(state.evaluation["mean"], held_out=state.evaluation.get("held_out", held_out))
+        figures = []
+        if "loss" in state.metrics:
+            figures.append(f"loss {state.metrics['loss']:.4f}")
+        if state.rate:
+            figures.append(f"{state.rate:.1f} it/s")
+        if "psnr" in quality:  # a training taken up again has none before its next evaluation
+            figures.append(f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}")
+        bar.update(task, completed=state.iteration, total=state.iterations, figures="  ".join(figures))
+
+    try:
+        yield show
+    finally:
+        bar.stop()

@@ -1,0 +1,42 @@
+"""Pictures of meshes without a screen: shaded surfaces, heat maps, overlays and contact sheets.
+
+>>> camera = body_cameras(mesh, views=("front",))[0]
+>>> Path("scan.png").write_bytes(encode_png(render_shaded(mesh, camera, vertex_colors=colors)))
+"""
+
+from pipelines.figures.colors import (
+    blend_joint_colors,
+    category_colors,
+    colormap,
+    dominant_joints,
+    heat_colors,
+    joint_palette,
+)
+from pipelines.figures.overlay import render_overlay
+from pipelines.figures.render import render_heat, render_shaded
+from pipelines.figures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
+from pipelines.figures.style import ShadeStyle
+from pipelines.figures.viewpoints import VIEWS, body_cameras, fit_cameras, turntable_cameras
+
+__all__ = [
+    "VIEWS",
+    "ShadeStyle",
+    "blend_joint_colors",
+    "body_cameras",
+    "caption",
+    "category_colors",
+    "color_bar",
+    "colormap",
+    "contact_sheet",
+    "dominant_joints",
+    "encode_jpeg",
+    "encode_png",
+    "fit_cameras",
+    "heat_colors",
+    "joint_palette",
+    "render_heat",
+    "render_overlay",
+    "render_shaded",
+    "row",
+    "turntable_cameras",
+]

@@ -1,0 +1,68 @@
+"""Whole pictures of one mesh: shaded, or coloured by a value."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.figures.colors import heat_colors
+from pipelines.figures.shading import resolve, shade_layer
+from pipelines.figures.sheets import color_bar
+from pipelines.figures.style import ShadeStyle
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+
+def render_shaded(
+    mesh: TriangleMesh,
+    camera: Camera,
+    *,
+    vertex_colors: np.ndarray | None = None,
+    face_colors: np.ndarray | None = None,
+    style: ShadeStyle | None = None,
+) -> np.ndarray:
+    """A lit picture of `mesh`: (H, W, 3) uint8.
+
+    Args:
+        vertex_colors: (N, 3) uint8 sRGB, interpolated in linear light. face_colors: (M, 3) uint8, one a face.
+        style: see `ShadeStyle`.
+    """
+    style = style or ShadeStyle()
+    layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, style=style)
+    return resolve(layer.color, layer.mask, style=style)
+
+
+def render_heat(
+    mesh: TriangleMesh,
+    camera: Camera,
+    values: np.ndarray,
+    *,
+    cmap: str = "error",
+    limits: tuple[float, float],
+    unit: str = "",
+    bar: bool = True,
+    style: ShadeStyle | None = None,
+) -> np.ndarray:
+    """`mesh` coloured by `values`, (N,) a vertex or (M,) a face, with a colour bar on the right: (H, W', 3) uint8.
+
+    Values outside `limits` take the end colours, values that are not finite are grey. Vertex values are interpolated
+    after colouring, so a picture is exact at vertices only.
+    """
+    # Light and shadow are held back: the colour is the message.
+    style = style or ShadeStyle(relief=0.55)
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape not in ((mesh.vertex_count,), (mesh.face_count,)):
+        raise InputError(
+            "values of a heat map",
+            expected=f"shape ({mesh.vertex_count},) or ({mesh.face_count},)",
+            received=f"shape {values.shape}",
+        )
+    colors = heat_colors(values, cmap=cmap, limits=limits)
+    key = "vertex_colors" if len(values) == mesh.vertex_count else "face_colors"
+    picture = render_shaded(mesh, camera, style=replace(style), **{key: colors})
+    if not bar:
+        return picture
+    side = color_bar(cmap=cmap, limits=limits, unit=unit, height=len(picture), background=style.background)
+    return np.concatenate([picture, side], axis=1)

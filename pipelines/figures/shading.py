@@ -1,0 +1,215 @@
+"""Deferred shading of the z-buffer's mesh maps: key light, sky and ground, rim, ambient occlusion, mesh lines."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipelines.figures.colors import linear_from_srgb, srgb8_from_linear
+from pipelines.figures.occlusion import unoccluded
+from pipelines.figures.style import ShadeStyle
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh
+
+# In camera axes (x right, y down, z forward): from the surface to the light, above and left of the camera.
+_KEY_DIRECTION = np.array([-0.42076, -0.62112, -0.66119], dtype=np.float32)
+_HALF_DIRECTION = np.array([-0.23084, -0.34076, -0.91137], dtype=np.float32)  # between the key and the viewer
+_KEY, _SKY, _GROUND = 0.62, 0.46, 0.24
+_RIM, _GLOSS = 0.16, 0.05
+_BLOCK = 1 << 15  # pixels shaded at a time
+_BACK_SIDE = np.array([0.42, 0.46, 0.54], dtype=np.float32)  # inside of open surfaces: darker and cooler
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A shaded surface before it is put on a background, at the supersampled size.
+
+    Attributes:
+        color: (H, W, 3) float32 linear light, 0 where nothing is hit.
+        mask: (H, W) bool.
+        depth: (H, W) float32 metres, inf where nothing is hit.
+        facing: (H, W) float32, |cos| between normal and view, 1 where nothing is hit.
+    """
+
+    color: np.ndarray
+    mask: np.ndarray
+    depth: np.ndarray
+    facing: np.ndarray
+
+
+def shade_layer(
+    mesh: TriangleMesh,
+    camera: Camera,
+    *,
+    vertex_colors: np.ndarray | None = None,
+    face_colors: np.ndarray | None = None,
+    style: ShadeStyle,
+) -> Layer:
+    """Rasterise and shade `mesh`; colours are (N, 3) a vertex or (M, 3) a face, uint8."""
+    for name, colors, count in (
+        ("vertex colours", vertex_colors, mesh.vertex_count),
+        ("face colours", face_colors, mesh.face_count),
+    ):
+        if colors is not None and (np.shape(colors) != (count, 3) or np.asarray(colors).dtype != np.uint8):
+            raise InputError(
+                name,
+                expected=f"uint8 of shape ({count}, 3)",
+                received=f"{np.asarray(colors).dtype} of shape {np.shape(colors)}",
+            )
+    if vertex_colors is not None and face_colors is not None:
+        raise InputError("colours", expected="a vertex or a face", received="both")
+    s = style.supersampling
+    K = camera.K.copy()
+    K[:2] *= s
+    fine = replace(camera, K=K, width=camera.width * s, height=camera.height * s)
+    maps = rasterize_mesh(mesh, fine)
+    hit = np.flatnonzero(maps.face_id.ravel() >= 0)
+    base = linear_from_srgb(np.array(style.base_color, np.uint8))
+    surface = _Surface(
+        mesh=mesh,
+        camera=fine,
+        maps=maps,
+        back=_back_faces(mesh, camera),
+        normals=_camera_normals(mesh, camera, smooth=style.smooth),
+        vertex_albedo=None if vertex_colors is None else linear_from_srgb(np.asarray(vertex_colors)),
+        face_albedo=base[None] if face_colors is None else linear_from_srgb(np.asarray(face_colors)),
+        edge_heights=_edge_heights(mesh, fine) if style.wireframe else None,
+        style=style,
+    )
+    open_sky = unoccluded(maps, fine, surface.normals_at, style=style)
+    color = np.zeros((fine.height * fine.width, 3), np.float32)
+    facing = np.ones(fine.height * fine.width, np.float32)
+
+    def work(begin: int) -> None:
+        pixels = hit[begin : begin + _BLOCK]
+        color[pixels], facing[pixels] = surface.shade(pixels, open_sky)
+
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        list(pool.map(work, range(0, len(hit), _BLOCK)))
+    shape = (fine.height, fine.width)
+    return Layer(color.reshape(*shape, 3), maps.face_id >= 0, maps.depth, facing.reshape(shape))
+
+
+def resolve(color: np.ndarray, alpha: np.ndarray, *, style: ShadeStyle) -> np.ndarray:
+    """Premultiplied linear `color` (sH, sW, 3) with `alpha` (sH, sW), averaged in linear light: (H, W, 3) uint8."""
+    s = style.supersampling
+
+    def average(x: np.ndarray) -> np.ndarray:
+        return sum(x[i::s, j::s] for i in range(s) for j in range(s)) * np.float32(1.0 / s**2)
+
+    background = linear_from_srgb(np.array(style.background, np.uint8))
+    return srgb8_from_linear(average(color) + (1.0 - average(alpha.astype(np.float32)))[..., None] * background)
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What every pixel's shading reads; `shade` works on blocks that fit the processor's cache."""
+
+    mesh: TriangleMesh
+    camera: Camera
+    maps: MeshMaps
+    back: np.ndarray  # (M,) bool
+    normals: np.ndarray  # (N, 3) or (M, 3) float32 in camera axes
+    vertex_albedo: np.ndarray | None  # (N, 3) float32 linear
+    face_albedo: np.ndarray  # (M, 3), or (1, 3) for all
+    edge_heights: np.ndarray | None  # (M, 3) float32 pixels
+    style: ShadeStyle
+
+    def normals_at(self, pixels: np.ndarray) -> np.ndarray:
+        """(P, 3) float32 unit normals towards the camera, in camera axes, at flat pixel indices."""
+        face, bary, corners = self._gather(pixels)
+        return self._normals(face, bary, corners)
+
+    def shade(self, pixels: np.ndarray, open_sky: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Linear colour (P, 3) and |cos| to the view (P,) at flat pixel indices."""
+        face, bary, corners = self._gather(pixels)
+        normal = self._normals(face, bary, corners)
+        if self.vertex_albedo is not None:
+            color = _interpolate(self.vertex_albedo, corners, bary)
+        elif len(self.face_albedo) == 1:
+            color = np.repeat(self.face_albedo, len(pixels), axis=0)
+        else:
+            color = self.face_albedo.take(face, axis=0)
+        row, col = np.divmod(pixels, self.camera.width)
+        s = self.style.supersampling
+        sky = open_sky[row // s, col // s]
+        facing = np.clip(-np.einsum("pd,pd->p", normal, _view_directions(self.camera, row, col)), 0.0, 1.0)
+        relief = np.float32(self.style.relief)
+        color *= _light(normal, facing, sky, relief)[:, None]
+        color += (relief * np.float32(_RIM) * (1.0 - facing) ** 4 * sky)[:, None]
+        color *= np.where(self.back.take(face)[:, None], _BACK_SIDE, np.float32(1.0))
+        if self.edge_heights is not None:
+            pixels_from_edge = (bary * self.edge_heights.take(face, axis=0)).min(axis=1)
+            color *= 1.0 - np.float32(0.7) * np.clip(1.4 - pixels_from_edge, 0.0, 1.0)[:, None]
+        return color, facing
+
+    def _gather(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        face = self.maps.face_id.ravel().take(pixels)
+        return face, self.maps.barycentric.reshape(-1, 3).take(pixels, axis=0), self.mesh.faces.take(face, axis=0)
+
+    def _normals(self, face: np.ndarray, bary: np.ndarray, corners: np.ndarray) -> np.ndarray:
+        normal = _interpolate(self.normals, corners, bary) if self.style.smooth else self.normals.take(face, axis=0)
+        length = np.sqrt(np.einsum("pd,pd->p", normal, normal))
+        sign = np.where(self.back.take(face), np.float32(-1.0), np.float32(1.0))
+        return normal * (sign / np.maximum(length, 1e-6))[:, None]
+
+
+def _interpolate(values: np.ndarray, corners: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    out = values.take(corners[:, 0], axis=0)
+    out *= bary[:, :1]
+    for k in (1, 2):
+        term = values.take(corners[:, k], axis=0)
+        term *= bary[:, k : k + 1]
+        out += term
+    return out
+
+
+def _view_directions(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+    """(P, 3) float32 unit vectors from the camera to pixel centres, in camera axes."""
+    view = np.empty((len(row), 3), np.float32)
+    view[:, 2] = 1.0
+    if camera.orthographic:
+        view[:, :2] = 0.0
+        return view
+    view[:, 0] = (col + (0.5 - camera.K[0, 2])) / camera.K[0, 0]
+    view[:, 1] = (row + (0.5 - camera.K[1, 2])) / camera.K[1, 1]
+    return view / np.sqrt(np.einsum("pd,pd->p", view, view))[:, None]
+
+
+def _back_faces(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
+    """(M,) bool: faces that turn their inner side to the camera."""
+    if camera.orthographic:
+        return mesh.face_cross @ camera.forward > 0.0
+    # The sign of n . (p - eye), with p any corner; n . p is fixed by the mesh.
+    offset = np.einsum("md,md->m", mesh.face_cross, mesh.vertices.take(mesh.faces[:, 0], axis=0))
+    return offset - mesh.face_cross @ camera.position > 0.0
+
+
+def _camera_normals(mesh: TriangleMesh, camera: Camera, *, smooth: bool) -> np.ndarray:
+    normals = mesh.vertex_normals if smooth else mesh.face_normals
+    return normals.astype(np.float32) @ camera.cam_from_world[:3, :3].T.astype(np.float32)
+
+
+def _light(normal: np.ndarray, facing: np.ndarray, open_sky: np.ndarray, relief: np.float32) -> np.ndarray:
+    """(P,) factor on the surface's colour."""
+    # Wrapped diffuse light: the terminator of a bare Lambert term hides half of the form.
+    key = np.clip((normal @ _KEY_DIRECTION + 0.30) / 1.30, 0.0, None)
+    sky = 0.5 * (1.0 - normal[:, 1])  # y points down
+    gloss = np.clip(normal @ _HALF_DIRECTION, 0.0, None) ** 24
+    ambient = _GROUND + (_SKY - _GROUND) * sky + 0.18 * facing
+    lit = _KEY * key * (0.45 + 0.55 * open_sky) + ambient * open_sky + _GLOSS * gloss
+    return (1.0 - relief) + relief * lit
+
+
+def _edge_heights(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
+    """(M, 3) float32: height over the opposite edge of each corner, in pixels; barycentrics times it are distances."""
+    t = camera.screen_from_world(mesh.vertices)[:, :2][mesh.faces]
+    u, v = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    twice_area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    opposite = np.stack([np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3)], axis=1)
+    return (twice_area[:, None] / np.maximum(opposite, 1e-9)).astype(np.float32)

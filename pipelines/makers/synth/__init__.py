@@ -1,1 +1,0 @@
-"""A synthetic capture of the fixture person: her performance, cloth in motion, soft light, cameras, files."""

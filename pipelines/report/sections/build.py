@@ -1,0 +1,291 @@
+"""The report of a build: pictures of every stage, histograms of errors, numbers against their gates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.figures import (
+    blend_joint_colors,
+    body_cameras,
+    encode_jpeg,
+    render_heat,
+    render_overlay,
+    render_shaded,
+    row,
+)
+from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture, Report, Section, Table, write_report
+from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
+from pipelines.runs.arrays import load_arrays
+from pipelines.runs.digests import versions
+from pipelines.runs.stage import StageRecord, require_stage
+from pipelines.stages.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs, load_build
+from pipelines.stages.evaluate_config import EVALUATE_STAGE
+from pipelines.stages.scan import MM, load_params_of_run, load_scan
+from pipelines.stages.template import load_parts, load_weights
+from smplxpp.body import load_body, load_params
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.core.json_values import jsonable
+from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
+from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core.params import BodyParams
+from smplxpp.metrics import point_to_surface
+from smplxpp.template.template import Template
+
+HEIGHT = 640
+POSE_HEIGHT = 520
+MOTION_PICTURES = 5
+ERROR_LIMIT_MM = 6.0
+
+
+def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
+    """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
+    template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
+    fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
+    records = {**records, **({} if fit is None else {FIT_STAGE: fit})}
+    trainings = standing_trainings(run, records.values())
+    records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
+    template = Template.load(run / "60_assemble" / "smplxpp.npz")
+    reference = load_params_of_run(run)
+    checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
+    by_stage = {name: tuple(c for c in checks if c.stage == name) for name in records}
+    posed = template.mesh.with_vertices(template.pose(reference)[0])
+    scan, colors, _ = load_scan(run)
+    cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
+    early = tuple(c for c in checks if c.stage in ("00_capture", "10_register", "20_segment"))
+    sections = (
+        _scan_section(run, scan, colors, cameras, early),
+        _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
+        _weights_section(run, records["40_transfer"], cameras, by_stage["40_transfer"]),
+        _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
+        _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
+        _poses_section(template, reference, inputs),
+        *(() if fit is None else (fit_section(fit),)),
+        *(training_section(record) for record in trainings.values()),
+        *(() if evaluation is None else evaluation_sections(evaluation)),
+    )
+    clothes = records["65_validate"].manifest["numbers"]["template_vs_scan"]["labels"]
+    key_numbers = [
+        KeyNumber(
+            f"{label.name} to scan", f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm", "mean, visible surface"
+        )
+        for label in CLOTH_LABELS
+        if clothes.get(label.name, {}).get("pred_to_gt")
+    ]
+    seconds = {name: r.manifest["seconds"] for name, r in records.items()}
+    key_numbers += [
+        KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
+        KeyNumber(
+            "scan to template", f"{sum(seconds[name] for name in STAGES):.1f} s", "all stages, validation included"
+        ),
+        *(() if fit is None else fit_key_numbers(fit)),
+        *training_key_numbers(trainings),
+        *(() if evaluation is None else evaluation_key_numbers(evaluation)),
+    ]
+    inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
+    front = body_cameras(posed, views=("front",), height=HEIGHT)[0]
+    report = Report(
+        subject=inputs.subject,
+        summary="A personalised clothed template (SMPLX++) from one scan, measured at every stage.",
+        hero=(
+            Picture(
+                "the template in the reference pose",
+                encode_jpeg(render_shaded(posed, front, vertex_colors=template.vertex_colors)),
+            ),
+        ),
+        key_numbers=tuple(key_numbers),
+        checks=tuple(checks),
+        seconds=seconds,
+        sections=sections,
+        provenance={
+            "configuration": jsonable(config),
+            "versions": versions(),
+            "inputs (SHA-256)": {k: v for k, v in inputs_of.items() if not k.startswith(STAGES)},
+            "seed": {"samples": config.seed},
+        },
+    )
+    return write_report(run / "report.html", report)
+
+
+def rewrite_report(run: Path) -> Path | None:
+    """Write the report of a finished run anew, from the run alone.
+
+    Returns:
+        The report, or None where the run does not say what it was built from.
+
+    Raises:
+        InputError: a stage of the template is missing or changed.
+    """
+    build = load_build(run)
+    if build is None:
+        return None
+    return write_build_report(run, *build, {name: require_stage(run, name) for name in STAGES})
+
+
+def _sheet(mesh: TriangleMesh, cameras: list, **colors) -> bytes:
+    return encode_jpeg(row([render_shaded(mesh, camera, **colors) for camera in cameras]))
+
+
+def _scan_section(run: Path, scan: TriangleMesh, colors: np.ndarray, cameras: list, checks: tuple) -> Section:
+    with np.load(run / "20_segment" / "labels.npz") as data:
+        labels, confidence = data["face_labels"], data["confidence"]
+    heat = [
+        render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
+        for camera in cameras
+    ]
+    present = [label for label in LABELS if (labels == label.id).any()]
+    return Section(
+        title="Scan and labels",
+        text=(
+            "The scan in metres, +Y up, as it enters. Every face takes the label that a graph cut finds cheapest: "
+            "labels given or votes of views, smoothed so that seams settle in folds.",
+        ),
+        pictures=(
+            Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
+            Picture("labels", _sheet(scan, cameras, face_colors=display_colors(labels))),
+            Picture("confidence of the labels", encode_jpeg(row(heat))),
+        ),
+        legend=tuple((label.name, label.display_rgb) for label in present),
+        checks=checks,
+    )
+
+
+def _parts_section(run: Path, record: StageRecord, cameras: list, checks: tuple) -> Section:
+    parts = load_parts(run)
+    mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
+    labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
+    numbers = record.manifest["numbers"]
+    rows = tuple(
+        (
+            name,
+            numbers[name]["report"]["faces_before"],
+            numbers[name]["faces"],
+            numbers[name]["quality"]["components"],
+            numbers[name]["quality"]["border_loops"],
+            numbers[name]["report"]["distance_mean"] * MM,
+            numbers[name]["report"]["distance_p95"] * MM,
+        )
+        for name in parts
+    )
+    return Section(
+        title="Parts",
+        text=("Clothes, hair and shoes cut out, cleaned and simplified to their budgets; openings are kept.",),
+        pictures=(Picture("parts", _sheet(mesh, cameras, face_colors=display_colors(labels))),),
+        tables=(
+            Table(("part", "faces before", "faces", "pieces", "openings", "to scan, mean mm", "p95 mm"), rows, "parts"),
+        ),
+        checks=checks,
+    )
+
+
+def _weights_section(run: Path, record: StageRecord, cameras: list, checks: tuple) -> Section:
+    parts, weights = load_parts(run), load_weights(run)
+    mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
+    colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
+    matched = np.concatenate([weights[name].matched for name in parts])
+    tint = np.where(matched[:, None], (90, 170, 120), (230, 160, 60)).astype(np.uint8)
+    numbers = record.manifest["numbers"]
+    rows = tuple(
+        (n, numbers[n]["matched_share"], numbers[n]["components"], ", ".join(numbers[n]["policies"])) for n in parts
+    )
+    return Section(
+        title="Skin weights",
+        text=(
+            "Weights of the body reach into the space around it; cloth takes them where it lies close and faces alike, "
+            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches.",
+        ),
+        pictures=(
+            Picture("joints mixed by weight", _sheet(mesh, cameras, vertex_colors=colors)),
+            Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
+        ),
+        tables=(Table(("part", "matched share", "pieces", "policies"), rows, "transfer"),),
+        checks=checks,
+    )
+
+
+def _template_section(template: Template, checks: tuple) -> Section:
+    cameras = body_cameras(template.mesh, views=("front", "back"), height=POSE_HEIGHT)
+    return Section(
+        title="Template in the T-pose",
+        text=(
+            "The parts taken back by the inverse of the skinning that drives them, on the naked body, layers apart.",
+        ),
+        pictures=(
+            Picture("colours of the scan", _sheet(template.mesh, cameras, vertex_colors=template.vertex_colors)),
+            Picture("semantic colours", _sheet(template.mesh, cameras, vertex_colors=template.semantic_colors)),
+        ),
+        checks=checks,
+    )
+
+
+def _fidelity_section(
+    run: Path,
+    template: Template,
+    posed: TriangleMesh,
+    scan: TriangleMesh,
+    colors: np.ndarray,
+    cameras: list,
+    checks: tuple,
+) -> Section:
+    distance = point_to_surface(posed.vertices, scan)[0] * MM
+    errors = load_arrays(run / "65_validate" / "errors.npz")
+    histograms = []
+    for label in LABELS:
+        values = errors["template_to_scan"]["distance_mm"][errors["template_to_scan"]["label"] == label.id]
+        if len(values) and label.id:
+            gates = (("mean gate", 1.0), ("p95 gate", 3.0)) if label in CLOTH_LABELS else ()
+            histograms.append(Histogram(f"{label.name}: template to scan", values, gates=gates))
+    back = errors["scan_to_template"]
+    histograms.append(Histogram("scan to template, all labels", back["distance_mm"]))
+    front = cameras[0]
+    heat = [
+        render_heat(posed, camera, distance, limits=(0.0, ERROR_LIMIT_MM), unit="mm", bar=camera is cameras[-1])
+        for camera in cameras
+    ]
+    return Section(
+        title="Back in the reference pose",
+        text=("The template posed with the frame's parameters, against the scan, on the surface that can be seen.",),
+        pictures=(
+            Picture("distance to the scan", encode_jpeg(row(heat))),
+            Picture(
+                "template (glass) over the scan",
+                encode_jpeg(row([render_overlay(scan, posed, camera, solid_colors=colors) for camera in cameras])),
+            ),
+        ),
+        comparisons=(
+            Comparison(
+                "scan and template",
+                Picture("scan", encode_jpeg(render_shaded(scan, front, vertex_colors=colors))),
+                Picture("template", encode_jpeg(render_shaded(posed, front, vertex_colors=template.vertex_colors))),
+            ),
+        ),
+        histograms=tuple(histograms),
+        checks=checks,
+    )
+
+
+def _poses_section(template: Template, reference: BodyParams, inputs: BuildInputs) -> Section:
+    pictures = []
+    for name, vertices in zip(HARD_POSES, template.pose(hard_poses(reference)), strict=True):
+        pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
+    if inputs.motion is not None:
+        motion = load_params(inputs.motion, body=load_body(inputs.body))
+        chosen = np.unique(np.linspace(0, len(motion) - 1, MOTION_PICTURES).round().astype(int))
+        for k, vertices in zip(chosen, template.pose(motion.select(chosen)), strict=True):
+            pictures.append(_pose_picture(template, vertices, f"motion, frame {k}"))
+    return Section(
+        title="Driven",
+        text=(
+            "Poses that try the skinning, and frames of the capture's own motion. Skinning alone: no cloth dynamics.",
+        ),
+        pictures=tuple(pictures),
+    )
+
+
+def _pose_picture(template: Template, vertices: np.ndarray, name: str) -> Picture:
+    mesh = template.mesh.with_vertices(vertices)
+    cameras = body_cameras(mesh, views=("front", "side"), height=POSE_HEIGHT)
+    return Picture(name, _sheet(mesh, cameras, vertex_colors=template.vertex_colors))

@@ -1,0 +1,128 @@
+"""The report's section on an evaluation: photograph, reference fit, teacher and student beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.figures import encode_jpeg, encode_png, row
+from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend
+from pipelines.figures.evaluation import read_tiles
+from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
+from pipelines.report.sections.fit import HEAD_HEIGHT
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.stage import StageRecord, read_manifest
+from pipelines.stages.build_config import TEMPLATE
+from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, HELD_OUT_VIEWS, MODEL_FILES, SURFACE_LIMIT_MM
+
+
+def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:
+    """The evaluation in a run, None where there is none or one of another template or other models than there are."""
+    manifest = read_manifest(run / EVALUATE_STAGE)
+    if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
+        return None
+    measured = {name: digest for name, digest in manifest["inputs"].items() if name in MODEL_FILES.values()}
+    if any(not (run / name).is_file() or sha256_file(run / name) != digest for name, digest in measured.items()):
+        return None
+    return StageRecord(run / EVALUATE_STAGE, manifest, ran=False)
+
+
+def evaluation_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
+    """The numbers for the head of the report: of the student, or of the teacher where there is no student."""
+    models = record.manifest["numbers"]["models"]
+    name = next((name for name in BEST_FIRST if name in models), None)
+    if name is None:
+        return ()
+    figures, out = models[name], []
+    for part, title in zip(HELD_OUT_VIEWS, ("novel views", "novel poses"), strict=True):
+        if figures.get(f"{part}.psnr") is not None:
+            note = f"{name}, SSIM {figures[f'{part}.ssim']:.3f}"
+            out.append(KeyNumber(title, f"{figures[f'{part}.psnr']:.1f} dB", note))
+    if figures.get("fps") is not None:
+        out.append(KeyNumber("pictures a second", f"{figures['fps']:.1f}", f"{name}, deform and render"))
+    return tuple(out)
+
+
+def evaluation_sections(record: StageRecord) -> tuple[Section, Section]:
+    """Tables with what their figures mean and distances on the meshes; then pictures of the views."""
+    return _figures(record), _side_by_side(record)
+
+
+def _figures(record: StageRecord) -> Section:
+    numbers = record.manifest["numbers"]
+    return Section(
+        title="Avatar: figures",
+        text=(
+            f"{_listed(list(numbers['models']))} on the same views. Training views: cameras and frames that were "
+            "trained on. Novel views: held-out cameras at training frames. Novel poses: held-out cameras at held-out "
+            f"frames. All figures, and these tables as text, CSV and LaTeX, lie in {EVALUATE_STAGE}.",
+            *(f"{name[0].upper()}{name[1:]}: {words}" for name, words in numbers["conventions"].items()),
+        ),
+        pictures=tuple(
+            Picture(f"{shown['title']}, 0 to {SURFACE_LIMIT_MM:g} mm", (record.folder / shown["file"]).read_bytes())
+            for shown in numbers["surfaces"]
+        ),
+        # Cells are text: they keep the digits that make small differences visible.
+        tables=tuple(
+            Table(tuple(table["header"]), tuple(map(tuple, table["rows"])), table["caption"])
+            for table in numbers["tables"]
+        ),
+        checks=tuple(CheckRow.of(check, stage=EVALUATE_STAGE) for check in record.manifest["checks"]),
+    )
+
+
+def _side_by_side(record: StageRecord) -> Section:
+    """Held-out views, and one view of every other set: the first held-out one of a set also with a slider."""
+    numbers = record.manifest["numbers"]
+    models = list(numbers["models"])
+    pictures, comparisons, seen = [], [], set()
+    for shown in numbers["views"]:
+        first, held_out = shown["set"] not in seen, shown["set"] in HELD_OUT_VIEWS
+        seen.add(shown["set"])
+        if not first and not held_out:
+            continue
+        truth, rendered = read_tiles(record.folder / shown["file"], len(models))
+        pictures += _view_pictures(shown, truth, rendered)
+        if first and held_out:
+            pair = Picture("photograph", encode_png(truth)), Picture(models[-1], encode_png(rendered[-1]))
+            comparisons.append(Comparison(f"{shown['title']}, every pixel", *pair))
+    pictures.append(Picture(f"error, of 255: 0 to {ERROR_LIMIT} and more", encode_png(error_legend())))
+    return Section(
+        title="Avatar: side by side",
+        text=(
+            f"Photograph, {', '.join(models)}; below each its error: the largest difference of a colour channel at a "
+            f"pixel, from 0 (pale) to {ERROR_LIMIT} of 255 and more (dark).",
+        ),
+        pictures=tuple(pictures),
+        comparisons=tuple(comparisons),
+    )
+
+
+def _view_pictures(shown: Mapping[str, Any], truth: np.ndarray, rendered: list[np.ndarray]) -> list[Picture]:
+    """The view whole, and its head enlarged."""
+    out = [Picture(shown["title"], encode_png(_with_errors(truth, rendered)))]
+    if shown["head"] is not None:
+        x0, y0, x1, y1 = shown["head"]
+        factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
+        crops = [enlarge(image[y0:y1, x0:x1], factor) for image in (truth, *rendered)]
+        picture = encode_jpeg(_with_errors(crops[0], crops[1:]), quality=92)
+        out.append(Picture(f"{shown['title']}, head, {factor} times enlarged", picture))
+    return out
+
+
+def _with_errors(truth: np.ndarray, rendered: list[np.ndarray]) -> np.ndarray:
+    """Photograph and renderings in a row, errors under the renderings."""
+    blank = np.full_like(truth, 255)
+    errors = row([blank, *(error_colors(truth, image) for image in rendered)])
+    images = row([truth, *rendered])
+    gap = np.full((12, images.shape[1], 3), 255, np.uint8)
+    return np.concatenate([images, gap, errors])
+
+
+def _listed(names: list[str]) -> str:
+    """Names in a sentence, the first with a capital."""
+    text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return text[0].upper() + text[1:]

@@ -1,0 +1,122 @@
+"""The report's section on a reference fit, from the files of its stage."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.figures import encode_png, row
+from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, read_strip
+from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
+from pipelines.runs.stage import StageRecord, read_manifest
+from pipelines.stages.build_config import FIT_STAGE, TEMPLATE
+
+HEAD_HEIGHT = 420
+"""Pixels: crops of the head are enlarged by the whole number that brings them nearest to this."""
+_FIGURES = ("psnr", "psnr_image", "ssim", "psnr_head")
+
+
+def standing_fit(run: Path, template_digest: str) -> StageRecord | None:
+    """The fit in a run, None where there is none or one of another template than the run has now."""
+    manifest = read_manifest(run / FIT_STAGE)
+    if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
+        return None
+    return StageRecord(run / FIT_STAGE, manifest, ran=False)
+
+
+def fit_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
+    """The fit's numbers for the head of the report."""
+    numbers = record.manifest["numbers"]
+    which, names = _shown(numbers)
+    figures = numbers["mean"][which]
+    note = f"{'held-out' if which == 'held_out' else 'training'} views ({len(names)}), SSIM {figures['ssim']:.3f}"
+    return (KeyNumber("Gaussians to photographs", f"{figures['psnr']:.1f} dB", note),)
+
+
+def fit_section(record: StageRecord) -> Section:
+    """Photograph, rendering and error beside each other, figures by camera, and quality as time went by."""
+    numbers = record.manifest["numbers"]
+    which, names = _shown(numbers)
+    pictures, comparisons = [], []
+    for name in names:
+        strip = record.folder / "previews" / f"{name}.png"
+        if not strip.is_file():
+            continue
+        parts = read_strip(strip)
+        pictures.append(Picture(f"{name}: photograph, rendered, error", encode_png(row(list(parts)))))
+        comparisons.append(
+            Comparison(
+                f"{name}, every pixel",
+                Picture("photograph", encode_png(parts[0])),
+                Picture("rendered", encode_png(parts[1])),
+            )
+        )
+        head = numbers["heads"].get(name)
+        if head is not None:
+            pictures.append(_head_picture(name, parts, head))
+    kind = "held out" if which == "held_out" else "trained on: no camera is held out"
+    return Section(
+        title="Gaussians",
+        text=(
+            f"{numbers['gaussians']:,} Gaussians bound to the template's triangles, fitted to one frame's photographs. "
+            f"The cameras shown were {kind}. Error: the largest difference of a colour channel at a pixel, "
+            f"from 0 (pale) to {ERROR_LIMIT} of 255 and more (dark).",
+            f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations in "
+            f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.1f} a second. "
+            f"{FIT_STAGE}/splats.ply holds the splats of this pose in the layout of 3D Gaussian Splatting, "
+            f"{FIT_STAGE}/gaussians.safetensors holds them bound to the triangles.",
+            numbers["convention"],
+        ),
+        pictures=(*pictures, Picture(f"error, of 255: 0 to {ERROR_LIMIT} and more", encode_png(error_legend()))),
+        comparisons=tuple(comparisons),
+        curves=_curves(record.folder / "metrics.jsonl"),
+        tables=(_table(numbers),),
+        checks=tuple(CheckRow.of(check, stage=FIT_STAGE) for check in record.manifest["checks"]),
+    )
+
+
+def _shown(numbers: dict[str, Any]) -> tuple[str, list[str]]:
+    """The views that speak for the fit: held-out ones, or the training views where none is held out."""
+    which = "held_out" if numbers["held_out"] else "train"
+    return which, list(numbers[which])
+
+
+def _head_picture(name: str, parts: tuple[np.ndarray, ...], box: list[int]) -> Picture:
+    x0, y0, x1, y1 = box
+    factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
+    crops = [enlarge(part[y0:y1, x0:x1], factor) for part in parts]
+    return Picture(f"{name}, head, {factor} times enlarged: photograph, rendered, error", encode_png(row(crops)))
+
+
+def _table(numbers: dict[str, Any]) -> Table:
+    rows = []
+    for which, label in (("held_out", "held out"), ("train", "training")):
+        for name, figures in numbers[which].items():
+            rows.append((name, label, *(figures[key] for key in _FIGURES)))
+        if numbers[which]:
+            rows.append(("mean", label, *(numbers["mean"][which].get(key) for key in _FIGURES)))
+    header = ("camera", "views", "PSNR person, dB", "PSNR image, dB", "SSIM", "PSNR head, dB")
+    return Table(header, tuple(rows), "figures by camera")
+
+
+def _curves(path: Path) -> tuple[Curve, ...]:
+    """Quality over the time spent in steps."""
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    found = [entry for entry in entries if entry["kind"] == "evaluation"]
+    if len(found) < 2:
+        return ()
+    seconds = np.array([entry["seconds"] for entry in found])
+    lines = {
+        title: (seconds, np.array([entry["mean"][key] for entry in found], dtype=np.float64))
+        for key, title in (("psnr", "person"), ("psnr_head", "head"))
+        if all(entry["mean"].get(key) is not None for entry in found)
+    }
+    which = "held-out" if found[0]["held_out"] else "training"
+    ssim = {"whole image": (seconds, np.array([entry["mean"]["ssim"] for entry in found]))}
+    return (
+        Curve(f"PSNR of the {which} views", lines, "seconds", "dB"),
+        Curve(f"SSIM of the {which} views", ssim, "seconds"),
+    )

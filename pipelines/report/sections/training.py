@@ -1,0 +1,185 @@
+"""The report's sections on the trainings, from the files of their stages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.figures import encode_png, row
+from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip
+from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
+from pipelines.runs.stage import StageRecord, read_manifest
+from pipelines.stages.build_config import BAKE_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TRAIN_STAGES
+from pipelines.stages.train_names import KINDS, kind_name, spread
+
+SHOWN_VIEWS = 4
+CURVE_POINTS = 300
+_FIGURES = {"psnr": "PSNR person, dB", "psnr_image": "PSNR image, dB", "ssim": "SSIM"}
+_TITLES = {
+    TEACHER_STAGE: ("Teacher", "Networks on maps of the posed mesh give every Gaussian its residuals in every pose."),
+    BAKE_STAGE: (
+        "Bake",
+        "A small field moves the student's mesh as the teacher moves its Gaussians; the student renders without maps.",
+    ),
+    COMPENSATE_STAGE: (
+        "Compensation",
+        "Blend shapes of the Gaussians learn what the mesh's motion leaves over. This is the avatar that runs.",
+    ),
+}
+
+
+def standing_trainings(run: Path, records: Iterable[StageRecord]) -> dict[str, StageRecord]:
+    """The trainings in a run by stage; without those of files that have been made anew since.
+
+    Args:
+        records: earlier stages that stand.
+    """
+    digests = {
+        f"{record.folder.name}/{file}": digest
+        for record in records
+        for file, digest in record.manifest["files"].items()
+    }
+    found, outdated = {}, set()
+    for stage in TRAIN_STAGES:
+        manifest = read_manifest(run / stage)
+        if manifest is None:
+            continue
+        inputs = manifest["inputs"].items()
+        if any(digests.get(file, digest) != digest or file.split("/")[0] in outdated for file, digest in inputs):
+            outdated.add(stage)
+            continue
+        found[stage] = StageRecord(run / stage, manifest, ran=False)
+        digests |= {f"{stage}/{file}": digest for file, digest in manifest["files"].items()}
+    return found
+
+
+def training_key_numbers(records: Mapping[str, StageRecord]) -> tuple[KeyNumber, ...]:
+    """Of the last training, for the head of the report."""
+    if not records:
+        return ()
+    stage, record = list(records.items())[-1]
+    numbers = record.manifest["numbers"]
+    who = "teacher" if stage == TEACHER_STAGE else "student"
+    return tuple(
+        KeyNumber(
+            f"{who}, {kind_name(kind, held_out=numbers['held_out_cameras'])}",
+            f"{numbers[kind]['psnr']:.1f} dB",
+            f"SSIM {numbers[kind]['ssim']:.3f}",
+        )
+        for kind in KINDS
+        if kind in numbers
+    )
+
+
+def training_section(record: StageRecord) -> Section:
+    """Figures at the start and the end, quality and loss over time, photographs beside renderings."""
+    stage, numbers = record.folder.name, record.manifest["numbers"]
+    title, what = _TITLES[stage]
+    pictures, comparisons = _pictures(record.folder)
+    lines = _entries(record.folder / "metrics.jsonl")
+    return Section(
+        title=title,
+        text=(what, _how(numbers), _files(numbers)),
+        pictures=(*pictures, Picture(f"error, of 255: 0 to {ERROR_LIMIT} and more", encode_png(error_legend()))),
+        comparisons=comparisons,
+        curves=_curves(lines, held_out=numbers["held_out_cameras"]),
+        tables=(_table(numbers),),
+        checks=tuple(CheckRow.of(check, stage=stage) for check in record.manifest["checks"]),
+    )
+
+
+def _how(numbers: Mapping[str, Any]) -> str:
+    stopped = "" if numbers["finished"] else " The limit of time ended it; the same command goes on."
+    memory = ", ".join(
+        f"{size / 1e9:.1f} GB {where}"
+        for where, size in (
+            (name, numbers["peak_memory"].get(key)) for key, name in (("host", "of memory"), ("device", "on the GPU"))
+        )
+        if size
+    )
+    processes, tracking, pretraining = (
+        numbers[name] for name in ("processes", "seconds_of_tracking", "seconds_of_pretraining")
+    )
+    before = f" The surface was followed through the frames first, in {tracking:.0f} s." if tracking else ""
+    before += f" The networks were pretrained without rendering, in {pretraining:.0f} s." if pretraining else ""
+    return (
+        f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations on "
+        f"{numbers['training_frames']} frames of {numbers['training_cameras']} cameras in "
+        f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.2f} a second"
+        f"{f' by {processes} processes' if processes > 1 else ''}; at most {memory}.{before}{stopped}"
+    )
+
+
+def _files(numbers: Mapping[str, Any]) -> str:
+    parts = numbers["parameters"]
+    counted = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in parts.items() if name != "total")
+    files = ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in numbers["bytes"].items())
+    kept = numbers.get("compact", {}).get("kept_blend_shapes", 1.0)
+    pruned = "" if kept == 1.0 else f" The compact file keeps the blend shapes of {100 * kept:.0f} % of the Gaussians."
+    return f"{parts['total']:,} parameters: {counted}. Files: {files}.{pruned}"
+
+
+def _table(numbers: Mapping[str, Any]) -> Table:
+    states = [("start", numbers["start"]), (f"after {numbers['measured_at'] or 0:,} iterations", numbers)]
+    if "compact" in numbers:
+        states.append(("the compact file", numbers["compact"]))
+    rows = tuple(
+        (kind_name(kind, held_out=numbers["held_out_cameras"]), name, *(state[kind][key] for key in _FIGURES))
+        for kind in KINDS
+        for name, state in states
+        if kind in state
+    )
+    return Table(
+        ("views", "of", *_FIGURES.values()),
+        rows,
+        "means over the measured views; person: where mask or rendered opacity exceed 0.02",
+    )
+
+
+def _pictures(folder: Path) -> tuple[list[Picture], tuple[Comparison, ...]]:
+    pictures, comparisons = [], []
+    for strip in spread(sorted((folder / "previews").glob("*.png")), SHOWN_VIEWS):
+        camera, frame = strip.stem.rsplit("_", 1)
+        name, parts = f"{camera}, frame {int(frame)}", read_strip(strip)
+        pictures.append(Picture(f"{name}: photograph, rendered, error", encode_png(row(list(parts)))))
+        comparisons.append(
+            Comparison(name, Picture("photograph", encode_png(parts[0])), Picture("rendered", encode_png(parts[1])))
+        )
+    return pictures, tuple(comparisons)
+
+
+def _curves(lines: list[dict[str, Any]], *, held_out: bool) -> tuple[Curve, ...]:
+    """Quality of the evaluations and loss of the steps, over the time spent in steps."""
+    evaluations = [line for line in lines if line["kind"] == "evaluation"]
+    steps = [line for line in lines if line["kind"] == "step" and "loss" in line]
+    curves = []
+    for key, title, unit in (("psnr", "PSNR", "dB"), ("ssim", "SSIM", "")):
+        drawn = {}
+        for kind in KINDS:
+            there = [line for line in evaluations if kind in line]
+            if len(there) > 1:
+                x, y = ([value(line) for line in there] for value in (_seconds, lambda line: line[kind][key]))  # noqa: B023
+                drawn[kind_name(kind, held_out=held_out)] = (np.array(x), np.array(y))
+        if drawn:
+            curves.append(Curve(title, drawn, "seconds", unit))
+    if len(steps) > 1:
+        groups = np.array_split(np.arange(len(steps)), min(CURVE_POINTS, len(steps)))
+        mean = [
+            [np.mean([value(steps[k]) for k in group]) for group in groups]
+            for value in (_seconds, lambda line: line["loss"])
+        ]
+        curves.append(Curve("loss", {"training": (np.array(mean[0]), np.array(mean[1]))}, "seconds"))
+    return tuple(curves)
+
+
+def _entries(path: Path) -> list[dict[str, Any]]:
+    """Of a log; none where training ended before its first step."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+def _seconds(line: Mapping[str, Any]) -> float:
+    return line["seconds"]

@@ -1,0 +1,51 @@
+"""A number held against a stated gate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Check:
+    """A number held against a stated gate: pass below `warn`, warn below `fail`, fail from there on.
+
+    `warn` and `fail` are upper bounds; a gate that is a lower bound is written with `higher_is_better`.
+    """
+
+    name: str
+    value: float
+    unit: str
+    warn: float
+    fail: float
+    higher_is_better: bool = False
+    explanation: str = ""
+
+    @property
+    def status(self) -> str:
+        """`pass`, `warn` or `fail`; a NaN fails."""
+        value, warn, fail = self.value, self.warn, self.fail
+        if self.higher_is_better:
+            value, warn, fail = -value, -warn, -fail
+        if math.isnan(value) or value > fail:
+            return "fail"
+        return "warn" if value > warn else "pass"
+
+    @property
+    def gate(self) -> str:
+        """The gate in words."""
+        sign = ">=" if self.higher_is_better else "<="
+        if self.warn == self.fail:
+            return f"{sign} {self.fail:g} {self.unit}".strip()
+        return f"{sign} {self.warn:g} (fail beyond {self.fail:g}) {self.unit}".strip()
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "value": self.value,
+            "unit": self.unit,
+            "status": self.status,
+            "gate": self.gate,
+            "explanation": self.explanation,
+        }

@@ -1,0 +1,1 @@
+"""The stages of a run, from a scan to an evaluation."""

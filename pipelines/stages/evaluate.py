@@ -1,0 +1,219 @@
+"""Stage 95: reference fit, teacher and student measured on a capture; figures, tables and pictures."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+from avatar.data.sequence import AvatarSequence
+from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
+from avatar.evaluation.protocol import SETS, ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
+from avatar.evaluation.summary import evaluation_tables, summary_figures
+from avatar.gaussians.bound_file import load_bound
+from avatar.models.model_file import load_avatar
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.posed import AvatarModel
+from avatar.rig.rig import Rig
+from pipelines.figures import encode_png
+from pipelines.figures.evaluation import surface_picture, write_tiles
+from pipelines.runs.checks import Check
+from pipelines.runs.digests import code_digest, sha256_file
+from pipelines.runs.lock import own_run_folder
+from pipelines.runs.stage import StageOutput, StageRecord, run_stage
+from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, MEASURED, MODEL_FILES, REPORT_FILE
+from pipelines.stages.train_inputs import TrainInputs, open_scene
+from smplxpp.capture import Capture
+from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import CLOTH_LABELS
+
+
+def evaluate(
+    run: Path,
+    inputs: TrainInputs,
+    config: EvaluationConfig,
+    *,
+    models: tuple[str, ...] = (),
+    device: str = "cpu",
+    force: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StageRecord:
+    """Measure the models of a run on a capture; skipped while models, capture, code and configuration stand.
+
+    Args:
+        models: names among `MODEL_FILES`; empty: `MEASURED`, as far as there are files.
+        force: measure anew even if the stage stands.
+        progress: called with frames done and all frames.
+
+    Raises:
+        InputError: no template, no trained model, a model of another template; a capture of another body, or one that
+            lacks views, masks or parameters.
+    """
+    files = model_files(run, models)
+    scene = open_scene(run, inputs)
+    sets = with_people(scene.capture, view_sets(scene.capture, config.protocol))
+    sequence = AvatarSequence(scene.capture, scene.template, device=device)
+    loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
+    digests = {
+        **scene.digests,
+        **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
+        "capture/surfaces": _surface_digest(scene.capture, config.protocol, sets),
+        "code": code_digest("smplxpp", "avatar"),
+        "torch": version("torch"),
+    }
+    with own_run_folder(run, (EVALUATE_STAGE, "report")):
+        return run_stage(
+            run,
+            EVALUATE_STAGE,
+            lambda folder: _write(
+                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), scene.overlap
+            ),
+            config={"evaluation": config, "scale": inputs.scale, "device": device},
+            inputs=digests,
+            seed=config.seed,
+            force=force,
+        )
+
+
+def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
+    """Files of the models of a run, in the order of `MODEL_FILES`.
+
+    Args:
+        names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
+
+    Raises:
+        InputError: an unknown name, a model that is asked for and not trained, no teacher and no student.
+    """
+    there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
+    asked = list(names)
+    unknown = [name for name in asked if name not in MODEL_FILES]
+    if unknown:
+        raise InputError("models", expected=f"among {', '.join(MODEL_FILES)}", received=", ".join(unknown))
+    missing = [name for name in asked if name not in there]
+    untrained = not asked and not there.keys() & set(BEST_FIRST)
+    if missing or untrained:
+        fit_alone = missing == ["reference-fit"]
+        raise InputError(
+            f"run {run}",
+            expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
+            received=f"only {', '.join(there)}" if there else "no model",
+            remedy=f"`smplxpp {'fit-reference' if fit_alone else 'train'}` makes it; a training under way is measured "
+            "when its stage is finished",
+        )
+    wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
+    return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
+
+
+def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
+    """A model of a run; the reference fit is a student without field and blend shapes.
+
+    Raises:
+        InputError: a damaged file, one of another template or of a newer version.
+    """
+    if name != "reference-fit":
+        return load_avatar(path, rig)
+    return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
+
+
+def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
+    """Figures, tables and pictures of an evaluation as files; what the manifest and the report say of it."""
+    report = found.report
+    report.save(folder / REPORT_FILE)
+    tables = evaluation_tables(report)
+    for name, table in tables.items():
+        for ending, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label=f"tab:{name}"))):
+            atomic_write_text(folder / "tables" / f"{name}.{ending}", text)
+    views, surfaces = [], []
+    for view in found.views:
+        file = f"pictures/{view.set}_{view_key(view.camera, view.frame)}.png"
+        write_tiles(folder / file, view.truth, list(view.rendered.values()))
+        views.append(
+            {
+                "file": file,
+                "set": view.set,
+                "title": f"{SETS[view.set]}, {view.camera}, frame {view.frame}",
+                "head": view.head,
+            }
+        )
+    for surface in found.surfaces:
+        file = f"pictures/surface_{surface.set}_{surface.frame:06d}.png"
+        atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
+        title = f"{SURFACE_SETS[surface.set]}, frame {surface.frame}: distance to the true surface"
+        surfaces.append({"file": file, "title": title})
+    numbers = {
+        "models": {name: summary_figures(model) for name, model in report.models.items()},
+        "conventions": report.conventions,
+        "tables": [{"caption": t.caption, "header": t.header(), "rows": t.cells()} for t in tables.values()],
+        "views": views,
+        "surfaces": surfaces,
+    }
+    return StageOutput(_checks(report, overlap), numbers)
+
+
+def _checks(report: EvalReport, overlap: float) -> list[Check]:
+    checks = [
+        Check(
+            "template's silhouette on the masks",
+            overlap,
+            "IoU",
+            0.95,
+            0.8,
+            higher_is_better=True,
+            explanation="skinning alone; low: another person, another pose, or other cameras",
+        )
+    ]
+    name = next((name for name in BEST_FIRST if name in report.models), None)
+    if name is None:
+        return checks
+    best = report.models[name]
+    for part, title, warn, fail in (
+        ("novel_view", "novel views", 22.0, 16.0),
+        ("novel_pose", "novel poses", 20.0, 15.0),
+    ):
+        if part in best.views:
+            checks.append(
+                Check(
+                    f"{name}, {title}: PSNR of the person",
+                    best.mean(part)["psnr"],
+                    "dB",
+                    warn,
+                    fail,
+                    higher_is_better=True,
+                )
+            )
+            if name != "teacher" and "teacher" in report.models:
+                gain = best.mean(part)["psnr"] - report.models["teacher"].mean(part)["psnr"]
+                checks.append(
+                    Check(f"{name} against its teacher, {title}", gain, "dB", -0.3, -2.0, higher_is_better=True)
+                )
+    for part, title in SURFACE_SETS.items():
+        if part not in best.surfaces or name == "teacher":
+            continue
+        own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
+        for label in CLOTH_LABELS:
+            if label.name in own and label.name in alone and own[label.name].p2s and alone[label.name].p2s:
+                share = own[label.name].p2s / alone[label.name].p2s
+                checks.append(
+                    Check(
+                        f"P2S of {label.name} against skinning alone, {title}",
+                        share,
+                        "x",
+                        1.0,
+                        1.5,
+                        explanation="below 1: the mesh that the field moves is nearer to the truth",
+                    )
+                )
+    return checks
+
+
+def _surface_digest(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> str:
+    """SHA-256 of the true surfaces that are measured."""
+    digest = hashlib.sha256()
+    for frame in chain(*truth_frames(capture, protocol, sets).values()):
+        mesh = capture.truth_mesh(frame)
+        digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
+    return digest.hexdigest()

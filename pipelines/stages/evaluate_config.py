@@ -1,0 +1,25 @@
+"""Names that the stage of an evaluation and the report's section on it share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pipelines.stages.build_config import BAKED, COMPACT_STUDENT, GAUSSIANS, STUDENT, TEACHER
+
+EVALUATE_STAGE = "95_evaluate"
+REPORT_FILE = "metrics.json"
+MODEL_FILES: Mapping[str, str] = {
+    "reference-fit": GAUSSIANS,
+    "teacher": TEACHER,
+    "baked": BAKED,
+    "student": STUDENT,
+    "compact": COMPACT_STUDENT,
+}
+"""Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
+MEASURED = ("reference-fit", "teacher", "student")
+"""Those that are measured where nothing else is asked for, as far as a run has them."""
+BEST_FIRST = ("student", "compact", "baked", "teacher")
+"""What an evaluation is about: the first of these that was measured."""
+HELD_OUT_VIEWS = ("novel_view", "novel_pose")
+SURFACE_LIMIT_MM = 40.0
+"""Distance that the colours of posed meshes end at."""

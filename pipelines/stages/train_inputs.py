@@ -1,0 +1,247 @@
+"""What a training reads, opened and looked at before it starts: what cannot be trained on is said, or left out."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from avatar.data.views import read_views
+from pipelines.runs.digests import sha256_file
+from pipelines.stages.build_config import TEMPLATE, load_build
+from pipelines.stages.fit import FitInputs, open_cameras, silhouette_overlap
+from pipelines.stages.train_names import spread
+from smplxpp.capture import Capture
+from smplxpp.capture.recording import Problem
+from smplxpp.capture.splits import Splits
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.template.template import Template
+
+CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
+"""Training frames, and cameras of each, in whose images the template has to stand."""
+OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
+"""Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
+
+
+@dataclass(frozen=True)
+class TrainInputs:
+    """Where a training takes its views from.
+
+    Attributes:
+        capture: folder of any known layout.
+        params: other parameters than the capture's own. body: what they are for, None for the open body.
+        hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
+        scale: of the images, 1 for all pixels.
+    """
+
+    capture: Path
+    params: Path | None = None
+    body: Path | None = None
+    hold_out: tuple[str, ...] = ()
+    scale: float = 1.0
+
+    def of_frame(self, frame: int) -> FitInputs:
+        """The same for a reference fit to one frame."""
+        return FitInputs(self.capture, frame, self.params, self.body, self.hold_out, self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainScene:
+    """A capture that can be trained on; pickles.
+
+    Attributes:
+        template: of the run.
+        capture: its splits are what is trained on and held out; unusable frames and views are left out.
+        frame: the reference frame of the fit.
+        built_frame: the one that the template was built from, if it is trained on; then both are one.
+        overlap: mean IoU of silhouettes and masks in `CHECKED_FRAMES` training frames.
+        digests: SHA-256 by name of everything that is read.
+    """
+
+    template: Template
+    capture: Capture
+    frame: int
+    built_frame: int | None
+    overlap: float
+    digests: dict[str, str]
+
+
+def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
+    """Open the template of a run and a capture, and look at both.
+
+    Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
+
+    Raises:
+        InputError: no template; no training camera, image, mask or parameters; images of another size than their
+            camera; nobody in the masks; a template that does not stand in the images, or parameters of another body.
+    """
+    path = run / TEMPLATE
+    if not path.is_file():
+        raise InputError(
+            f"run {run}",
+            expected=f"a template, {TEMPLATE}",
+            received="none",
+            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+        )
+    template = Template.load(path)
+    if not template.cloth_mask.any():
+        warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
+    capture, params = _with_params(_opened(inputs))
+    capture = _with_masks(capture)
+    seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
+    frames = [number for number in capture.splits.train_frames if number in seen]
+    built = load_build(run)
+    built_frame = built[0].frame if built is not None and built[0].frame in frames else None
+    frame = frames[0] if built_frame is None else built_frame
+    for name in capture.splits.train_cameras:
+        if capture.file(name, frame) is not None:
+            capture.foreground(name, frame)  # a damaged image or one of another size is an error now
+    _compare_shapes(template, [params[f] for f in frames])
+    overlap = _overlap(template, capture, params)
+    digests = {TEMPLATE: sha256_file(path), **_digests(capture, params)}
+    return TrainScene(template, capture, frame, built_frame, overlap, digests)
+
+
+def _opened(inputs: TrainInputs) -> Capture:
+    """The capture with the user's held-out cameras and scale; frames as it splits them."""
+    capture, train, held_out = open_cameras(inputs.of_frame(0))
+    old = capture.splits
+    if not old.train_frames:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="frames to train on",
+            received="none in its splits",
+            remedy="see docs/captures.md: splits are read from the capture",
+        )
+    return replace(capture, splits=Splits(train, held_out, old.train_frames, old.novel_pose_frames))
+
+
+def _with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:
+    """Without the frames that have no usable parameters; those of the others."""
+    splits, known, why = capture.splits, {}, {}
+    for frame in (*splits.train_frames, *splits.novel_pose_frames):
+        try:
+            params = capture.params(frame)
+        except InputError as error:
+            why[frame] = str(error)
+            continue
+        if params is None:
+            why[frame] = f"frame {frame}: no body parameters"
+        else:
+            known[frame] = params
+    if not any(frame in known for frame in splits.train_frames):
+        raise InputError(
+            f"capture {capture.name}",
+            expected="body parameters of the training frames",
+            received=why[splits.train_frames[0]],
+            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+        )
+    if why:
+        _warn(f"{len(why)} of {len(known) + len(why)} frames are left out: {next(iter(why.values()))}")
+        capture = capture.without([Problem(text, None, frame) for frame, text in why.items()])
+    return capture, known
+
+
+def _with_masks(capture: Capture) -> Capture:
+    """Without the views that have no mask."""
+    names = list(capture.cameras)
+    images, masks = capture.presence(), capture.presence("mask")
+    wanted = np.isin(names, capture.splits.train_cameras)[:, None] & np.isin(
+        capture.frames, capture.splits.train_frames
+    )
+    lacking = [(names[row], capture.frames[column]) for row, column in np.argwhere(images & ~masks)]
+    if not (images & masks & wanted).any():
+        raise InputError(
+            f"capture {capture.name}",
+            expected="images of training frames and their masks",
+            received="no mask" if (images & wanted).any() else "no image",
+            remedy="give the masks as docs/captures.md says, or make them with your matting model",
+        )
+    if lacking:
+        camera, frame = lacking[0]
+        _warn(f"{len(lacking)} views are left out: no mask of camera {camera}, frame {frame}")
+        capture = capture.without([Problem("no mask", *view) for view in lacking])
+    return capture
+
+
+def _compare_shapes(template: Template, params: Sequence[BodyParams]) -> None:
+    """Refuse parameters of another person: their shape coefficients against those that the template is made of."""
+    size = template.shape_basis.shape[2]
+    betas = np.mean([_padded(p.betas[0], size) for p in params], axis=0)
+    moved = template.shape_basis @ (betas - _padded(template.betas, size))
+    distance = float(np.linalg.norm(moved, axis=-1).mean())
+    if distance > OTHER_PERSON:
+        raise InputError(
+            "body parameters of the training frames",
+            expected="those of the template's person and body model",
+            received=f"shape coefficients that move the body by {1e3 * distance:.0f} mm on average",
+            remedy="build the template from this capture, or name its own parameters with --params (and --body)",
+        )
+    if distance > OTHER_SHAPE:
+        _warn(
+            f"the parameters' body is {1e3 * distance:.0f} mm off the template's on average: another fit of its shape?"
+        )
+
+
+def _padded(betas: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(betas[:size], (0, max(0, size - len(betas))))
+
+
+def _overlap(template: Template, capture: Capture, params: Mapping[int, BodyParams]) -> float:
+    """Mean IoU of the posed template and the masks in some training frames.
+
+    Raises:
+        InputError: nobody in these masks, or a template elsewhere.
+    """
+    values = []
+    for frame in spread(capture.splits.train_frames, CHECKED_FRAMES):
+        seen = [name for name in capture.splits.train_cameras if capture.file(name, frame) is not None]
+        views = read_views(capture, frame, spread(seen, CHECKED_CAMERAS))
+        if views:
+            posed = template.mesh.with_vertices(template.pose(params[frame])[0])
+            values.append(silhouette_overlap(posed, views))
+    if not values:
+        raise InputError(
+            f"masks of capture {capture.name}",
+            expected="a person in them",
+            received=f"masks that are zero in all of {CHECKED_FRAMES} frames",
+            remedy="look at them with `smplxpp capture check`",
+        )
+    return float(np.mean(values))
+
+
+def _digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
+    """SHA-256 of cameras, parameters, splits, and of the names and sizes of all files that training may read.
+
+    The content of the files is left out: a sequence has hundreds of gigabytes of them.
+    """
+    cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+    for name, camera in capture.cameras.items():
+        cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
+        cameras.update(f"{camera.width} {camera.height}".encode())
+    for frame, row in params.items():
+        numbers.update(str(frame).encode())
+        for array in ARRAY_NAMES:
+            numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
+    splits, used = capture.splits, 0
+    for camera, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
+        for kind in ("image", "mask", "normal"):
+            path = capture.file(camera, frame, kind)
+            if path is not None:
+                files.update(f"{kind} {camera} {frame} {path.name} {path.stat().st_size}\n".encode())
+                used += 1
+    return {
+        "capture/cameras": cameras.hexdigest(),
+        "capture/parameters": numbers.hexdigest(),
+        f"capture/names and sizes of {used} files": files.hexdigest(),
+        "capture/splits": hashlib.sha256(repr((splits, capture.recording.background)).encode()).hexdigest(),
+    }
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, GeometryWarning, stacklevel=3)

@@ -1,0 +1,175 @@
+"""What a training leaves in its stage: models, previews, figures, checks."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.data.sequence import AvatarSequence
+from avatar.data.views import read_view
+from avatar.metrics.speed import parameter_counts
+from avatar.metrics.view_quality import CONVENTION
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.models.student import Student
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
+from avatar.training.engine.memory import peak_memory
+from avatar.training.engine.metrics_log import read_metrics
+from avatar.training.student.compensate import CompensateConfig, CompensateTask
+from avatar.training.student.prune import pruned_to
+from avatar.training.train import PRETRAIN, TRACK
+from pipelines.figures.comparison import write_strip
+from pipelines.runs.checks import Check
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.build_config import COMPACT_STUDENT, STUDENT
+from pipelines.stages.train_names import KINDS, kind_name
+from smplxpp.capture import Capture
+
+BEFORE = {TRACK: "track_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
+"""Logs of what comes before a training, by its folder."""
+
+
+def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
+    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
+    background = capture.recording.background or (0.0, 0.0, 0.0)
+
+    def write(images: Mapping[str, np.ndarray]) -> None:
+        for name, image in images.items():
+            camera, frame = name.rsplit(" ", 1)
+            real = read_view(capture, camera, int(frame)).photograph(background)
+            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
+
+    return write
+
+
+def keep_logs(work: Path, folder: Path) -> None:
+    """Copy what a training has logged and shown into its stage; what came before it has metrics of its own."""
+    for name in ("previews", TENSORBOARD_FOLDER):
+        if (work / name).is_dir():
+            shutil.copytree(work / name, folder / name)
+    for part, name in (("", METRICS_FILE), *BEFORE.items()):
+        source = work / part / METRICS_FILE
+        if source.is_file():
+            shutil.copyfile(source, folder / name)
+
+
+def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
+    """Write a model; the number of its bytes."""
+    return {"bytes": {path.name: save_avatar(path, model)}}
+
+
+def write_student(
+    folder: Path,
+    student: Student,
+    sequence: AvatarSequence,
+    config: CompensateConfig,
+    *,
+    max_bytes: float | None,
+    options: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Write a student with blend shapes, whole and compact; bytes, and figures of the compact one read back.
+
+    Args:
+        max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
+        options: of a `ViewTask`.
+    """
+    name, compact = (Path(file).name for file in (STUDENT, COMPACT_STUDENT))
+    small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
+    bytes_of = {name: save_avatar(folder / name, student), compact: save_avatar(folder / compact, small, compact=True)}
+    # As a player has it: half precision, and without what was pruned.
+    stored = load_avatar(folder / compact, sequence.rig)
+    quiet = {**options, "preview": lambda images: None}
+    figures = CompensateTask(sequence, stored, config, **quiet).evaluate(config.iterations)
+    measured = {kind: figures[kind] for kind in KINDS if kind in figures}
+    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
+
+
+def stage_output(
+    folder: Path,
+    model: TeacherAvatar | Student,
+    done: Progress,
+    sequence: AvatarSequence,
+    numbers: Mapping[str, Any],
+    *,
+    overlap: float,
+) -> StageOutput:
+    """Numbers and checks of a stage whose logs are in `folder`.
+
+    Args:
+        done: where training ended. numbers: of the files that were written.
+        overlap: of the template and the masks.
+    """
+    evaluations = [line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation"]
+    # None while tracking or pretraining: nothing of the training itself has been measured.
+    start, end = (evaluations[0], evaluations[-1]) if evaluations else ({}, {})
+    before = {part: read_metrics(folder / name) for part, name in BEFORE.items()}
+    seconds = {part: lines[-1]["seconds"] if lines else 0.0 for part, lines in before.items()}
+    held_out = bool(sequence.capture.splits.novel_view_cameras)
+    found = {kind: end[kind] for kind in KINDS if kind in end}
+    everything = {
+        **numbers,
+        "gaussians": len(model.gaussians),
+        "parameters": parameter_counts(model),
+        "iterations": done.iterations,
+        "iterations_done": done.iteration,
+        "finished": done.finished,
+        "seconds_of_steps": done.seconds,
+        "iterations_per_second": done.iteration / done.seconds if done.seconds else 0.0,
+        "peak_memory": peak_memory(str(sequence.device)),
+        "training_frames": len(sequence.train_frames),
+        "training_cameras": len(sequence.train_cameras),
+        "held_out_cameras": held_out,
+        "convention": CONVENTION,
+        "seconds_of_tracking": seconds[TRACK],
+        "seconds_of_pretraining": seconds[PRETRAIN],
+        "iterations_before": sum(lines[-1]["iteration"] for lines in before.values() if lines),
+        "measured_at": end.get("iteration"),
+        "start": {kind: start[kind] for kind in KINDS if kind in start},
+        **found,
+    }
+    return StageOutput(_checks(everything, overlap), everything)
+
+
+def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
+    checks = [
+        Check(
+            "template's silhouette on the masks",
+            overlap,
+            "IoU",
+            0.95,
+            0.8,
+            higher_is_better=True,
+            explanation="mean over some training views; low: another pose, or other cameras",
+        ),
+    ]
+    for kind, gates in (("novel_view", (22.0, 16.0)), ("novel_pose", (20.0, 14.0))):
+        if kind not in numbers:
+            continue
+        name, figures = kind_name(kind, held_out=numbers["held_out_cameras"]), numbers[kind]
+        checks += [
+            Check(f"{name}: PSNR of the person", figures["psnr"], "dB", *gates, higher_is_better=True),
+            Check(f"{name}: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
+        ]
+        if kind in numbers["start"]:
+            gain = figures["psnr"] - numbers["start"][kind]["psnr"]
+            checks.append(Check(f"{name}: gain of PSNR since the start", gain, "dB", 0.0, -1.0, higher_is_better=True))
+        if kind in numbers.get("compact", {}):
+            loss = figures["psnr"] - numbers["compact"][kind]["psnr"]
+            checks.append(Check(f"{name}: PSNR lost in the compact file", loss, "dB", 0.3, 2.0))
+    done = numbers["iterations_done"] / numbers["iterations"]
+    checks.append(
+        Check(
+            "iterations done",
+            done,
+            "",
+            1.0,
+            0.0,
+            higher_is_better=True,
+            explanation="below 1: the limit of time ended it; the same command goes on",
+        )
+    )
+    return checks

@@ -1,0 +1,123 @@
+"""Stage 65: the template against the scan it came from, and under poses that try its skinning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.runs.arrays import save_arrays
+from pipelines.runs.checks import Check
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.build_config import BuildConfig, BuildInputs
+from pipelines.stages.scan import MM, load_params_of_run, load_scan
+from pipelines.stages.template import load_parts
+from smplxpp.body import load_body, load_params
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.metrics import (
+    CompareConfig,
+    directed_distances,
+    mesh_quality,
+    point_to_surface,
+    stretch_report,
+    summarize,
+)
+from smplxpp.metrics.conventions import convention_named
+from smplxpp.template.template import Template
+
+MOTION_FRAMES = 12
+
+
+def validate(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) -> StageOutput:
+    """65: distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
+    template = Template.load(run / "60_assemble" / "smplxpp.npz")
+    scan, _, _ = load_scan(run)
+    with np.load(run / "20_segment" / "labels.npz") as labels:
+        face_labels = labels["face_labels"]
+    reference = load_params_of_run(run)
+    posed = template.mesh.with_vertices(template.pose(reference)[0])
+    checks, numbers = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, config)
+    quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
+    numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
+    flips = _flips(template, posed, run)
+    checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
+    poses = {"hard poses": hard_poses(reference)}
+    if inputs.motion is not None:
+        motion = load_params(inputs.motion, body=load_body(inputs.body))
+        poses["motion"] = motion.select(np.unique(np.linspace(0, len(motion) - 1, MOTION_FRAMES).round().astype(int)))
+    for title, params in poses.items():
+        names = list(HARD_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]
+        numbers[title], worst = _stretch(template, params, names)
+        checks.append(
+            Check(f"edge stretch p99.9, {title}", worst, "x", 3.0, 10.0, explanation="the worst part and pose")
+        )
+    return StageOutput(checks, numbers)
+
+
+def _against_scan(
+    folder: Path,
+    posed: TriangleMesh,
+    vertex_labels: np.ndarray,
+    scan: TriangleMesh,
+    face_labels: np.ndarray,
+    config: BuildConfig,
+) -> tuple[list[Check], dict]:
+    common = {"samples": config.samples, "seed": config.seed, "config": CompareConfig(visible_only=True)}
+    forth = directed_distances(posed, scan, source_labels=vertex_labels, target_labels=face_labels, **common)
+    back = directed_distances(scan, posed, source_labels=face_labels, target_labels=vertex_labels, **common)
+    result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0)
+    save_arrays(
+        folder / "errors.npz",
+        {
+            name: {"distance_mm": (d.distance * MM).astype(np.float32), "label": d.label.astype(np.int8)}
+            for name, d in (("template_to_scan", forth), ("scan_to_template", back))
+        },
+    )
+    checks = []
+    for label in LABELS:
+        found = result.labels.get(label.name)
+        if found is None or found.pred_to_gt is None or label == SKIN:
+            continue
+        warn, fail = ((1.0, 3.0), (2.0, 6.0)) if label in CLOTH_LABELS else ((2.0, 6.0), (5.0, 15.0))
+        checks += [
+            Check(f"template to scan, {label.name}: mean", found.pred_to_gt.mean, "mm", warn[0], fail[0]),
+            Check(f"template to scan, {label.name}: p95", found.pred_to_gt.p95, "mm", warn[1], fail[1]),
+        ]
+    skin = face_labels == SKIN.id
+    if skin.any():
+        points = scan.vertices[np.unique(scan.faces[skin])]
+        fit = float(point_to_surface(points, posed)[0].mean() * MM)
+        checks.append(
+            Check("scan's skin to the template: mean", fit, "mm", 5.0, 15.0, explanation="how well the body was fitted")
+        )
+    return checks, {"template_vs_scan": result.as_dict()}
+
+
+def _flips(template: Template, posed: TriangleMesh, run: Path) -> int:
+    """Faces of the posed template's parts that face away from where they faced on the cleaned scan."""
+    part_of_face = template.vertex_part[template.faces[:, 0]]
+    turned = 0
+    for name, (mesh, _) in load_parts(run).items():
+        there = posed.submesh(part_of_face == template.part_names.index(name))[0]
+        turned += int((np.einsum("ij,ij->i", mesh.face_cross, there.face_cross) < 0).sum())
+    return turned
+
+
+def _stretch(template: Template, params: BodyParams, names: list[str]) -> tuple[dict, float]:
+    """Edge stretch of each worn part in each pose, and the largest p99.9."""
+    vertices = template.pose(params)
+    out: dict[str, dict] = {}
+    for part in template.part_names:
+        if part == "body":
+            continue
+        chosen = template.vertex_part[template.faces[:, 0]] == template.part_names.index(part)
+        rest = template.mesh.submesh(chosen)[0]
+        used = np.unique(template.faces[chosen])
+        out[part] = {
+            name: stretch_report(rest, rest.with_vertices(vertices[k][used])).as_dict() for k, name in enumerate(names)
+        }
+    worst = max((pose["p999"] for poses in out.values() for pose in poses.values()), default=1.0)
+    return out, worst

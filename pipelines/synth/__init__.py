@@ -1,0 +1,1 @@
+"""The synthetic capture: performance, cloth dynamics (XPBD), soft light, files."""

@@ -1,0 +1,69 @@
+"""Cameras on rings around the person, with close-ups of the face; which of them are held out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from smplxpp.capture.writers.cameras import BODY, FACE, RigCamera
+from smplxpp.core.camera import Camera
+
+# Height of the ring's cameras over the floor, in turns (metres), and their distance.
+_HEIGHTS = (1.05, 1.75, 0.55)
+_BODY_DISTANCE, _FACE_DISTANCE = 3.4, 1.15
+_FACE_AZIMUTHS = (-6.0, 44.0)  # degrees to the subject's left: she turns that way
+_MARGIN = 1.06
+
+
+def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, seed: int) -> list[RigCamera]:
+    """`count` cameras that see the person in every frame.
+
+    Args:
+        points: (P, 3) what body cameras must hold: the person over all frames.
+        heads: (Q, 3) what face cameras must hold: the head over all frames.
+        count: of cameras; from four on two of them look at the face.
+        size: height of body images in pixels; they are 4/5 as wide, face images square, 3/4 as high.
+        seed: of small irregularities of places and principal points.
+    """
+    rng = np.random.default_rng([seed, 3])
+    faces = 2 if count >= 4 else 0
+    bodies = count - faces
+    held_out = set(_spread(bodies, max(1, round(bodies / 6)))) if bodies >= 4 else set()
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    width = max(8, round(size * 0.8 / 8) * 8)
+    rig = []
+    for k in range(bodies):
+        azimuth = np.radians(360.0 * k / bodies + rng.uniform(-4, 4))
+        height = _HEIGHTS[k % len(_HEIGHTS)] + rng.uniform(-0.08, 0.08)
+        eye = middle + _BODY_DISTANCE * np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
+        eye[1] = height
+        camera = _fitted(eye, middle, points, (width, size), rng, f"Cam{k + 1:03d}")
+        rig.append(RigCamera(camera, BODY, k in held_out))
+    head = 0.5 * (heads.min(axis=0) + heads.max(axis=0))
+    square = max(8, round(size * 0.75 / 8) * 8)
+    for k in range(faces):
+        azimuth = np.radians(_FACE_AZIMUTHS[k] + rng.uniform(-3, 3))
+        eye = head + _FACE_DISTANCE * np.array([np.sin(azimuth), rng.uniform(-0.06, 0.1), np.cos(azimuth)])
+        rig.append(RigCamera(_fitted(eye, head, heads, (square, square), rng, f"Face{k + 1}"), FACE, False))
+    return rig
+
+
+def _spread(count: int, chosen: int) -> list[int]:
+    """`chosen` of `count` places on a ring, evenly; not the first, which looks at the front."""
+    return [int((j + 0.5) * count / chosen) for j in range(chosen)]
+
+
+def _fitted(
+    eye: np.ndarray, target: np.ndarray, points: np.ndarray, size: tuple[int, int], rng: np.random.Generator, name: str
+) -> Camera:
+    """A camera whose image just holds `points`, its principal point a little off the middle."""
+    width, height = size
+    camera = Camera.look_at(eye=eye, target=target, fov_y_deg=40.0, width=width, height=height)
+    cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    slope = cam[:, :2] / cam[:, 2:]
+    low, high = slope.min(axis=0), slope.max(axis=0)
+    focal = float(np.min(np.array([width, height]) / (_MARGIN * (high - low))))
+    center = np.array([width, height]) / 2 - focal * 0.5 * (low + high) + rng.uniform(-1, 1, 2)
+    K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1.0]])
+    return replace(camera, K=K, name=name)

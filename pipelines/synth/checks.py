@@ -1,0 +1,71 @@
+"""What was made, in figures: skinning, cloth, contact, silhouettes, the scan."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.synth.contact import depths
+from pipelines.synth.person import PART_NAMES, Person
+from pipelines.synth.scan_simulation import SimulatedScan
+from pipelines.synth.simulate import Take
+from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.params import BodyParams
+from smplxpp.core.signed_distance import SignedDistanceField
+
+_MM = 1e3
+_GARMENTS = ("upper", "lower")
+
+
+def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, float]:
+    """Body against skinning, cloth against skinning, strain of free edges, depth in the body, the tracker's error."""
+    count = person.body.vertex_count
+    posed = person.body.forward(take.params).vertices
+    moved = row_lengths((take.vertices - take.skinned).reshape(-1, 3)).reshape(take.vertices.shape[:2])
+    tracked = person.body.forward(noisy).vertices
+    out = {
+        "body_vs_skinning_max_mm": _MM * float(np.abs(posed - take.vertices[:, :count]).max()),
+        "tracker_error_mean_mm": _MM * float(row_lengths((tracked - posed).reshape(-1, 3)).mean()),
+    }
+    for name in (*_GARMENTS, "hair"):
+        own = person.vertex_part == PART_NAMES.index(name)
+        out[f"{name}_vs_skinning_mean_mm"] = _MM * float(moved[:, own].mean())
+    bodies = [TriangleMesh(vertices[:count], person.body.faces) for vertices in take.vertices]
+    for name in _GARMENTS:
+        own = person.vertex_part == PART_NAMES.index(name)
+        depth = np.stack([depths(body, frame[own]) for body, frame in zip(bodies, take.vertices, strict=True)])
+        strain = free_edge_strain(person, take, name)
+        out |= {
+            f"{name}_depth_max_mm": _MM * float(depth.max()),
+            f"{name}_vertices_deeper_1mm_percent": 100 * float((depth > 1e-3).mean()),
+            f"{name}_strain_p99_percent": 100 * float(np.percentile(np.abs(strain), 99)),
+        }
+    return out
+
+
+def free_edge_strain(person: Person, take: Take, garment: str) -> np.ndarray:
+    """(T, E) relative change of length, against frame 0's skinned layer, of edges whose ends both are free cloth."""
+    mesh, used = person.tpose.submesh(person.face_part == PART_NAMES.index(garment))
+    edges = used[mesh.edges]
+    edges = edges[(take.attachment[edges] < 1.0).all(axis=1)]
+
+    def lengths(vertices: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(vertices[..., edges[:, 0], :] - vertices[..., edges[:, 1], :], axis=-1)
+
+    return lengths(take.vertices) / lengths(take.skinned[0]) - 1.0
+
+
+def scan_checks(reference: TriangleMesh, scan: SimulatedScan) -> dict[str, float]:
+    """The scan against the layers that it shows."""
+    shown = np.einsum("pk,pkx->px", scan.barycentric, reference.triangles[scan.face])
+    distance = row_lengths(scan.mesh.vertices - shown) * _MM
+    inside = SignedDistanceField(scan.mesh, solid=True).query(shown[distance < 5]).distance
+    counts = scan.mesh.edges_with_counts[1]
+    return {
+        "scan_to_layers_mean_mm": float(distance.mean()),
+        "scan_to_layers_p99_mm": float(np.percentile(distance, 99)),
+        "layers_to_scan_mean_signed_mm": float(inside.mean() * _MM),
+        "scan_vertices_webbed_percent": float(100 * (distance > 5).mean()),
+        "scan_faces": scan.mesh.face_count,
+        "scan_open_edges": int((counts == 1).sum()),
+        "scan_nonmanifold_edges": int((counts > 2).sum()),
+    }

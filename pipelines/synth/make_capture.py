@@ -1,0 +1,246 @@
+"""Make a synthetic capture with moving cloth from the fixture person: one call, seeded, any size."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.synth.camera_rig import camera_rig
+from pipelines.synth.checks import scan_checks, take_checks
+from pipelines.synth.hidden import hidden_faces
+from pipelines.synth.motion import Performance, tracker_noise
+from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
+from pipelines.synth.person_file import load_person
+from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
+from pipelines.synth.simulate import SimulationConfig, Take, simulate
+from pipelines.synth.soft_light import LightConfig, vertex_light
+from pipelines.synth.views import LitFrame, View, normal_map, render_view
+from smplxpp.capture.writers.arrays import rounded, save_compact
+from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
+from smplxpp.capture.writers.images import write_gray_png, write_jpeg, write_normal_png
+from smplxpp.core.atomic import atomic_folder, atomic_write_text
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_io import write_ply
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, float], None]
+_NOVEL_POSE_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """What to make.
+
+    Attributes:
+        cameras: how many; from four on two of them are close-ups of the face.
+        frames, fps: of the performance.
+        size: height of body images in pixels.
+        seed: of the performance, the cameras, the tracker's and the scan's noise.
+        layout: "simple" is ours, with everything; "actorshq" holds images, masks and cameras in ActorsHQ's folders.
+        supersampling: samples a pixel along each axis.
+        quality: of JPEG files.
+        truth_step, normals_step: truth meshes and normal maps of every n-th frame.
+        scan_faces: of the reference frame's scan; 0 makes none.
+        simulation, light: see there; `simulation.fps` is replaced by `fps`.
+
+    Raises:
+        InputError: numbers below 1, images too small, an unknown layout.
+    """
+
+    cameras: int = 12
+    frames: int = 24
+    fps: float = 10.0
+    size: int = 640
+    seed: int = 0
+    layout: Literal["simple", "actorshq"] = "simple"
+    supersampling: int = 3
+    quality: int = 95
+    truth_step: int = 1
+    normals_step: int = 1
+    scan_faces: int = 80_000
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+    light: LightConfig = field(default_factory=LightConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("cameras", "frames", "supersampling", "truth_step", "normals_step"):
+            if getattr(self, name) < 1:
+                raise InputError(
+                    f"--{name.replace('_', '-')}", expected="at least 1", received=str(getattr(self, name))
+                )
+        if self.size < 16:
+            raise InputError("--size", expected="at least 16 pixels", received=str(self.size))
+        if not self.fps > 0:
+            raise InputError("--fps", expected="more than 0", received=str(self.fps))
+        if self.layout not in ("simple", "actorshq"):
+            raise InputError("--layout", expected="simple or actorshq", received=repr(self.layout))
+
+
+def make_capture(
+    out: Path, topology_file: Path, config: SynthConfig, *, progress: Progress = lambda what, share: None
+) -> dict[str, float]:
+    """Write a capture to the folder `out`, whole or not at all; what stands there is replaced.
+
+    Args:
+        out: folder of the capture.
+        topology_file: the person's layers, `geometry/topology.npz` of the fixture.
+        config: what to make.
+        progress: called with the name of the work under way and its share done.
+
+    Returns:
+        Figures about what was made, as in `checks.json`.
+
+    Raises:
+        InputError: no person there.
+    """
+    person = load_person(topology_file)
+    performance = Performance(
+        betas=person.betas,
+        expression_names=person.body.expression_names,
+        seconds=(config.frames - 1) / config.fps,
+        seed=config.seed,
+    )
+    simulation = replace(config.simulation, fps=config.fps)
+    take = simulate(person, performance, config.frames, simulation, lambda share: progress("cloth", share))
+    take = replace(take, vertices=rounded(take.vertices))
+    rig = _rig(person, take, config)
+    noisy = tracker_noise(take.params, seed=config.seed + 3)
+    checks = take_checks(person, take, noisy)
+    with atomic_folder(out) as root:
+        if config.layout == "actorshq":
+            sequence = root / "Actor01" / "Sequence1"
+            # The name under which fitted parameters lie beside ActorsHQ's scales.
+            images, params = sequence / "1x", sequence / "smpl_params.npz"
+            boxes = np.stack([take.vertices.min(axis=1), take.vertices.max(axis=1)], axis=1)
+            write_actorshq_scene(sequence, boxes, config.fps)
+        else:
+            images, params = root, root / "params" / "params.npz"
+        write_calibration_csv(images / "calibration.csv", rig)
+        take.params.save(params)
+        noisy.save(params.with_stem(f"{params.stem}_noisy"))
+        hidden = hidden_faces(person, take.vertices[0])
+        if config.layout == "simple":
+            write_cameras_json(root / "cameras.json", rig)
+            _write_geometry(root / "geometry", topology_file, take, hidden, config)
+            if config.scan_faces:
+                progress("scan", 0.0)
+                checks |= _write_scan(root / "scans", person, take, config)
+                progress("scan", 1.0)
+            atomic_write_text(root / "manifest.json", json.dumps(_manifest(out, rig, config), indent=1) + "\n")
+            atomic_write_text(root / "checks.json", json.dumps(checks, indent=1) + "\n")
+        _write_views(images, person, take, rig, (hidden, config, progress))
+    return checks
+
+
+def split_frames(frames: int) -> tuple[int, int]:
+    """Frames [0, n) for training and [n, frames) held out: the last fifth, none of a take shorter than five."""
+    novel = int(_NOVEL_POSE_SHARE * frames)
+    return frames - novel, novel
+
+
+def _rig(person: Person, take: Take, config: SynthConfig) -> list[RigCamera]:
+    hair = person.vertex_part == PART_NAMES.index("hair")
+    rig = camera_rig(
+        take.vertices[:, ::5].reshape(-1, 3),
+        take.vertices[:, hair].reshape(-1, 3),
+        count=config.cameras,
+        size=config.size,
+        seed=config.seed,
+    )
+    if config.layout == "simple":
+        return rig
+    # ActorsHQ numbers all its cameras alike.
+    return [replace(item, camera=replace(item.camera, name=f"Cam{k + 1:03d}")) for k, item in enumerate(rig)]
+
+
+def _write_geometry(folder: Path, topology_file: Path, take: Take, hidden: np.ndarray, config: SynthConfig) -> None:
+    with np.load(topology_file, allow_pickle=False) as data:
+        arrays = {name: data[name] for name in data.files}
+    arrays |= {"face_hidden": hidden, "pin": take.attachment.astype(np.float32)}
+    save_compact(folder / "topology.npz", arrays)
+    for frame in range(0, config.frames, config.truth_step):
+        arrays = {"verts": take.vertices[frame].astype(np.float32)}
+        save_compact(folder / f"frame_{frame:06d}.npz", arrays)
+
+
+def _write_scan(folder: Path, person: Person, take: Take, config: SynthConfig) -> dict[str, float]:
+    reference = TriangleMesh(take.vertices[0], person.tpose.faces)
+    sheets = [person.face_part == part for part in range(1, len(PART_NAMES))]
+    scan = simulate_scan(reference, sheets, ScanConfig(faces=config.scan_faces, seed=config.seed + 3))
+    part, label, colors = _scan_attributes(person, scan)
+    write_ply(folder / "scan_000000.ply", scan.mesh, vertex_colors=colors)
+    save_compact(folder / "scan_000000_labels.npz", {"label": label, "part": part})
+    return scan_checks(reference, scan)
+
+
+def _scan_attributes(person: Person, scan: SimulatedScan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Part (N,), label (N,) and colour (N, 3) of each scan vertex: of the point of the layers that it shows."""
+    corners = person.tpose.faces[scan.face]
+    rest = np.einsum("pk,pkx->px", scan.barycentric, person.tpose.vertices[corners])
+    nearest = corners[np.arange(len(corners)), np.argmax(scan.barycentric, axis=1)]
+    shown, label = person.face_part[scan.face], person.vertex_label[nearest]
+    colors = person.colors(rest, shown, label)
+    part = merge_islands(scan.mesh, shown)
+    return part, np.where(part == shown, label, PART_LABELS[part]), colors
+
+
+def _write_views(
+    root: Path, person: Person, take: Take, rig: list[RigCamera], rest: tuple[np.ndarray, SynthConfig, Progress]
+) -> None:
+    hidden, config, progress = rest
+    shown = np.flatnonzero(~hidden)
+    faces = person.tpose.faces[shown]
+    for frame in range(config.frames):
+        mesh = TriangleMesh(take.vertices[frame], faces)
+        lit = LitFrame(mesh, shown, vertex_light(mesh, config.light))
+
+        def one(item: RigCamera, lit: LitFrame = lit, frame: int = frame) -> None:
+            view = render_view(person, lit, item.camera, supersampling=config.supersampling)
+            _write_view(root, item.camera.name, frame, view, config)
+            if config.layout == "simple" and frame % config.normals_step == 0:
+                path = _view_path(root, "normals", "normal", item.camera.name, frame, "png")
+                write_normal_png(path, normal_map(lit, item.camera))
+
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(one, rig))
+        progress("views", (frame + 1) / config.frames)
+
+
+def _write_view(root: Path, camera: str, frame: int, view: View, config: SynthConfig) -> None:
+    write_jpeg(_view_path(root, "rgbs", "rgb", camera, frame, "jpg"), view.image, quality=config.quality)
+    write_gray_png(_view_path(root, "masks", "mask", camera, frame, "png"), view.mask)
+    if config.layout == "simple":
+        write_gray_png(_view_path(root, "labels", "label", camera, frame, "png"), view.labels)
+
+
+def _view_path(root: Path, folder: str, tag: str, camera: str, frame: int, suffix: str) -> Path:
+    return root / folder / camera / f"{camera}_{tag}{frame:06d}.{suffix}"
+
+
+def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:
+    train, novel = split_frames(config.frames)
+    everything, normals = list(range(config.frames)), list(range(0, config.frames, config.normals_step))
+    names = [item.camera.name for item in rig]
+    splits = {"train_frames": [0, train - 1]} | ({"novel_pose_frames": [train, config.frames - 1]} if novel else {})
+    return {
+        "name": out.name,
+        "frames": config.frames,
+        "fps": config.fps,
+        "seed": config.seed,
+        "background": [0, 0, 0],
+        "label_set": "capture",
+        **splits,
+        "train_views": [item.camera.name for item in rig if not item.novel],
+        "novel_views": [item.camera.name for item in rig if item.novel],
+        "truth_frames": list(range(0, config.frames, config.truth_step)),
+        **{kind: dict.fromkeys(names, everything) for kind in ("images", "masks", "labels")},
+        "normals": dict.fromkeys(names, normals),
+    }

@@ -1,0 +1,261 @@
+"""The fixture person's performance: gestures, talking, a turn with steps; and a tracker's noise on it.
+
+A performance is a smooth curve through key poses, defined at every instant, so that cloth can be simulated at a finer
+step than the frames'. It starts from a relaxed A-pose with a neutral face, at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.core.params import POSE_BLOCKS, BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+
+# Degrees a joint, axis-angle in the T-pose's world axes (x to the subject's left, y up, z to the front); fingers bend
+# by one number a hand. What a pose does not name stays relaxed.
+_RELAXED = {
+    "left_collar": (0, 0, -4),
+    "right_collar": (0, 0, 4),
+    "left_shoulder": (0, -6, -46),
+    "right_shoulder": (0, 6, 46),
+    "left_elbow": (0, -14, 0),
+    "right_elbow": (0, 14, 0),
+}
+_FINGERS = {"left_fingers": 12.0, "right_fingers": 12.0}
+_POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
+    "relaxed": {},
+    "explain": {  # both hands before the belly
+        "left_shoulder": (10, -40, -52),
+        "right_shoulder": (10, 40, 52),
+        "left_elbow": (-20, -70, 10),
+        "right_elbow": (-10, 55, -5),
+        "head": (5, 10, 0),
+        "left_wrist": (25, 0, 0),
+        "right_wrist": (30, 0, 0),
+        "left_fingers": 22.0,
+        "right_fingers": 6.0,
+    },
+    "stress": {  # the hands part and fall a little, weight on one leg
+        "left_shoulder": (16, -30, -46),
+        "right_shoulder": (16, 30, 46),
+        "spine1": (0, 0, 3),
+        "pelvis": (0, 4, -2),
+        "left_elbow": (-20, -60, 6),
+        "right_elbow": (-14, 66, -6),
+        "head": (-3, -6, 2),
+        "left_wrist": (45, 0, 0),
+        "right_wrist": (45, 0, 0),
+        "left_fingers": 4.0,
+        "right_fingers": 16.0,
+    },
+    "step": {  # turning to the left on the right foot
+        "pelvis": (0, 34, 0),
+        "left_hip": (-36, 10, 3),
+        "left_knee": (46, 0, 0),
+        "right_hip": (8, -12, 0),
+        "left_ankle": (-6, 0, 0),
+        "spine2": (0, 6, 0),
+        "head": (0, 18, 0),
+        "right_shoulder": (0, 26, 50),
+        "left_shoulder": (0, 8, -48),
+        "right_elbow": (0, 30, 0),
+    },
+    "turned": {
+        "pelvis": (0, 62, 0),
+        "left_hip": (-12, 8, 2),
+        "left_knee": (10, 0, 0),
+        "right_hip": (12, -16, 0),
+        "right_knee": (6, 0, 0),
+        "right_ankle": (-14, 0, 0),
+        "spine2": (0, -6, 0),
+        "head": (0, -12, 0),
+        "left_shoulder": (0, -30, -40),
+        "left_elbow": (0, -40, 0),
+        "right_shoulder": (0, 20, 50),
+    },
+    "point": {  # to her left, looking there
+        "pelvis": (0, 48, 0),
+        "left_shoulder": (0, -25, -10),
+        "left_elbow": (0, -10, 0),
+        "head": (0, 26, 0),
+        "spine3": (0, 12, 0),
+        "neck": (0, 8, 0),
+        "left_fingers": 3.0,
+    },
+    "twist": {  # back to the right
+        "pelvis": (0, 10, 0),
+        "spine1": (0, -12, 0),
+        "spine2": (0, -16, 0),
+        "spine3": (0, -12, 0),
+        "head": (0, -15, 0),
+        "left_shoulder": (0, -45, -40),
+        "right_shoulder": (0, -15, 50),
+        "right_hip": (-14, 0, 0),
+        "right_knee": (20, 0, 0),
+    },
+    "overhead": {
+        "left_collar": (0, 0, 18),
+        "right_collar": (0, 0, -18),
+        "left_shoulder": (0, 0, 50),
+        "right_shoulder": (0, 0, -50),
+        "left_elbow": (0, -8, 8),
+        "right_elbow": (0, 8, -8),
+        "head": (-8, 0, 0),
+    },
+}
+# Seconds and poses of the opening; a longer performance goes on with poses drawn at random.
+_SCRIPT = (
+    (0.0, "relaxed"),
+    (0.4, "explain"),
+    (0.75, "stress"),
+    (1.15, "step"),
+    (1.6, "turned"),
+    (2.3, "twist"),
+    (2.9, "overhead"),
+    (3.6, "point"),
+)
+_PAUSE = (0.5, 0.8)  # seconds between poses drawn at random
+
+# Shapes of the mouth while she talks, and looks of the rest of the face; the jaw turns with `jawOpen` as well.
+_VISEMES: tuple[dict[str, float], ...] = (
+    {"jawOpen": 0.30, "mouthLowerDownLeft": 0.3, "mouthLowerDownRight": 0.3},
+    {"jawOpen": 0.10, "mouthFunnel": 0.5, "mouthPucker": 0.2},
+    {"mouthPressLeft": 0.4, "mouthPressRight": 0.4, "mouthRollLower": 0.2},
+    {"jawOpen": 0.42, "mouthStretchLeft": 0.2, "mouthStretchRight": 0.2},
+    {"jawOpen": 0.08, "mouthSmileLeft": 0.6, "mouthSmileRight": 0.55, "cheekSquintLeft": 0.3, "cheekSquintRight": 0.3},
+    {"jawOpen": 0.18, "mouthPucker": 0.6},
+    {"jawOpen": 0.22, "mouthUpperUpLeft": 0.25, "mouthUpperUpRight": 0.25, "mouthDimpleLeft": 0.2},
+)
+_LOOKS: tuple[dict[str, float], ...] = (
+    {},
+    {"browInnerUp": 0.5},
+    {"browOuterUpLeft": 0.5, "browOuterUpRight": 0.5, "eyeWideLeft": 0.2, "eyeWideRight": 0.2},
+    {"browDownLeft": 0.4, "browDownRight": 0.4, "eyeSquintLeft": 0.25, "eyeSquintRight": 0.25},
+)
+_JAW_DEGREES = 9.0  # at jawOpen = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Performance:
+    """What the person does, as a function of time.
+
+    Attributes:
+        betas: (B,) shape.
+        expression_names: names of the E expressions.
+        seconds: how long it lasts; later instants hold the last pose.
+        seed: of timing, sizes of gestures, words and blinks.
+    """
+
+    betas: np.ndarray
+    expression_names: tuple[str, ...]
+    seconds: float
+    seed: int = 0
+
+    def at(self, times: np.ndarray, *, fps: float | None = None) -> BodyParams:
+        """Parameters at `times` (T,) in seconds; transl is zero, `fps` is stored as it is given."""
+        t = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
+        pose, expression = self._poses(t), np.clip(self._faces(t), 0.0, 1.0)
+        pose = pose + self._sway(t)
+        pose[:, SMPLX_JOINTS.index("jaw"), 0] += (
+            np.radians(_JAW_DEGREES) * expression[:, self.expression_names.index("jawOpen")]
+        )
+        return BodyParams.from_full_pose(
+            pose,
+            betas=np.repeat(self.betas[None], len(t), axis=0),
+            expression=expression,
+            transl=np.zeros((len(t), 3)),
+            fps=fps,
+        )
+
+    @cached_property
+    def _poses(self) -> CubicSpline:
+        """(T,) -> (T, 55, 3) radians, at rest at both ends."""
+        rng = np.random.default_rng(self.seed)
+        times, names = map(list, zip(*_SCRIPT, strict=True))
+        while times[-1] < self.seconds + 1.0:
+            times.append(times[-1] + rng.uniform(*_PAUSE))
+            names.append(rng.choice([name for name in _POSES if name != names[-1]]))
+        keys = np.stack([_pose(_RELAXED | _FINGERS | _POSES[name]) for name in names])
+        relaxed = keys[0]
+        size = rng.uniform(0.9, 1.1, size=(len(keys), 1, 1))
+        late = rng.uniform(-0.04, 0.04, len(times)) * (np.array(times) > 0)
+        return CubicSpline(np.array(times) + late, relaxed + size * (keys - relaxed), bc_type="clamped")
+
+    @cached_property
+    def _faces(self) -> PchipInterpolator:
+        """(T,) -> (T, E): words at about five a second, looks, blinks; monotone between keys, so within [0, 1]."""
+        rng = np.random.default_rng([self.seed, 1])
+        times = np.concatenate([[0.0], 0.12 + np.cumsum(rng.uniform(0.13, 0.26, int(self.seconds / 0.13) + 8))])
+        values = np.zeros((len(times), len(self.expression_names)))
+        look: dict[str, float] = {}
+        for k in range(1, len(times)):
+            if k % 3 == 1:
+                look = _LOOKS[rng.integers(len(_LOOKS))]
+            closed = {"eyeBlinkLeft": 0.95, "eyeBlinkRight": 0.95} if rng.uniform() < 0.12 else {}
+            word = _VISEMES[rng.integers(len(_VISEMES))]
+            for name, amount in (word | look | closed).items():
+                values[k, self.expression_names.index(name)] = amount * rng.uniform(0.8, 1.05)
+        return PchipInterpolator(times, values)
+
+    def _sway(self, t: np.ndarray) -> np.ndarray:
+        """(T, 55, 3) radians: breath, small movements of the head and the eyes; none at the start."""
+        rng = np.random.default_rng([self.seed, 2])
+        out = np.zeros((len(t), len(SMPLX_JOINTS), 3))
+        sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
+        for name, degrees in sizes.items():
+            out[:, SMPLX_JOINTS.index(name)] = np.radians(degrees) * _wander(t, rng, hertz=1.1)
+        gaze = np.radians(2.5) * _wander(t, rng, hertz=1.6)
+        gaze[:, 2] = 0.0
+        for name in ("left_eye_smplhf", "right_eye_smplhf"):
+            out[:, SMPLX_JOINTS.index(name)] = gaze
+        return out * (1.0 - np.exp(-((t / 0.3) ** 2)))[:, None, None]
+
+
+def _wander(t: np.ndarray, rng: np.random.Generator, *, hertz: float) -> np.ndarray:
+    """(T, 3) smooth, of about unit size: a few sines an axis."""
+    frequency = hertz * rng.uniform(0.4, 1.6, size=(4, 3))
+    phase = rng.uniform(0, 2 * np.pi, size=(4, 3))
+    return np.sin(2 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) / np.sqrt(2.0)
+
+
+def tracker_noise(
+    params: BodyParams,
+    *,
+    seed: int,
+    degrees: float = 1.5,
+    transl: float = 0.008,
+    expression: float = 0.04,
+    betas: float = 0.12,
+) -> BodyParams:
+    """Parameters as a tracker would give them; standard deviations of each joint's turn about each axis, of each
+    coordinate in metres (half white, half slow), of expression weights, and of one constant offset of betas."""
+    rng = np.random.default_rng(seed)
+    count = len(params)
+    turns = matrix_from_rotvec(rng.normal(0, np.radians(degrees), (count, len(SMPLX_JOINTS), 3)))
+    pose = rotvec_from_matrix(turns @ matrix_from_rotvec(params.full_pose))
+    phase = rng.uniform(0, 2 * np.pi, 3) + 2 * np.pi * np.arange(count)[:, None] / max(count, 2)
+    slow, white = np.sin(phase) * np.sqrt(2), rng.normal(size=(count, 3))
+    blocks = BodyParams.from_full_pose(
+        pose,
+        betas=params.betas + rng.normal(0, betas, params.betas.shape[1]),
+        expression=np.clip(params.expression + rng.normal(0, expression, params.expression.shape), 0, 1),
+        transl=params.transl + transl * np.sqrt(0.5) * (slow + white),
+    )
+    return replace(params, **blocks.as_dict())
+
+
+def _pose(degrees: dict[str, tuple[float, float, float] | float]) -> np.ndarray:
+    """(55, 3) axis-angle in radians."""
+    pose = np.zeros((sum(joints for _, joints in POSE_BLOCKS), 3))
+    for j, name in enumerate(SMPLX_JOINTS):
+        if name[-1].isdigit() and not name.startswith("spine") and "thumb" not in name:
+            pose[j, 2] = -degrees["left_fingers"] if name.startswith("left") else degrees["right_fingers"]
+    for name, angles in degrees.items():
+        if name not in _FINGERS:
+            pose[SMPLX_JOINTS.index(name)] = angles
+    return np.radians(pose)

@@ -1,0 +1,59 @@
+"""The fixture person from her files: no base mesh, no maker's extra."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
+from smplxpp.body import load_body
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+
+_NEEDED = ("v_tpose", "faces", "face_part", "vertex_part", "vertex_label", "weights", "betas", "part_names")
+
+
+def load_person(topology_file: Path) -> Person:
+    """Read `geometry/topology.npz` of the fixture.
+
+    Raises:
+        InputError: no such file, keys missing, or other parts than the fixture person's.
+    """
+    if not topology_file.is_file():
+        raise InputError(
+            "person",
+            expected="a file geometry/topology.npz of the fixture person",
+            received=str(topology_file),
+            remedy="run in a checkout, or name the folder with --person",
+        )
+    with np.load(topology_file, allow_pickle=False) as data:
+        missing = [name for name in _NEEDED if name not in data.files]
+        if missing:
+            raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(data.files))
+        arrays = {name: data[name] for name in _NEEDED}
+    parts = tuple(arrays["part_names"].tolist())
+    if parts != PART_NAMES:
+        raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))
+    return Person(
+        tpose=TriangleMesh(arrays["v_tpose"], arrays["faces"]),
+        weights=arrays["weights"].astype(np.float64),
+        vertex_part=arrays["vertex_part"],
+        face_part=arrays["face_part"],
+        vertex_label=arrays["vertex_label"],
+        betas=arrays["betas"].astype(np.float64),
+        body=load_body(),
+        face=face_marks(face_landmarks()),
+    )
+
+
+def face_landmarks() -> np.ndarray:
+    """(51, 3) face landmarks on the open body's T-pose at the person's shape; dlib's order from 17."""
+    with (
+        resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path,
+        np.load(path, allow_pickle=False) as data,
+    ):
+        shaped = data["v_template"] + data["shapedirs"][..., : len(PERSON_BETAS)] @ PERSON_BETAS
+        corners = shaped[data["f"][data["lmk_faces_idx"]]]
+        return np.einsum("lk,lkx->lx", data["lmk_bary_coords"], corners)

@@ -1,0 +1,225 @@
+"""A scan as image-based reconstruction gives it: one outer surface, noise, webs where no camera sees the gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+
+from pipelines.synth.cloth_mesh import diffuse, smooth
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
+from smplxpp.core.topology import component_labels, face_components
+from smplxpp.raster import rasterize_mesh, view_directions
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """How the scan is taken; lengths in metres.
+
+    Attributes:
+        cell: of the grid on which depth is fused.
+        views, resolution: orthographic depth images, pixels a side; none from far below the horizon.
+        min_elevation: lowest y of a unit vector towards a camera.
+        sure_free: a cell is empty when a camera sees at least this far past it.
+        sheet_thickness: given to open sheets (clothes), inwards, so that both their sides exist.
+        faces: of the finished scan.
+        detail_above, detail: edges above this height (metres over the lowest vertex: the head) are shorter by this
+            factor, as captures with cameras on the face have it.
+        noise, noise_radius: standard deviation along the normal, and over what distance it is correlated.
+        seed: of the noise.
+    """
+
+    cell: float = 0.004
+    views: int = 96
+    resolution: int = 1024
+    min_elevation: float = -0.12
+    sure_free: float = 0.006
+    sheet_thickness: float = 0.009
+    faces: int = 80_000
+    detail_above: float = 1.45
+    detail: float = 1.7
+    noise: float = 0.0007
+    noise_radius: float = 0.006
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedScan:
+    """A closed mesh and, for each vertex, the point of the scanned layers that it shows.
+
+    Attributes:
+        mesh: N vertices.
+        face, barycentric: (N,), (N, 3) the layers' face and the point on it.
+    """
+
+    mesh: TriangleMesh
+    face: np.ndarray
+    barycentric: np.ndarray
+
+
+def simulate_scan(layers: TriangleMesh, sheets: list[np.ndarray], config: ScanConfig) -> SimulatedScan:
+    """Scan `layers`, standing on the plane of its lowest vertex.
+
+    Args:
+        layers: closed parts and open sheets, outward.
+        sheets: face masks (M,) of the open sheets, one a sheet.
+    """
+    solid = concatenate_meshes([layers, *(_inner_side(layers, mask, config.sheet_thickness) for mask in sheets)])
+    cameras = _cameras(layers, config)
+    depths, seen = _depth_images(solid, cameras)
+    # Sub-pixel faces at grazing angles: whoever touches a seen vertex counts as seen.
+    seen_vertex = np.zeros(solid.vertex_count, dtype=bool)
+    seen_vertex[solid.faces[seen]] = True
+    seen = seen_vertex[solid.faces].any(axis=1)
+
+    grid, size = _grid(solid, config.cell)
+    level = _level_set(solid, seen, grid, (cameras, depths), config)
+    vertices, faces, _ = igl.marching_cubes(level, grid, *size, 0.0)
+    surface = _outer_component(TriangleMesh(vertices, faces))
+    surface = surface.with_vertices(smooth(surface, surface.vertices, steps=1))
+    surface = _simplified(surface, config)
+    face, barycentric = _shown_points(layers, seen[: layers.face_count], surface.vertices)
+    rng = np.random.default_rng(config.seed)
+    bumps = diffuse(surface, rng.normal(size=(surface.vertex_count, 1)), radius=config.noise_radius)
+    noisy = surface.vertices + config.noise * bumps / bumps.std() * surface.vertex_normals
+    return SimulatedScan(surface.with_vertices(noisy), face, barycentric)
+
+
+def _inner_side(layers: TriangleMesh, mask: np.ndarray, thickness: float) -> TriangleMesh:
+    """The back of a sheet, moved inwards, and the rim that joins it to the front."""
+    sheet = layers.submesh(mask)[0]
+    n = sheet.vertex_count
+    back = sheet.vertices - thickness * sheet.vertex_normals
+    directed = np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]])
+    border = directed[np.isin(np.sort(directed, axis=1) @ [n, 1], sheet.border_edges @ [n, 1])]
+    a, b = border.T
+    rim = np.concatenate([np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)])
+    return TriangleMesh(np.concatenate([sheet.vertices, back]), np.concatenate([sheet.faces[:, ::-1] + n, rim]))
+
+
+def _cameras(mesh: TriangleMesh, config: ScanConfig) -> list[Camera]:
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    directions = view_directions(config.views)
+    radius = 0.52 * float(np.linalg.norm(high - low))
+    return [
+        Camera.orthographic_view(center=0.5 * (low + high), direction=d, half_extent=radius, size=config.resolution)
+        for d in directions[directions[:, 1] > config.min_elevation]
+    ]
+
+
+def _depth_images(mesh: TriangleMesh, cameras: list[Camera]) -> tuple[list[np.ndarray], np.ndarray]:
+    """Depth of every view, and (M,) which faces own a pixel."""
+    seen = np.zeros(mesh.face_count, dtype=bool)
+    depths = []
+    for camera in cameras:
+        maps = rasterize_mesh(mesh, camera)
+        seen[maps.face_id[maps.mask]] = True
+        depths.append(maps.depth)
+    return depths, seen
+
+
+def _grid(mesh: TriangleMesh, cell: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """(G, 3) grid points with x fastest, a few cells beyond the mesh, and the counts along x, y, z."""
+    low, high = mesh.vertices.min(axis=0) - 4 * cell, mesh.vertices.max(axis=0) + 4 * cell
+    size = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
+    points = np.empty((size[2], size[1], size[0], 3))
+    for axis in range(3):
+        shape = [1, 1, 1]
+        shape[2 - axis] = size[axis]
+        points[..., axis] = (low[axis] + cell * np.arange(size[axis])).reshape(shape)
+    return points.reshape(-1, 3), size
+
+
+def _level_set(
+    mesh: TriangleMesh, seen: np.ndarray, grid: np.ndarray, views: tuple[list, list], config: ScanConfig
+) -> np.ndarray:
+    """(G,) distance to the nearest surface within a band; negative in what the cameras take for solid.
+
+    Near a seen surface its own normal decides the side. Elsewhere a point is free when some camera sees clearly past
+    it, or when it is below the floor; what no camera sees is solid: that makes the webs.
+    """
+    solid = grid[:, 1] >= mesh.vertices[:, 1].min()
+    for camera, depth in zip(*views, strict=True):
+        left = np.flatnonzero(solid)
+        x, y, z = camera.screen_from_world(grid[left]).T[:3]
+        column = np.clip(x.astype(int), 0, camera.width - 1)
+        row = np.clip(y.astype(int), 0, camera.height - 1)
+        solid[left[depth[row, column] > z + config.sure_free]] = False
+
+    band = 2 * config.cell
+    level = np.where(solid, -band, band)
+    near = np.flatnonzero(_near_vertices(mesh, grid, config.cell))
+    where = SignedDistanceField(mesh, solid=True).query(grid[near])
+    close = np.abs(where.distance) < band
+    outside = ~solid[near] | ((where.distance > 0) & seen[where.face])
+    level[near] = np.where(outside, 1.0, -1.0) * np.where(close, np.abs(where.distance), band)
+    return level
+
+
+def _near_vertices(mesh: TriangleMesh, grid: np.ndarray, cell: float) -> np.ndarray:
+    """(G,) bool: grid points within about three cells of a face's corner or centre."""
+    low = grid[0]
+    size = np.round((grid[-1] - low) / cell).astype(int) + 1
+    hit = np.zeros(size[::-1], dtype=bool)
+    samples = np.concatenate([mesh.vertices, mesh.triangles.mean(axis=1)])
+    index = np.round((samples - low) / cell).astype(int)
+    hit[index[:, 2], index[:, 1], index[:, 0]] = True
+    for axis in range(3):
+        grown = hit.copy()
+        for step in (1, 2, 3):
+            grown |= np.roll(hit, step, axis=axis) | np.roll(hit, -step, axis=axis)
+        hit = grown
+    return hit.ravel()
+
+
+def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
+    """The component of most area, outward."""
+    component = face_components(mesh.faces)
+    areas = np.bincount(component, mesh.face_areas)
+    kept = mesh.submesh(component == np.argmax(areas))[0]
+    volume = np.einsum("ij,ij->", kept.triangles.mean(axis=1) - kept.vertices.mean(axis=0), kept.face_cross)
+    return kept if volume > 0 else TriangleMesh(kept.vertices, kept.faces[:, ::-1])
+
+
+def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
+    """`config.faces` faces of about equal size (shortest edges collapse first), smaller ones on the head."""
+    floor = mesh.vertices[:, 1].min()
+    # Simplify in a space that is stretched above `detail_above`, then undo the stretch.
+    height = np.linspace(-0.1, 2.5, 2601)
+    scale = 1 + (config.detail - 1) * np.clip((height - config.detail_above) / 0.1 + 0.5, 0, 1)
+    stretched = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(height))])
+
+    y = mesh.vertices[:, 1] - floor
+    wide = np.interp(y, height, scale)
+    points = np.stack([mesh.vertices[:, 0] * wide, np.interp(y, height, stretched), mesh.vertices[:, 2] * wide], axis=1)
+    points, faces = igl.decimate(points, mesh.faces, config.faces)[:2]
+    y = np.interp(points[:, 1], stretched, height)
+    wide = np.interp(y, height, scale)
+    return TriangleMesh(np.stack([points[:, 0] / wide, y + floor, points[:, 2] / wide], axis=1), faces)
+
+
+def _shown_points(layers: TriangleMesh, seen: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The closest seen face of the layers and the barycentric coordinates of the closest point on it."""
+    candidates = np.flatnonzero(seen)
+    _, face, closest = igl.point_mesh_squared_distance(points, layers.vertices, layers.faces[candidates])
+    face = candidates[face]
+    return face, barycentric_coordinates(closest, layers.triangles[face])
+
+
+def merge_islands(mesh: TriangleMesh, part: np.ndarray, *, smallest: int = 30) -> np.ndarray:
+    """(N,) part of each vertex, where pieces of fewer than `smallest` vertices take the part that lies around them.
+
+    Where layers touch, the closest one to a noisy vertex is a matter of chance.
+    """
+    part, edges = part.copy(), mesh.edges
+    piece = component_labels(edges[part[edges[:, 0]] == part[edges[:, 1]]], mesh.vertex_count)
+    for small in np.flatnonzero(np.bincount(piece) < smallest):
+        inside = piece[edges] == small
+        crossing = inside[:, 0] != inside[:, 1]
+        around = part[edges[crossing][~inside[crossing]]]
+        if len(around):
+            part[piece == small] = np.argmax(np.bincount(around))
+    return part

@@ -1,0 +1,224 @@
+"""All layers of the person through a performance: skinning for body and shoes, dynamics for clothes and hair."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipelines.synth.cloth_model import Fabric, build_cloth
+from pipelines.synth.cloth_solver import ClothSolver, SolverConfig, Tick
+from pipelines.synth.contact import body_contacts, sheet_contacts
+from pipelines.synth.hair_lag import HairLag
+from pipelines.synth.motion import Performance
+from pipelines.synth.noise import ramp
+from pipelines.synth.person import PART_NAMES, Person
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.skinning import skin
+
+UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """Steps in time and distances.
+
+    Attributes:
+        fps: of the frames.
+        tick: longest time between two searches for contacts, seconds.
+        settle: seconds in which the clothes come to rest on the first pose before the motion starts.
+        skin_margin, sheet_margin: metres that cloth keeps from the skin, and the shirt from the skirt.
+        substeps: of a tick, a garment: the skirt hangs from its waist alone and needs more.
+        fabric, solver: material, stepping.
+    """
+
+    fps: float = 10.0
+    tick: float = 1.0 / 50.0
+    settle: float = 0.8
+    skin_margin: float = 0.004
+    sheet_margin: float = 0.003
+    substeps: Mapping[str, int] = field(default_factory=lambda: {"lower": 20, "upper": 12})
+    fabric: Fabric = field(default_factory=Fabric)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """T frames of the person.
+
+    Attributes:
+        params: exact parameters; she stands on the floor, y = 0.
+        vertices: (T, V, 3) all layers.
+        skinned: (T, V, 3) the same by linear blend skinning alone.
+        attachment: (V,) how much a vertex follows skinning: 1 wholly, 0 free cloth.
+    """
+
+    params: BodyParams
+    vertices: np.ndarray
+    skinned: np.ndarray
+    attachment: np.ndarray
+
+
+def simulate(
+    person: Person,
+    performance: Performance,
+    frames: int,
+    config: SimulationConfig,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Take:
+    """Play `frames` frames of the performance; frame 0 is the first pose with settled clothes.
+
+    `progress` is called with the share of the work done.
+    """
+    stage = _Stage(person, performance, config)
+    ticks_per_frame = int(np.ceil(1.0 / (config.fps * config.tick)))
+    settling = int(np.ceil(config.settle / config.tick))
+    total = settling + ticks_per_frame * (frames - 1)
+    for k in range(settling):
+        stage.advance(0.0, config.tick, damped=k < settling - 10)
+        progress((k + 1) / total)
+    states = [stage.layers()]
+    for frame in range(1, frames):
+        for k in range(ticks_per_frame):
+            time = (frame - 1 + (k + 1) / ticks_per_frame) / config.fps
+            stage.advance(time, 1.0 / (config.fps * ticks_per_frame))
+            progress((settling + (frame - 1) * ticks_per_frame + k + 1) / total)
+        states.append(stage.layers())
+    params, skinned = stage.standing(np.arange(frames) / config.fps)[:2]
+    return Take(replace(params, fps=config.fps), np.stack(states), skinned, attachment(person))
+
+
+def attachment(person: Person) -> np.ndarray:
+    """(V,) 1 where a layer follows the body exactly, 0 where it is free.
+
+    Clothes hold on where they are worn tight and something carries them: the skirt at the waist, the shirt on the
+    shoulders and the upper sleeves. Tight is told by the distance to the skin in the T-pose.
+    """
+    vertices, part = person.tpose.vertices, person.vertex_part
+    body = TriangleMesh(vertices[: person.body.vertex_count], person.body.faces)
+    joint = dict(zip(person.body.joint_names, person.body.joint_regressor @ body.vertices, strict=True))
+    out = np.ones(len(vertices))
+    cloth = np.flatnonzero((part == UPPER) | (part == LOWER))
+    distance = SignedDistanceField(body, solid=True).query(vertices[cloth]).distance
+    tight = np.zeros(len(vertices))
+    tight[cloth] = ramp(distance, 0.020, 0.011)
+    x, y = np.abs(vertices[:, 0]), vertices[:, 1]
+    waist = vertices[part == LOWER, 1].max()
+    shoulder, elbow = joint["left_shoulder"], joint["left_elbow"]
+    carried = np.where(
+        part == LOWER,
+        ramp(y, waist - 0.06, waist - 0.03),
+        ramp(y, shoulder[1] - 0.16, shoulder[1] - 0.05)
+        * ramp(x, shoulder[0] + 0.30 * (elbow[0] - shoulder[0]), shoulder[0] + 0.05 * (elbow[0] - shoulder[0])),
+    )
+    # The waistband is tight by itself.
+    band = (part == LOWER) & (y > waist - 0.03)
+    out[cloth] = np.where(band, 1.0, tight * carried)[cloth]
+    out[out > 0.6] = 1.0
+    return out
+
+
+class _Garment:
+    """One piece of clothing: its particles among all vertices, and their solver."""
+
+    def __init__(
+        self, person: Person, part: int, hold: np.ndarray, start: np.ndarray, config: SimulationConfig
+    ) -> None:
+        skinned = TriangleMesh(start, person.tpose.faces)
+        rest, self.vertices = skinned.submesh(person.face_part == part)
+        substeps = config.substeps[PART_NAMES[part]]
+        model = build_cloth(rest, hold[self.vertices], config.fabric)
+        self.solver = ClothSolver(model, rest.vertices, replace(config.solver, substeps=substeps))
+        self.free = np.flatnonzero(~model.fixed)
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        return self.solver.model.rest.with_vertices(self.solver.position)
+
+
+class _Stage:
+    """The moving things at one instant."""
+
+    def __init__(self, person: Person, performance: Performance, config: SimulationConfig) -> None:
+        self.person, self.performance, self.config = person, performance, config
+        self.hair = np.flatnonzero(person.vertex_part == HAIR)
+        self._skin_faces = _contact_faces(person)
+        self._head = person.body.joint_names.index("head")
+        _, layers, transforms = self.standing(np.zeros(1))
+        self._layers = layers[0]
+        self._pivot = self._head_joint(transforms[0])
+        self.lag = HairLag(transforms[0, self._head, :3, :3])
+        self._looseness = self._hair_looseness()
+        hold = attachment(person)
+        self.skirt, self.shirt = (
+            _Garment(person, part, hold=hold, start=self._layers, config=config) for part in (LOWER, UPPER)
+        )
+
+    def standing(self, times: np.ndarray) -> tuple[BodyParams, np.ndarray, np.ndarray]:
+        """Parameters with the lowest vertex at y = 0, all layers skinned (T, V, 3), the joints' transforms."""
+        person = self.person
+        params = self.performance.at(times)
+        posed = person.body.forward(params)
+        rest = np.repeat(person.tpose.vertices[None], len(params), axis=0)
+        rest[:, : person.body.vertex_count] = posed.rest_vertices
+        layers = skin(rest, person.weights, posed.posed_from_rest)
+        up = np.round(-layers[..., 1].min(axis=1), 5)
+        layers[..., 1] += up[:, None]
+        transforms = posed.posed_from_rest.copy()
+        transforms[:, :, 1, 3] += up[:, None]
+        return replace(params, transl=np.stack([0 * up, up, 0 * up], axis=1)), layers, transforms
+
+    def advance(self, time: float, seconds: float, *, damped: bool = False) -> None:
+        """Go on to `time`, which is `seconds` later: the skirt on the body, then the shirt on both.
+
+        `damped` takes most speed away first.
+        """
+        _, layers, transforms = self.standing(np.array([time]))
+        before, after = self._layers, layers[0]
+        count = self.person.body.vertex_count
+        skin_before, skin_ends = TriangleMesh(before[:count], self._skin_faces), (before[:count], after[:count])
+        skirt_before = self.skirt.mesh
+        for garment in (self.skirt, self.shirt):
+            touching = body_contacts(skin_before, garment.mesh, garment.free, margin=self.config.skin_margin)
+            contacts = [(touching, skin_ends)]
+            if garment is self.shirt:
+                over = sheet_contacts(skirt_before, garment.mesh, garment.free, margin=self.config.sheet_margin)
+                contacts.insert(0, (over, (skirt_before.vertices, self.skirt.solver.position)))
+            if damped:
+                garment.solver.velocity *= 0.7
+            garment.solver.advance(Tick(seconds, (before[garment.vertices], after[garment.vertices]), contacts))
+        self.lag.advance(transforms[0, self._head, :3, :3], seconds)
+        self._pivot = self._head_joint(transforms[0])
+        self._layers = after
+
+    def layers(self) -> np.ndarray:
+        """(V, 3) all layers as they are now."""
+        out = self._layers.copy()
+        for garment in (self.skirt, self.shirt):
+            out[garment.vertices] = garment.solver.position
+        out[self.hair] = self.lag.applied(out[self.hair], self._looseness, self._pivot)
+        return out
+
+    def _head_joint(self, transforms: np.ndarray) -> np.ndarray:
+        """(3,) where the head's joint is: the hair's pivot."""
+        body = self.person.body
+        rest = body.joint_regressor[self._head] @ self.person.tpose.vertices[: body.vertex_count]
+        return transforms[self._head, :3, :3] @ rest + transforms[self._head, :3, 3]
+
+    def _hair_looseness(self) -> np.ndarray:
+        """(H,) 0 on the crown, 1 at the tips."""
+        y = self.person.tpose.vertices[self.hair, 1]
+        return ramp(y, y.max() - 0.10, y.min() + 0.02)
+
+
+def _contact_faces(person: Person) -> np.ndarray:
+    """Faces of the skin below the head: what cloth can touch."""
+    body = person.body
+    rest = person.tpose.vertices[: body.vertex_count]
+    joint = body.joint_regressor @ rest
+    outer = body.part_labels == body.part_label_names.index("body")
+    low = rest[:, 1] < joint[body.joint_names.index("head"), 1]
+    return body.faces[(outer & low)[body.faces].all(axis=1)]

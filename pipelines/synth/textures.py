@@ -1,0 +1,162 @@
+"""Procedural colours of the fixture person, as functions of the point on the T-pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.synth.noise import ramp, smooth_noise
+from smplxpp.core.mesh import row_lengths
+
+SKIN, LIPS, BROWS, BLUSH = (222, 176, 150), (188, 104, 98), (66, 44, 32), (224, 132, 116)
+SCLERA, IRIS, IRIS_LIGHT, PUPIL = (232, 227, 222), (72, 98, 84), (112, 134, 110), (18, 14, 14)
+HAIR, HAIR_LIGHT = (62, 38, 24), (112, 72, 44)
+SHOE, SOLE = (124, 74, 46), (232, 226, 214)
+SHIRT, STRIPE = (240, 236, 226), (44, 62, 110)
+PLAID = ((150, 34, 44), (28, 60, 66), (236, 204, 120))
+
+
+def mix(a, b, t: np.ndarray) -> np.ndarray:
+    """(N, 3) colours between `a` (t = 0) and `b` (t = 1)."""
+    t = np.asarray(t, dtype=float)[:, None]
+    return (1 - t) * np.asarray(a, dtype=float) + t * np.asarray(b, dtype=float)
+
+
+def band(x: np.ndarray, *, period: float, width: float, edge: float = 0.006) -> np.ndarray:
+    """(N,) 1 within `width` metres about every multiple of `period`, 0 between, soft over `edge`."""
+    distance = np.abs((x + 0.5 * period) % period - 0.5 * period)
+    return ramp(distance, 0.5 * (width + edge), 0.5 * (width - edge))
+
+
+def shirt_colors(points: np.ndarray, shoulder: np.ndarray) -> np.ndarray:
+    """Stripes around torso and sleeves, in an uneven knit."""
+    x, y, _ = points.T
+    start = shoulder[0] + 0.03
+    on_sleeve = (np.abs(x) > start) & (y > shoulder[1] - 0.13)
+    along = np.where(on_sleeve, np.abs(x) - start, y)
+    colors = mix(SHIRT, STRIPE, band(along, period=0.048, width=0.02))
+    return colors * (1.0 + 0.045 * _weave(points, seed=11))[:, None]
+
+
+def skirt_colors(points: np.ndarray, centre_z: float) -> np.ndarray:
+    """A plaid: broad dark bands and thin light lines, around and along."""
+    x, y, z = points.T
+    around = np.arctan2(x, z - centre_z) * 0.21  # about metres on the skirt
+    period = 2 * np.pi * 0.21 / 12
+    dark = 0.5 * (band(around, period=period, width=0.044) + band(y, period=0.11, width=0.044))
+    colors = mix(PLAID[0], PLAID[1], dark)
+    line = np.maximum(
+        band(around + 0.5 * period, period=period, width=0.009), band(y + 0.055, period=0.11, width=0.009)
+    )
+    colors = colors + 0.8 * line[:, None] * (np.array(PLAID[2]) - colors)
+    # Wool: threads along and across, of uneven strength.
+    return colors * (1.0 + 0.09 * _weave(points, seed=12))[:, None]
+
+
+def hair_colors(points: np.ndarray, seed: int) -> np.ndarray:
+    """Brown with lighter streaks along the fall."""
+    locks = smooth_noise(points, scale=(0.007, 0.3, 0.007), seed=seed)
+    strands = smooth_noise(points, scale=(0.0009, 0.12, 0.0009), seed=seed + 1)
+    return mix(HAIR, HAIR_LIGHT, np.clip(0.3 + 0.22 * locks + 0.2 * strands, 0, 1))
+
+
+def shoe_colors(points: np.ndarray, floor: float) -> np.ndarray:
+    """Leather over a light sole."""
+    return mix(SOLE, SHOE, ramp(points[:, 1], floor + 0.010, floor + 0.016))
+
+
+def skin_colors(points: np.ndarray, face: FaceMarks, seed: int) -> np.ndarray:
+    """Skin with warm patches and fine mottling; on the face cheeks, lips, brows and lashes."""
+    warmth = smooth_noise(points, scale=(0.04, 0.04, 0.04), seed=seed)
+    mottling = smooth_noise(points, scale=(0.003, 0.003, 0.003), seed=seed + 1)
+    pores = smooth_noise(points, scale=(0.0005, 0.0005, 0.0005), seed=seed + 2)
+    colors = np.array(SKIN, dtype=float) + 3.0 * warmth[:, None] * [1.0, -0.6, -0.8]
+    colors += (1.8 * mottling)[:, None] * [0.4, -1.0, -0.8] + (1.6 * pores)[:, None]
+    near = np.flatnonzero(face.in_front(points))
+    colors[near] = _face_colors(colors[near], points[near], face, seed)
+    return colors
+
+
+@dataclass(frozen=True, eq=False)
+class FaceMarks:
+    """Landmarks on the T-pose in dlib's order: brows (10, 3), eyes (12, 3), outline of the lips (12, 3)."""
+
+    brows: np.ndarray
+    eyes: np.ndarray
+    lips: np.ndarray
+
+    def in_front(self, points: np.ndarray) -> np.ndarray:
+        """(P,) bool: points on the front of the face."""
+        low, high = self.lips.min(axis=0), self.brows.max(axis=0)
+        x, y, z = points.T
+        return (y > low[1] - 0.02) & (y < high[1] + 0.02) & (z > low[2] - 0.045) & (np.abs(x) < 0.075)
+
+
+def _face_colors(colors: np.ndarray, points: np.ndarray, face: FaceMarks, seed: int) -> np.ndarray:
+    """Paint the face's features over the skin; all are drawn in the frontal plane."""
+    x, y, _ = points.T
+    mirrored = np.stack([np.abs(x), y], axis=1)
+    lips, eye, brow = face.lips, face.eyes[6:, :2], face.brows[5:, :2]
+    cheek = np.array([1.25 * eye[:, 0].mean(), 0.5 * (eye[:, 1].mean() + lips[:, 1].mean())])
+    blush = np.exp(-((row_lengths(mirrored - cheek) / 0.018) ** 2)) + 0.5 * np.exp(-((x / 0.012) ** 2))
+    colors = mix_rows(colors, BLUSH, 0.22 * blush * ramp(y, eye[:, 1].min(), lips[:, 1].max()))
+
+    middle = lips[:, :2].mean(axis=0)
+    outline = lips[:, :2] - middle
+    offset = np.stack([x, y], axis=1) - middle
+    order = np.argsort(np.arctan2(outline[:, 1], outline[:, 0]))
+    radius = np.interp(
+        np.arctan2(offset[:, 1], offset[:, 0]),
+        np.arctan2(outline[:, 1], outline[:, 0])[order],
+        row_lengths(outline)[order],
+        period=2 * np.pi,
+    )
+    lines = smooth_noise(points, scale=(0.0006, 0.006, 0.006), seed=seed + 3)
+    tint = ramp(row_lengths(offset) / np.maximum(radius, 1e-6), 1.0, 0.78)
+    colors = mix_rows(colors, LIPS, 0.85 * tint) * (1.0 + 0.04 * tint * lines)[:, None]
+
+    # Brows: lower and flatter than the landmarks' arc, broad inside, made of short strokes.
+    t = np.clip((mirrored[:, 0] - brow[0, 0]) / (brow[-1, 0] - brow[0, 0]), 0.0, 1.0)
+    lowered = np.stack([brow[:, 0], brow[:, 1] - 0.004 - 0.0045 * np.linspace(1, 0, len(brow)) ** 1.5], axis=1)
+    half = 0.0038 * (1.0 - t) + 0.0014
+    strokes = smooth_noise(points @ _SLANT.astype(points.dtype), scale=(0.0005, 0.004, 0.004), seed=seed + 4)
+    cover = ramp(_off_curve(mirrored, lowered) / half, 1.25, 0.4) * np.clip(0.72 + 0.25 * strokes, 0, 1)
+    colors = mix_rows(colors, BROWS, cover)
+
+    # Lashes: a dark line on the upper lid, a faint one on the lower.
+    for lid, strength, width in ((eye[:4], 0.85, 0.0013), (eye[[0, 5, 4, 3]], 0.35, 0.0009)):
+        colors = mix_rows(colors, BROWS, strength * ramp(_off_curve(mirrored, lid), 1.6 * width, 0.4 * width))
+    return colors
+
+
+# Strokes of the brows lean outwards, to the same side on both halves as seen from the front.
+_SLANT = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _off_curve(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """(N,) about the distance of points (N, 2) from a flat curve (L, 2) with ascending x."""
+    x, y = points.T
+    beside = np.maximum(np.maximum(curve[0, 0] - x, x - curve[-1, 0]), 0.0)
+    return np.hypot(y - np.interp(x, curve[:, 0], curve[:, 1]), beside)
+
+
+def _weave(points: np.ndarray, *, seed: int) -> np.ndarray:
+    """(N,) of about unit size: threads along and across, uneven, so that no moire shows from afar."""
+    along = smooth_noise(points, scale=(0.0006, 0.010, 0.0006), seed=seed)
+    across = smooth_noise(points, scale=(0.010, 0.0006, 0.010), seed=seed + 1)
+    patches = smooth_noise(points, scale=(0.02, 0.02, 0.02), seed=seed + 2)
+    return 0.6 * along + 0.6 * across + 0.5 * patches
+
+
+def eye_colors(offsets: np.ndarray) -> np.ndarray:
+    """White, iris and pupil by the distance from the eye's axis, +z; `offsets` (N, 3) from its centre."""
+    radius, angle = np.hypot(offsets[:, 0], offsets[:, 1]), np.arctan2(offsets[:, 1], offsets[:, 0])
+    fibres = 0.5 + 0.25 * np.sin(23 * angle) + 0.25 * np.sin(37 * angle + 900 * radius)
+    colors = mix_rows(mix(IRIS, IRIS_LIGHT, fibres), PUPIL, 0.6 * ramp(radius, 0.0048, 0.0058))
+    colors = mix_rows(colors, SCLERA, ramp(radius, 0.0058, 0.0066))
+    return mix_rows(colors, PUPIL, ramp(radius, 0.003, 0.0022))
+
+
+def mix_rows(colors: np.ndarray, other: tuple, t: np.ndarray) -> np.ndarray:
+    return colors + np.asarray(t, dtype=float)[:, None] * (np.asarray(other, dtype=float) - colors)

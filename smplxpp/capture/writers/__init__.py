@@ -1,0 +1,1 @@
+"""Files of a capture, written: cameras, images, arrays."""

@@ -1,0 +1,77 @@
+"""Camera files of a capture: ours and ActorsHQ's."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.camera import Camera
+from smplxpp.core.rotations import rotvec_from_matrix
+
+_CONVENTION = (
+    "OpenCV: x_cam = R @ x_world + T, x right, y down, z forward; u = fx*x/z + cx in [0,w], pixel (i,j) has its centre "
+    "at (j+0.5, i+0.5); no distortion; world y up, metres"
+)
+
+
+_CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
+
+
+def write_cameras_json(path: Path, rig: list[RigCamera]) -> None:
+    """Cameras in OpenCV's form, with kind and split."""
+    entries = [
+        {
+            "name": item.camera.name,
+            "w": item.camera.width,
+            "h": item.camera.height,
+            "K": item.camera.K.tolist(),
+            "R": item.camera.cam_from_world[:3, :3].tolist(),
+            "T": item.camera.cam_from_world[:3, 3].tolist(),
+            "kind": item.kind,
+            "split": "novel" if item.novel else "train",
+        }
+        for item in rig
+    ]
+    atomic_write_text(path, json.dumps({"convention": _CONVENTION, "cameras": entries}, indent=1) + "\n")
+
+
+def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
+    """ActorsHQ's calibration: camera-to-world, intrinsics in units of the image's size."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_CSV_FIELDS)
+    for item in rig:
+        camera = item.camera
+        world_from_cam = camera.cam_from_world[:3, :3].T
+        size = np.array([camera.width, camera.height])
+        focal, center = np.diag(camera.K)[:2] / size, camera.K[:2, 2] / size
+        numbers = [*rotvec_from_matrix(world_from_cam), *camera.position, *focal, *center]
+        writer.writerow([camera.name, *size.tolist(), *(f"{value:.12g}" for value in numbers)])
+    atomic_write_text(path, text.getvalue())
+
+
+def write_actorshq_scene(folder: Path, boxes: np.ndarray, fps: float) -> None:
+    """`aabbs.csv` and `scene.json` beside the scale folders; `boxes` (T, 2, 3) corners of each frame's bounds."""
+    corners = [f"aabb_{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+    rows = [",".join(["frame_number", *corners])]
+    rows += [",".join([str(frame), *(f"{value:.6g}" for value in box.ravel())]) for frame, box in enumerate(boxes)]
+    atomic_write_text(folder / "aabbs.csv", "\n".join(rows) + "\n")
+    atomic_write_text(folder / "scene.json", json.dumps({"num_frames": len(boxes), "fps": fps}, indent=1) + "\n")
+
+
+BODY, FACE = "body", "face"
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """A camera with what it is for: `kind` is body or face, `novel` cameras are held out."""
+
+    camera: Camera
+    kind: str
+    novel: bool

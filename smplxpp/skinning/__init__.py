@@ -1,0 +1,15 @@
+"""Skinning, forwards and back: forward kinematics, linear blends, and from the reference pose to the T-pose."""
+
+from smplxpp.skinning.inverse import UnposeConfig, Unposed, UnposeReport, pose, unpose
+from smplxpp.skinning.linear_blend import blend_transforms, forward_kinematics, skin
+
+__all__ = [
+    "UnposeConfig",
+    "UnposeReport",
+    "Unposed",
+    "blend_transforms",
+    "forward_kinematics",
+    "pose",
+    "skin",
+    "unpose",
+]

@@ -1,0 +1,193 @@
+"""Skinning and its inverse with one and the same model: rest points to posed ones, and back."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.skinning.linear_blend import blend_transforms, skin
+
+# How many vertices an error names before it only counts them.
+_NAMED = 8
+
+
+@dataclass(frozen=True)
+class UnposeConfig:
+    """Bounds on the determinant of a blended transform (1 where one joint owns the vertex).
+
+    An even blend of two joints has 0.5 at 90 degrees between them, 0.25 at 120, 0.067 at 150 and 0 at 180, where blend
+    skinning has folded the surface flat and nothing can unfold it.
+
+    Attributes:
+        warn_below: a warning and a count.
+        fail_below: an error that names the vertices.
+    """
+
+    warn_below: float = 0.25
+    fail_below: float = 0.05
+
+
+@dataclass(frozen=True)
+class UnposeReport:
+    """How well the pose could be undone.
+
+    Attributes:
+        determinant_min, determinant_mean: over the vertices.
+        below_warning: vertices under `UnposeConfig.warn_below`.
+        round_trip_max: largest |pose(unpose(x)) - x|, metres.
+    """
+
+    determinant_min: float
+    determinant_mean: float
+    below_warning: int
+    round_trip_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class Unposed:
+    """Result of `unpose`.
+
+    Attributes:
+        vertices: (N, 3) rest positions, metres.
+        determinant: (N,) of the linear part of each vertex's blended transform.
+        report: summary.
+    """
+
+    vertices: np.ndarray
+    determinant: np.ndarray
+    report: UnposeReport
+
+
+def pose(
+    rest_vertices: np.ndarray,
+    weights: SkinWeights | np.ndarray,
+    posed_from_rest: np.ndarray,
+    *,
+    rest_offsets: np.ndarray | None = None,
+) -> np.ndarray:
+    """Linear blend skinning, `x = (sum_j w_j G_j) (x_T + b)`.
+
+    Args:
+        rest_vertices: (N, 3) x_T, metres.
+        weights: of the N vertices over J joints; dense rows sum to 1.
+        posed_from_rest: (J, 4, 4) G, as `BodyModel.forward` returns them for one frame.
+        rest_offsets: (N, 3) b, see `unpose`.
+
+    Returns:
+        (N, 3) posed positions, metres.
+
+    Raises:
+        InputError: shapes that do not fit, NaN, transforms that are not affine.
+    """
+    rest, dense, transforms, offsets = _checked("rest vertices", rest_vertices, weights, posed_from_rest, rest_offsets)
+    return skin(rest + offsets, dense, transforms)
+
+
+def unpose(
+    posed_vertices: np.ndarray,
+    weights: SkinWeights | np.ndarray,
+    posed_from_rest: np.ndarray,
+    *,
+    rest_offsets: np.ndarray | None = None,
+    config: UnposeConfig | None = None,
+) -> Unposed:
+    """Undo linear blend skinning, `x_T = (sum_j w_j G_j)^-1 x - b`.
+
+    The inverse is that of the blended matrix, so that `pose` with the same weights and transforms gives the input back
+    (blending the inverses instead would not). The transforms already stand at the joints of the shaped body, so x_T
+    lies around that body's own T-pose, whose identity is not taken out.
+
+    b is what the driving model adds to the rest position before skinning, in this pose: the expression and
+    pose-corrective offset of the body at the point that the vertex corresponds to (barycentric, as its weights were
+    found). Pass it exactly when the driver will add it again; a `Template` moves its parts by skinning alone, so parts
+    that go into one are unposed without.
+
+    Args:
+        posed_vertices: (N, 3) x, metres.
+        weights: of the N vertices over J joints.
+        posed_from_rest: (J, 4, 4) of the pose that x is in.
+        rest_offsets: (N, 3) b, metres; None is zero.
+        config: bounds on the determinant.
+
+    Raises:
+        InputError: as `pose`; a determinant below `config.fail_below`, with the vertices' names.
+
+    Warns:
+        GeometryWarning: a determinant below `config.warn_below`.
+
+    Example:
+        >>> posed = body.forward(params).frame(0)
+        >>> unpose(posed.vertices, body.weights, posed.posed_from_rest).vertices  # posed.rest_vertices, to 1e-9
+    """
+    config = config or UnposeConfig()
+    posed, dense, transforms, offsets = _checked(
+        "posed vertices", posed_vertices, weights, posed_from_rest, rest_offsets
+    )
+    blended = blend_transforms(dense, transforms)
+    linear, shift = blended[:, :3, :3], blended[:, :3, 3]
+    determinant = np.linalg.det(linear)
+    low = np.flatnonzero(determinant < config.fail_below)
+    if len(low):
+        named = ", ".join(f"{v} ({determinant[v]:.3g})" for v in low[:_NAMED])
+        raise InputError(
+            "blended transforms",
+            expected=f"determinants of at least {config.fail_below:g}",
+            received=f"{len(low)} vertices below: {named}{', ...' if len(low) > _NAMED else ''}",
+            remedy="choose a reference frame nearer to the T-pose, or smooth the weights of these vertices",
+        )
+    doubtful = int((determinant < config.warn_below).sum())
+    if doubtful:
+        warnings.warn(
+            f"{doubtful} of {len(posed)} vertices are bent so far that unposing magnifies their errors "
+            f"(determinant down to {determinant.min():.3g})",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    shaped = np.linalg.solve(linear, (posed - shift)[..., None])[..., 0]
+    round_trip = np.linalg.norm(skin(shaped, dense, transforms) - posed, axis=1)
+    report = UnposeReport(
+        determinant_min=float(determinant.min(initial=np.inf)),
+        determinant_mean=float(determinant.mean()) if len(determinant) else float("nan"),
+        below_warning=doubtful,
+        round_trip_max=float(round_trip.max(initial=0.0)),
+    )
+    return Unposed(shaped - offsets, determinant, report)
+
+
+def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
+    """The four arrays in float64, shapes agreeing."""
+    vertices = np.asarray(vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.isfinite(vertices).all():
+        raise InputError(subject, expected="finite (N, 3), N > 0", received=_describe(vertices))
+    dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights, dtype=np.float64)
+    if dense.ndim != 2 or len(dense) != len(vertices) or not np.isfinite(dense).all():
+        raise InputError("skinning weights", expected=f"finite ({len(vertices)}, J)", received=_describe(dense))
+    error = np.abs(dense.sum(axis=1) - 1.0)
+    if error.max() > 1e-6:
+        raise InputError(
+            "skinning weights",
+            expected="rows that sum to 1",
+            received=f"a sum of {dense[np.argmax(error)].sum():.6g} at vertex {int(np.argmax(error))}",
+            remedy="normalise them, for instance with SkinWeights.from_dense",
+        )
+    transforms = np.asarray(posed_from_rest, dtype=np.float64)
+    if transforms.shape != (dense.shape[1], 4, 4) or not np.isfinite(transforms).all():
+        raise InputError(
+            "posed_from_rest", expected=f"finite ({dense.shape[1]}, 4, 4): one frame", received=_describe(transforms)
+        )
+    if not np.array_equal(transforms[:, 3], np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(transforms), 4))):
+        raise InputError(
+            "posed_from_rest", expected="last rows 0 0 0 1", received="others", remedy="check for transposed matrices"
+        )
+    offsets = np.zeros((1, 3)) if rest_offsets is None else np.asarray(rest_offsets, dtype=np.float64)
+    if rest_offsets is not None and (offsets.shape != vertices.shape or not np.isfinite(offsets).all()):
+        raise InputError("rest offsets", expected=f"finite {vertices.shape}", received=_describe(offsets))
+    return vertices, dense, transforms, offsets
+
+
+def _describe(array: np.ndarray) -> str:
+    return f"shape {array.shape}" + ("" if np.isfinite(array).all() else " with NaN or infinity")

@@ -1,0 +1,86 @@
+"""Figures of a view by their stated conventions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.data.views import View
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.metrics.view_quality import ViewQuality, decibels, eight_bit, mean_quality, view_quality
+from tests.training.doll import doll
+
+BLACK = torch.zeros(3)
+
+
+def view(name: str = "Ring0") -> View:
+    return View(doll().cameras[name], torch.tensor(doll().images[name]), torch.tensor(doll().masks[name]))
+
+
+def test_an_equal_image_is_perfect():
+    it = view()
+    quality = view_quality(it, it.composited(BLACK), it.opacity(), BLACK, head=(10, 10, 50, 40))
+    assert quality.psnr == quality.psnr_image == quality.psnr_head == math.inf
+    assert quality.ssim == pytest.approx(1.0) and quality.ssim_head == pytest.approx(1.0)
+
+
+def test_a_known_error_on_the_person_alone():
+    it = view()
+    person = it.opacity() > 0.02
+    # Towards the middle, so that nothing is clipped.
+    real = it.composited(BLACK)
+    image = torch.where(person[..., None], real + torch.where(real > 0.5, -0.1, 0.1), real)
+    quality = view_quality(it, image, it.opacity(), BLACK, head=None)
+    assert quality.psnr == pytest.approx(20.0, abs=1e-4)
+    assert quality.psnr_image == pytest.approx(20.0 - 10 * math.log10(float(person.float().mean())), abs=1e-4)
+    assert quality.psnr_head is None
+
+
+def test_what_is_drawn_beside_the_person_counts():
+    it = view()
+    image, alpha = it.composited(BLACK), it.opacity().clone()
+    image[:5, :5], alpha[:5, :5] = 0.5, 1.0
+    union = int((it.opacity() > 0.02).sum()) + 25
+    expected = -10 * math.log10(25 * 0.25 / union)
+    assert view_quality(it, image, alpha, BLACK, head=None).psnr == pytest.approx(expected, abs=1e-4)
+
+
+def test_colours_outside_the_screen_are_clamped_first():
+    it = view()
+    image = it.composited(BLACK) - (it.opacity() == 0)[..., None] * 3.0
+    assert view_quality(it, image, it.opacity(), BLACK, head=None).psnr_image == math.inf
+
+
+def test_means_are_over_the_views_that_have_a_figure():
+    views = {"a": ViewQuality(20.0, 30.0, 0.9, 25.0), "b": ViewQuality(22.0, 32.0, 0.8, None)}
+    assert mean_quality(views) == {"psnr": 21.0, "psnr_image": 31.0, "ssim": pytest.approx(0.85), "psnr_head": 25.0}
+    assert mean_quality({}) == {}
+
+
+class MeanDifference(PerceptualDistance):
+    """Stands for a metric; blind to what it is not shown."""
+
+    name = "mean difference"
+
+    def distance(self, x, y):
+        return (x - y).abs().mean((1, 2, 3))
+
+
+def test_perceptual_distance_and_ssim_of_the_crop_see_the_crop_alone():
+    it, metric = view(), MeanDifference()
+    image = it.composited(BLACK).clone()
+    image[60:] = 1.0  # below the head's box
+    quality = view_quality(it, image, it.opacity(), BLACK, head=(8, 4, 56, 44), metric=metric)
+    assert (quality.ssim_head, quality.perceptual_head) == (pytest.approx(1.0), 0.0)
+    assert quality.ssim < 0.95 and quality.perceptual > 0.1
+    small = view_quality(it, image, it.opacity(), BLACK, head=(8, 4, 39, 44), metric=metric)
+    assert small.perceptual_head is None and small.psnr_head is not None
+    assert view_quality(it, image, it.opacity(), BLACK, head=None).perceptual is None
+
+
+def test_decibels_and_eight_bits():
+    assert decibels(0.01) == pytest.approx(20.0) and decibels(0.0) == math.inf
+    np.testing.assert_array_equal(eight_bit(torch.tensor([-1.0, 0.0, 0.5, 1.0, 9.0])), [0, 0, 128, 255, 255])

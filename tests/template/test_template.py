@@ -1,0 +1,204 @@
+"""Template: posing against the body model, the file bit for bit, and files that are none."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body
+from smplxpp.body.stress_poses import hard_poses
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import SKIN, UPPER
+from smplxpp.core.params import BodyParams
+from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.template.template import Template
+from tests.export.templates import random_template
+
+ARRAYS = [f.name for f in fields(Template)]
+
+
+def template_of(body, betas: np.ndarray) -> Template:
+    """The body, and a part: some of its own faces a centimetre out, with the body's own weights."""
+    rest = body.forward(BodyParams.rest(betas=betas, expressions=0), flat_hand_mean=True).rest_vertices[0]
+    mesh = body.mesh(rest)
+    piece, used = mesh.submesh(np.arange(mesh.face_count) % 7 == 0)
+    count, extra = body.vertex_count, len(used)
+    dense = np.concatenate([body.weights, body.weights[used]])
+    return Template(
+        vertices=np.concatenate([rest, rest[used] + 0.01]),
+        faces=np.concatenate([body.faces, piece.faces + count]),
+        vertex_labels=np.repeat([SKIN.id, UPPER.id], [count, extra]),
+        vertex_part=np.repeat([0, 1], [count, extra]),
+        part_names=("body", "shirt"),
+        vertex_colors=np.random.default_rng(0).integers(0, 256, (count + extra, 3)),
+        weights=SkinWeights.from_dense(dense, policies=("matched",)),
+        joint_regressor=body.joint_regressor,
+        parents=body.parents,
+        joint_names=body.joint_names,
+        betas=betas,
+        shape_basis=body.shapedirs,
+        expression_basis=body.exprdirs,
+        pose_basis=body.posedirs,
+        left_hand_components=body.left_hand_components,
+        right_hand_components=body.right_hand_components,
+        left_hand_mean=body.left_hand_mean,
+        right_hand_mean=body.right_hand_mean,
+        body_labels=body.part_labels,
+        body_label_names=body.part_label_names,
+        body_index=np.concatenate([np.arange(count), used]),
+        scan_index=np.concatenate([np.full(count, -1), np.arange(extra)]),
+        metadata={"body": body.name, "note": "ä"},
+    )
+
+
+@pytest.fixture(scope="module")
+def open_body():
+    return load_body(num_betas=4, num_expressions=6)
+
+
+@pytest.fixture(scope="module")
+def template(open_body):
+    return template_of(open_body, np.array([0.5, -1.0, 0.3, 0.0]))
+
+
+def test_the_body_poses_as_its_model(open_body, template):
+    params = hard_poses(BodyParams.rest(betas=template.betas, expressions=6))
+    expression = np.random.default_rng(1).uniform(0, 1, (len(params), 6))
+    params = replace(params, expression=expression, transl=np.array([[0.1, 1.0, -2.0]] * len(params)))
+    expected = open_body.forward(params)
+    posed = template.pose(params)
+    assert posed.shape == (len(params), template.vertex_count, 3)
+    assert np.allclose(posed[:, : open_body.vertex_count], expected.vertices, atol=1e-6)
+    # The part follows the joints alone: skinning of its own rest.
+    of_part = template.vertex_part == 1
+    transforms = np.einsum("vj,tjab->tvab", template.weights.dense()[of_part], template.posed_from_rest(params))
+    rest = template.vertices[of_part]
+    direct = np.einsum("tvab,vb->tva", transforms[..., :3, :3], rest) + transforms[..., :3, 3]
+    assert np.allclose(posed[:, of_part], direct, atol=1e-12)
+
+
+def test_the_identity_is_its_own(template):
+    params = hard_poses(BodyParams.rest(betas=template.betas, expressions=6))
+    other = replace(params, betas=np.full((len(params), 4), 3.0))
+    assert np.array_equal(template.pose(params), template.pose(other))
+
+
+def test_rest_is_the_t_pose(template):
+    posed = template.pose(BodyParams.rest(betas=template.betas, expressions=6))[0]
+    assert np.allclose(posed, template.vertices, atol=1e-12)
+    assert np.allclose(template.joints, template.joint_regressor @ template.vertices[: template.body_vertex_count])
+
+
+def test_pose_correctives_hand_means_and_hand_components_survive_the_file(tmp_path):
+    rng = np.random.default_rng(2)
+    random = random_template(joint_count=55, pose_correctives=True)
+    hands = {f"{side}_hand_components": rng.normal(scale=0.2, size=(12, 45)) for side in ("left", "right")}
+    body = replace(random.body_model, **hands)
+    template = template_of(body, np.array([0.4, -0.2]))
+    params = replace(
+        hard_poses(BodyParams.rest(betas=template.betas, expressions=3)),
+        **{f"{side}_hand_pose": rng.normal(size=(4, 6)) for side in ("left", "right")},
+    )
+    expected = body.forward(params)
+    assert np.abs(expected.pose_offsets).max() > 0.01
+    posed = _round_trip(template, tmp_path).pose(params)
+    assert np.allclose(posed[:, : body.vertex_count], expected.vertices, atol=1e-6)
+
+
+def _round_trip(template: Template, folder) -> Template:
+    template.save(folder / "template.npz")
+    return Template.load(folder / "template.npz")
+
+
+def test_the_file_gives_every_bit_back(tmp_path, template):
+    loaded = _round_trip(template, tmp_path)
+    for name in ARRAYS:
+        before, after = getattr(template, name), getattr(loaded, name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype, name
+            assert before.tobytes() == after.tobytes(), name
+        elif name == "weights":
+            for f in fields(SkinWeights):
+                a, b = getattr(before, f.name), getattr(after, f.name)
+                same = a.tobytes() == b.tobytes() and a.dtype == b.dtype if isinstance(a, np.ndarray) else a == b
+                assert same, f.name
+        else:
+            assert before == after, name
+    loaded.save(tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "template.npz").read_bytes()
+    params = BodyParams.rest(betas=template.betas, expressions=6)
+    assert np.array_equal(loaded.pose(params), template.pose(params))
+
+
+def test_the_file_holds_no_pickle(tmp_path, template):
+    template.save(tmp_path / "template.npz")
+    with np.load(tmp_path / "template.npz", allow_pickle=False) as data:
+        assert all(data[key].dtype != object for key in data.files)
+    assert [p.name for p in tmp_path.iterdir()] == ["template.npz"]
+
+
+def test_masks_colours_and_parts(template):
+    of_part = template.vertex_part == 1
+    assert np.array_equal(template.cloth_mask, of_part)
+    assert (template.semantic_colors[of_part] == UPPER.semantic_rgb).all()
+    assert (template.semantic_colors[~of_part] == SKIN.semantic_rgb).all()
+    assert template.part_mesh("shirt").vertex_count == of_part.sum()
+    assert template.part_mesh("shirt").face_count + template.body_model.faces.shape[0] == len(template.faces)
+    with pytest.raises(InputError, match="one of body, shirt"):
+        template.part_mesh("hat")
+
+
+def test_arrays_cannot_be_written(template):
+    with pytest.raises(ValueError, match="read-only"):
+        template.vertices[0] = 0
+
+
+def _rewritten(source, target, **changes) -> None:
+    with np.load(source) as data:
+        arrays = {key: data[key] for key in data.files}
+    np.savez(target, **{key: value for key, value in (arrays | changes).items() if value is not None})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"smplxpp_template_schema": None}, "written by Template.save"),
+        ({"smplxpp_template_schema": np.int64(99)}, "version 99.*[Uu]pdate"),
+        ({"vertices": None}, "template"),
+        ({"weights_joint_indices": None}, "all arrays of a template"),
+        ({"metadata": np.array("{")}, "all arrays of a template"),
+        ({"scan_index": np.zeros(3)}, "scan_index"),
+        ({"faces": np.array([[0, 1, 10**7]])}, "faces"),
+        ({"vertices": np.full((3, 3), np.nan)}, "template"),
+        ({"part_names": np.array(["shirt", "body"])}, "part_names"),
+    ],
+)
+def test_foreign_newer_and_incomplete_files(tmp_path, template, changes, message):
+    template.save(tmp_path / "good.npz")
+    _rewritten(tmp_path / "good.npz", tmp_path / "bad.npz", **changes)
+    with pytest.raises(InputError, match=message):
+        Template.load(tmp_path / "bad.npz")
+
+
+def test_damaged_files(tmp_path, template):
+    template.save(tmp_path / "good.npz")
+    data = (tmp_path / "good.npz").read_bytes()
+    bad = tmp_path / "bad.npz"
+    middle = len(data) // 2
+    objects = np.array([object()], dtype=object)
+    for content in (b"", b"not an archive", data[:middle], data[:middle] + bytes(64) + data[middle + 64 :]):
+        bad.write_bytes(content)
+        with pytest.raises(InputError, match="template file"):
+            Template.load(bad)
+    np.savez(bad, smplxpp_template_schema=1, vertices=objects, allow_pickle=True)
+    with pytest.raises(InputError, match="plain arrays"):
+        Template.load(bad)
+    with zipfile.ZipFile(bad, "w") as archive:
+        archive.writestr("text.txt", "hello")
+    with pytest.raises(InputError, match="template file"):
+        Template.load(bad)
+    with pytest.raises(InputError, match="existing file"):
+        Template.load(tmp_path / "none.npz")

@@ -1,0 +1,95 @@
+"""The picture at the head of the README: one run from scan to driven template and trained student.
+
+python -m tools.overview RUN --out docs/images/overview.png
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
+from pipelines.figures.evaluation import read_tiles
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.evaluate_config import EVALUATE_STAGE
+from pipelines.stages.scan import load_params_of_run, load_scan
+from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import display_colors
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.template.template import Template
+
+HEIGHT = 420
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Draw a finished run in one row."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `smplxpp build`, `smplxpp train` and `smplxpp evaluate` wrote."""
+    out: Path = Path("docs/images/overview.png")
+    """The picture."""
+
+    def run(self) -> None:
+        """Render and write the picture."""
+        template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
+        scan, colors, _ = load_scan(self.run_folder)
+        with np.load(self.run_folder / "20_segment" / "labels.npz") as labels:
+            label_colors = display_colors(labels["face_labels"])
+        poses = dict(zip(HARD_POSES, template.pose(hard_poses(load_params_of_run(self.run_folder))), strict=True))
+        step = template.mesh.with_vertices(poses["high_step"])
+        looks = {"vertex_colors": template.vertex_colors}
+        weights = {"vertex_colors": blend_joint_colors(template.weights)}
+        cells = [
+            ("scan", scan, {"vertex_colors": colors}),
+            ("labels", scan, {"face_colors": label_colors}),
+            ("skin weights", template.mesh, weights),
+            ("T-pose", template.mesh, looks),
+            ("high step", step, looks),
+        ]
+        pictures = [caption(_front(mesh, options), name) for name, mesh, options in cells]
+        photograph, skinned, student = _cut(held_out_view(self.run_folder))
+        pictures += [caption(photograph, "held-out view")]
+        pictures += [caption(skinned, "Gaussians, skinned"), caption(student, "student")]
+        atomic_write_bytes(self.out, encode_png(row(pictures, gap=4)))
+
+
+def held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
+    manifest = read_manifest(run / EVALUATE_STAGE)
+    numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]
+    views = [shown for shown in numbers["views"] if shown["set"] == "novel_view"]
+    models = list(numbers["models"])
+    if not views or not {"reference-fit", "student"} <= set(models):
+        raise InputError(
+            "evaluation of the run",
+            expected="a reference fit and a student, measured on novel views",
+            received=f"{', '.join(models) or 'none'}, {len(views)} novel views",
+            remedy="run `smplxpp train` and `smplxpp evaluate`",
+        )
+    photograph, rendered = read_tiles(run / EVALUATE_STAGE / views[-1]["file"], len(models))
+    return photograph, rendered[models.index("reference-fit")], rendered[models.index("student")]
+
+
+def _cut(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """The same columns of each, those that the person in the first is in, at the height of the other pictures."""
+    columns = np.flatnonzero((images[0] > 16).any(axis=(0, 2)))
+    cut = [image[:, max(columns[0] - 4, 0) : columns[-1] + 5] for image in images]
+    size = (round(cut[0].shape[1] * HEIGHT / len(cut[0])), HEIGHT)
+    return [np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS)) for image in cut]
+
+
+def _front(mesh: TriangleMesh, options: dict) -> np.ndarray:
+    camera = body_cameras(mesh, views=("three-quarter",), height=HEIGHT)[0]
+    return render_shaded(mesh, camera, **options)
+
+
+if __name__ == "__main__":
+    tyro.cli(Overview, prog="python -m tools.overview").run()
