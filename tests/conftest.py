@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from tests import shape_contracts
+
+shape_contracts.install()  # before anything of the packages is imported
+
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 

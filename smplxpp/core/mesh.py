@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.topology import edge_groups
@@ -150,7 +151,7 @@ class TriangleMesh:
         start = first[count == 2]
         return np.stack([order[start], order[start + 1]], axis=1) // 3
 
-    def with_vertices(self, vertices: np.ndarray) -> TriangleMesh:
+    def with_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> TriangleMesh:
         """The same faces on other positions."""
         return replace(self, vertices=vertices)
 
