@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from benchmarks.capture_truth import CaptureTruth, TruePart, find_captures, read_capture_truth
 from benchmarks.machine import store_results
 from benchmarks.rin23 import load_peer, run_peer
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -87,9 +87,9 @@ def methods(peer: Path | None) -> dict[str, Method]:
 
 def driven_poses(truth: CaptureTruth, identity: BodyParams, motion_frames: int) -> dict[str, np.ndarray]:
     """Name -> (F, J, 4, 4) transforms of the poses on an identity; the root stays at the origin in hard poses."""
-    hard = hard_poses(replace(identity, transl=np.zeros((1, 3))))
+    hard = stress_poses(replace(identity, transl=np.zeros((1, 3))))
     hard_transforms = truth.body.forward(hard).posed_from_rest
-    out = {name: hard_transforms[[k]] for k, name in enumerate(HARD_POSES)}
+    out = {name: hard_transforms[[k]] for k, name in enumerate(STRESS_POSES)}
     if len(truth.motion) > 1:
         chosen = truth.motion.select(np.linspace(0, len(truth.motion) - 1, motion_frames).round().astype(int))
         chosen = replace(chosen, betas=np.repeat(identity.betas, len(chosen), axis=0))

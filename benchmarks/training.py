@@ -183,7 +183,7 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
                 teacher,
                 bake.pretrain,
                 0,
-                code_rate=bake.code_rate,
+                code_lr_factor=bake.code_lr_factor,
                 null_share=bake.null_share,
                 imagined=bake.imagined,
             ).step

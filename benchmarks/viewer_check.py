@@ -40,7 +40,7 @@ from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
 from avatar.render import rasterize
 from benchmarks.build import FIXTURE
 from benchmarks.machine import store_results
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
@@ -182,8 +182,8 @@ def posed_template(run: Path, count: int) -> tuple[BoundGaussians, torch.Tensor,
     # Brighter and redder where the triangle faces the camera, greener along its median.
     sh[:, 2] = torch.tensor([0.4, 0.2, 0.0])
     sh[:, 0] = torch.tensor([0.0, 0.3, -0.2])
-    poses = hard_poses(BodyParams.rest(betas=0, expressions=0))
-    vertices = template.pose(poses.frame(list(HARD_POSES).index("high_step")))[0]
+    poses = stress_poses(BodyParams.rest(betas=0, expressions=0))
+    vertices = template.pose(poses.frame(list(STRESS_POSES).index("high_step")))[0]
     # The viewer cuts every Gaussian's colour at 1 and we do not: keep below.
     bound = replace(bound, dc=0.7 * bound.dc, sh=sh)
     return bound, torch.tensor(vertices, dtype=torch.float32), torch.tensor(template.faces)

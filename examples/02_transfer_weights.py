@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import smplxpp
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.skinning import pose, unpose
@@ -32,7 +32,7 @@ def main() -> None:
     # As it was cut, skinned to the reference pose: the authored weights are exact for it.
     skirt = cut.with_vertices(pose(cut.vertices, authored, posed.posed_from_rest))
 
-    driven = body.forward(hard_poses(params)).posed_from_rest[list(HARD_POSES).index("high_step")]
+    driven = body.forward(stress_poses(params)).posed_from_rest[list(STRESS_POSES).index("high_step")]
     truth = pose(cut.vertices, authored, driven)
     for name, config in SETTINGS.items():
         weights = smplxpp.transfer_weights(body.mesh(posed.vertices), body.weights, skirt, config=config)

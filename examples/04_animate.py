@@ -12,7 +12,7 @@ import numpy as np
 import smplxpp
 from pipelines.figures import VIEWS, encode_png, fit_cameras, render_shaded
 from smplxpp.assemble import CanonicalPart, assemble_template
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.labels import LABEL_BY_NAME
 from smplxpp.core.mesh_io import write_ply
 
@@ -32,14 +32,14 @@ def main() -> None:
     smplxpp.write_glb(out / "motion.glb", template, animation=motion)
     print(f"motion.glb: {len(motion)} frames at {motion.fps:g} a second")
 
-    poses = hard_poses(motion)  # the template has its own shape: betas in the parameters are not looked at
+    poses = stress_poses(motion)  # the template has its own shape: betas in the parameters are not looked at
     vertices = template.pose(poses)  # (T, V, 3)
     write_ply(out / "squat.ply", template.mesh.with_vertices(vertices[0]), vertex_colors=template.vertex_colors)
     cameras = fit_cameras(vertices.reshape(-1, 3), directions=[VIEWS["three-quarter"]], height=480)
-    for name, points in zip(HARD_POSES, vertices, strict=True):
+    for name, points in zip(STRESS_POSES, vertices, strict=True):
         picture = render_shaded(template.mesh.with_vertices(points), cameras[0], vertex_colors=template.vertex_colors)
         (out / f"{name}.png").write_bytes(encode_png(picture))
-    print(f"written {out}/motion.glb, squat.ply, {', '.join(f'{name}.png' for name in HARD_POSES)}")
+    print(f"written {out}/motion.glb, squat.ply, {', '.join(f'{name}.png' for name in STRESS_POSES)}")
 
 
 def from_layers(params: smplxpp.BodyParams) -> smplxpp.Template:

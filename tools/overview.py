@@ -18,7 +18,7 @@ from pipelines.figures.evaluation import read_tiles
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from pipelines.stages.scan import load_params_of_run, load_scan
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
@@ -43,7 +43,7 @@ class Overview:
         scan, colors, _ = load_scan(self.run_folder)
         with np.load(self.run_folder / "20_segment" / "labels.npz") as labels:
             label_colors = display_colors(labels["face_labels"])
-        poses = dict(zip(HARD_POSES, template.pose(hard_poses(load_params_of_run(self.run_folder))), strict=True))
+        poses = dict(zip(STRESS_POSES, template.pose(stress_poses(load_params_of_run(self.run_folder))), strict=True))
         step = template.mesh.with_vertices(poses["high_step"])
         looks = {"vertex_colors": template.vertex_colors}
         weights = {"vertex_colors": blend_joint_colors(template.weights)}

@@ -35,12 +35,12 @@ class Baseline(nn.Module, ABC):
     gaussians: LearnedGaussians
 
     @abstractmethod
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        """The avatar in a pose, as C cameras at `eyes` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        """The avatar in a pose, as C cameras at `camera_centers` (C, 3) see it."""
 
     @abstractmethod
-    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
-        """What is learned beside the attributes of the Gaussians; `rate` is that of networks."""
+    def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
+        """What is learned beside the attributes of the Gaussians; `lr` is that of networks."""
 
 
 class ResidualBaseline(Baseline):
@@ -68,8 +68,8 @@ class ResidualBaseline(Baseline):
     def residuals(self, motion: Motion, code: Tensor) -> Tensor:
         """(N, 12) outputs in the order of `RESIDUALS`; `code` (code_size,) of the frame."""
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        """The avatar in a pose, as C cameras at `eyes` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        """The avatar in a pose, as C cameras at `camera_centers` (C, 3) see it."""
         code = self.codes([motion.frame if motion.frame in self.codes.row else None])[0]
         position, log_scales, quats, colour = self.residuals(motion, code).split((3, 2, 4, 3), dim=-1)
         bound = self.gaussians()
@@ -83,9 +83,9 @@ class ResidualBaseline(Baseline):
         vertices = self.rig.pose(motion)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
-        return PosedAvatar(vertices, world, view_colors(bound, frames, world.means.detach(), eyes), bound)
+        return PosedAvatar(vertices, world, view_colors(bound, frames, world.means.detach(), camera_centers), bound)
 
-    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
+    def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
         """Networks and codes."""
         own = {name: p for name, p in self.named_parameters() if not name.startswith("gaussians.")}
-        return [ParameterGroup("networks", own, rate, final)]
+        return [ParameterGroup("networks", own, lr, lr_final_factor)]

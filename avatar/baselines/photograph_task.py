@@ -9,13 +9,13 @@ from typing import Any
 from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
-from avatar.data.sequence import AvatarSequence, Item, eyes_of
-from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
 from smplxpp.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotographConfig(ViewConfig):
+class PhotographConfig(PhotometricConfig):
     """Choices of a baseline's training.
 
     Attributes:
@@ -30,11 +30,11 @@ class PhotographConfig(ViewConfig):
             raise InputError("baseline: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
 
 
-class PhotographTask(ViewTask):
+class PhotographTask(PhotometricTask):
     """`L_rec` of a baseline's renderings against photographs."""
 
     def __init__(self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, **options: Any) -> None:
-        groups = model.groups(config.rate, config.final)
+        groups = model.groups(config.lr, config.lr_final_factor)
         super().__init__(sequence, model, config, groups, **options)
         for group in groups:
             # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
@@ -48,5 +48,5 @@ class PhotographTask(ViewTask):
         motion = self.sequence.motion(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
             motion = motion.without_code()
-        total, terms, _ = self.compared(self.model(motion, eyes_of(views)), views)
+        total, terms, _ = self.compared(self.model(motion, camera_centers_of(views)), views)
         return total, {"loss": float(total.detach()), **terms}

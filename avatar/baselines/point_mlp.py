@@ -17,9 +17,9 @@ from torch import Tensor, cat, nn
 
 from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.gaussians.binding import BoundGaussians
-from avatar.models.networks.config import require_at_least
 from avatar.models.networks.deformation_field import positional_encoding
 from avatar.rig.rig import THETA, Motion, Rig
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)

@@ -64,16 +64,16 @@ class TexturedMeshAvatar(Baseline):
         """The texels."""
         return self.student.gaussians
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        """The mesh in a pose, as C cameras at `eyes` (C, 3) see it."""
-        return self.student(motion, eyes)
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        """The mesh in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+        return self.student(motion, camera_centers)
 
-    def groups(self, rate: float, final: float) -> list[ParameterGroup]:
+    def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
         """Field, codes and texture."""
         return [
-            ParameterGroup("field", dict(self.student.field.named_parameters()), rate, final),
-            ParameterGroup("codes", {"codes": self.student.codes.codes}, rate, final),
-            ParameterGroup("texture", {"dc": self.gaussians.dc}, LearningRates().dc, final),
+            ParameterGroup("field", dict(self.student.field.named_parameters()), lr, lr_final_factor),
+            ParameterGroup("codes", {"codes": self.student.codes.codes}, lr, lr_final_factor),
+            ParameterGroup("texture", {"dc": self.gaussians.dc}, LearningRates().dc, lr_final_factor),
         ]
 
 

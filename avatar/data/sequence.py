@@ -147,12 +147,12 @@ class AvatarSequence:
         return whole.cropped(self.config.margin)
 
 
-def eyes_of(views: Sequence[View]) -> Tensor:
+def camera_centers_of(views: Sequence[View]) -> Tensor:
     """(C, 3) centres of projection in the world."""
     return torch.stack([view.position for view in views])
 
 
-def evenly(frames: Sequence[int], count: int) -> list[int]:
+def spread_inside(frames: Sequence[int], count: int) -> list[int]:
     """At most `count` of the frames, each from the middle of its share."""
     if not len(frames):
         return []

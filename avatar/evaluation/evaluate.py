@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, eyes_of
+from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
@@ -182,10 +182,10 @@ class _Run:
                 part = self._middle[frame]
                 self.meshes[part] = ShownSurface(part, frame, truth, {SKINNING_ALONE: mesh})
         # A frame that only its surface is measured of is posed for any eye: the mesh does not depend on it.
-        eyes = eyes_of(views) if views else skinned.new_zeros(1, 3)
+        camera_centers = camera_centers_of(views) if views else skinned.new_zeros(1, 3)
         for name, model in self.models.items():
             with at_rest(model):
-                posed = model(_motion(model, sequence, frame), eyes)
+                posed = model(_motion(model, sequence, frame), camera_centers)
                 for index, (view, head) in enumerate(zip(views, heads, strict=True)):
                     self._see(name, posed, index, view=view, frame=frame, head=head)
             if truth is not None:

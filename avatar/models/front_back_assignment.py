@@ -14,7 +14,7 @@ from avatar.rig.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
-class MapSides:
+class FrontBackAssignment:
     """Sides of P points.
 
     Attributes:
@@ -26,7 +26,7 @@ class MapSides:
     behind: Tensor
 
 
-def map_sides(rig: Rig, frame: MapFrame, size: int, points: Tensor, normals: Tensor) -> MapSides:
+def assign_front_back(rig: Rig, frame: MapFrame, size: int, points: Tensor, normals: Tensor) -> FrontBackAssignment:
     """Sides by depth, not by the direction that a point faces.
 
     A fold of the front of a skirt has a far side, which faces backwards: on the back map at its place is the back of
@@ -49,4 +49,4 @@ def map_sides(rig: Rig, frame: MapFrame, size: int, points: Tensor, normals: Ten
         belows.append(below.masked_fill(~seen, 0.0))
     nothing = torch.isinf(distances[0]) & torch.isinf(distances[1])
     front = torch.where(nothing, normals[:, 2] >= 0, distances[0] <= distances[1])
-    return MapSides(front, torch.where(front, belows[0], belows[1]))
+    return FrontBackAssignment(front, torch.where(front, belows[0], belows[1]))

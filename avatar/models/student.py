@@ -14,12 +14,12 @@ from avatar.gaussians.sampling import head_faces
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.networks.config import require_at_least
 from avatar.models.networks.control_points import choose_control_points, template_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.networks.local_pose import seen_joints
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)
@@ -94,15 +94,15 @@ class Student(nn.Module):
         du, dc = self.blend_shapes(self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw))
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        """The student in a pose, as C cameras at `eyes` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        """The student in a pose, as C cameras at `camera_centers` (C, 3) see it."""
         displacements = self.displacements(motion)
         vertices = self.rig.pose(motion, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.compensated(motion)
         world = world_from_frames(bound, frames)
         # Directions count as constants: a colour must not pull its Gaussian to the side.
-        colors = view_colors(bound, frames, world.means.detach(), eyes)
+        colors = view_colors(bound, frames, world.means.detach(), camera_centers)
         return PosedAvatar(vertices, world, colors, bound, displacements)
 
     def with_blend_shapes(self, blend_shapes: BlendShapes | BlendShapeConfig | None) -> Student:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import view_colors
-from avatar.models.front_back_assignment import map_sides
+from avatar.models.front_back_assignment import assign_front_back
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
@@ -68,7 +68,7 @@ class TeacherAvatar(nn.Module):
         # Where the triangles have them, without the offsets, which are learned: one lookup for all of the training.
         face = gaussians.face_index.to(rig.device)
         points = on_triangles(canonical.corners[face], gaussians.barycentric.to(rig.device))
-        sides = map_sides(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
+        sides = assign_front_back(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
         self.sampler = MapSampler(self.frame, config.out_size, points, sides.front)
         self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)
         self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
@@ -118,22 +118,22 @@ class TeacherAvatar(nn.Module):
     def _shown(self, positions: Tensor) -> Tensor:
         return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
-    def inputs(self, motion: Motion, eyes: Tensor) -> TeacherMaps:
-        """Maps of a pose and of C cameras at `eyes` (C, 3); constants for gradients."""
+    def inputs(self, motion: Motion, camera_centers: Tensor) -> TeacherMaps:
+        """Maps of a pose and of C cameras at `camera_centers` (C, 3); constants for gradients."""
         with self._exact():
             to_root = motion.root_from_world
             vertices, positions = self._root_positions(motion)
             if not self.config.sees_view:
                 return TeacherMaps(self._shown(positions), None)
             normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
-            from_root = eyes @ to_root[:3, :3].T + to_root[:3, 3]
+            from_root = camera_centers @ to_root[:3, :3].T + to_root[:3, 3]
             directions = F.normalize(from_root[:, None, None, None] - positions, dim=-1)
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
             return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
 
-    def residual_maps(self, motion: Motion, eyes: Tensor) -> Residuals:
+    def residual_maps(self, motion: Motion, camera_centers: Tensor) -> Residuals:
         """Maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
-        maps = self.inputs(motion, eyes)
+        maps = self.inputs(motion, camera_centers)
         return self.networks(maps.positions, self.semantics, maps.cosines)
 
     def displacement_maps(self, motions: Sequence[Motion]) -> Tensor:
@@ -141,11 +141,11 @@ class TeacherAvatar(nn.Module):
         inputs = torch.cat([self.position_input(motion) for motion in motions])
         return self.config.position_scale * self.networks.positions(inputs, self.semantics)
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        """The teacher in a pose, as C cameras at `eyes` (C, 3) see it."""
-        return self.posed(motion, eyes, self.residual_maps(motion, eyes))
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        """The teacher in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+        return self.posed(motion, camera_centers, self.residual_maps(motion, camera_centers))
 
-    def posed(self, motion: Motion, eyes: Tensor, maps: Residuals) -> PosedAvatar:
+    def posed(self, motion: Motion, camera_centers: Tensor, maps: Residuals) -> PosedAvatar:
         """`forward` from residual maps at hand."""
         residuals = maps.sampled(self.sampler)
         bound = self.gaussians()
@@ -160,11 +160,11 @@ class TeacherAvatar(nn.Module):
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
         means = world.means.detach()
-        color = residuals.colour.expand(len(eyes), -1, -1)
+        color = residuals.colour.expand(len(camera_centers), -1, -1)
         # dc joins before the clamp, so each camera's residual is part of it.
         colors = [
-            view_colors(replace(bound, dc=bound.dc + color[c]), frames, means, eyes[c : c + 1])
-            for c in range(len(eyes))
+            view_colors(replace(bound, dc=bound.dc + color[c]), frames, means, camera_centers[c : c + 1])
+            for c in range(len(camera_centers))
         ]
         return PosedAvatar(vertices, world, torch.cat(colors), bound)
 

@@ -70,14 +70,14 @@ class TrackedAvatar(nn.Module):
         """(K, 3) metres, of the frame that is being followed."""
         self.to(rig.device)
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
         """The avatar in a pose, displaced by the control points as they stand."""
         displacements = self.cage(self.controls)
         vertices = self.rig.pose(motion, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.gaussians()
         world = world_from_frames(bound, frames)
-        colors = view_colors(bound, frames, world.means.detach(), eyes)
+        colors = view_colors(bound, frames, world.means.detach(), camera_centers)
         return PosedAvatar(vertices, world, colors, bound, displacements)
 
 

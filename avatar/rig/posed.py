@@ -38,11 +38,11 @@ class AvatarModel(Protocol):
 
     rig: Rig
 
-    def __call__(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
+    def __call__(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
         """The avatar in a pose.
 
         Args:
-            eyes: (C, 3) centres of projection in the world, metres.
+            camera_centers: (C, 3) centres of projection in the world, metres.
         """
 
 

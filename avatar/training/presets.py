@@ -8,7 +8,6 @@ from typing import TypeVar
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.models.networks.config import require_choice
 from avatar.models.networks.presets import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
 from avatar.training.engine.pretraining import PretrainConfig
@@ -17,6 +16,7 @@ from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig
 from avatar.training.tracking.track import Level, TrackConfig
+from smplxpp.core.validation import require_choice
 
 LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
 """Of `BlendShapeConfig`, for local blend shapes."""
@@ -45,7 +45,7 @@ class TrainingPreset:
         """Of the bake; the compensation adds the blend shapes."""
         return StudentConfig(self.networks.field, None, self.control_points)
 
-    def seeded(self, seed: int) -> TrainingPreset:
+    def with_seed(self, seed: int) -> TrainingPreset:
         """The same with another seed everywhere."""
         track = self.teacher.track
         return replace(
@@ -92,7 +92,7 @@ class _Size:
     gaussians: int
     control_points: int
     track: tuple[Level, ...]
-    still: float
+    body_motion_weight: float
     pretrain: int
     fit: int
     teacher: int
@@ -107,7 +107,9 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
     the followed surface and its answers about imagined poses. Several views a step, attributes that learn in every
     stage, no perceptual term.
     """
-    pretrain = PretrainConfig(iterations=size.pretrain, batch=8, rate=1e-2, final=0.02, warmup=20, betas=(0.9, 0.99))
+    pretrain = PretrainConfig(
+        iterations=size.pretrain, batch=8, lr=1e-2, lr_final_factor=0.02, warmup=20, betas=(0.9, 0.99)
+    )
     return TrainingPreset(
         networks=network_preset(name),
         fit=FitConfig(sampling=SamplingConfig(count=size.gaussians), iterations=size.fit),
@@ -115,32 +117,34 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             iterations=size.teacher,
             pretrain=pretrain,
             views=3,
-            rate=2e-3,
+            lr=2e-3,
             attributes=1.0,
             weights=_LEAN_WEIGHTS,
-            track=TrackConfig(levels=size.track, control_points=size.control_points, still=size.still),
+            track=TrackConfig(
+                levels=size.track, control_points=size.control_points, body_motion_weight=size.body_motion_weight
+            ),
         ),
         bake=BakeConfig(
             iterations=size.bake,
-            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, rate=5e-3),
+            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=5e-3),
             images="photographs",
             semantic=0.0,
             attributes=1.0,
             imagined=48,
-            code_rate=5.0,
+            code_lr_factor=5.0,
             views=3,
-            rate=1e-3,
+            lr=1e-3,
             null_share=0.2,
             weights=_LEAN_WEIGHTS,
         ),
         compensate=CompensateConfig(
             iterations=size.compensate,
-            items=1,
+            poses_per_step=1,
             views=3,
-            rate=1e-3,
+            lr=1e-3,
             null_share=0.2,
             attributes=1.0,
-            seeded=True,
+            init_from_track=True,
             weights=_LEAN_WEIGHTS,
         ),
         blend_shapes=BlendShapeConfig(jaw=True),
@@ -160,7 +164,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
     "gpu": TrainingPreset(
         networks=network_preset("gpu"),
         fit=PRESETS["paper"],
-        teacher=FitTeacherConfig(iterations=60_000, pretrain=None, rate=1e-3, attributes=0.2, amp=True),
+        teacher=FitTeacherConfig(iterations=60_000, pretrain=None, lr=1e-3, attributes=0.2, amp=True),
         bake=BakeConfig(iterations=10_000, null_share=0.1),
         compensate=CompensateConfig(iterations=15_000, null_share=0.1),
         blend_shapes=BlendShapeConfig(jaw=True),
@@ -171,7 +175,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             gaussians=50_000,
             control_points=2400,
             track=TrackConfig().levels,
-            still=0.0,
+            body_motion_weight=0.0,
             pretrain=500,
             fit=600,
             teacher=500,
@@ -185,7 +189,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             gaussians=15_000,
             control_points=800,
             track=(Level(1, 12, 5e-3), Level(0, 12, 2e-3)),
-            still=2.0,
+            body_motion_weight=2.0,
             pretrain=100,
             fit=100,
             teacher=60,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from avatar.data.sequence import AvatarSequence, evenly
+from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.networks.blend_shapes import BlendShapeConfig
@@ -16,18 +16,19 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
-from avatar.training.engine.optimization_task import GradientTask
-from avatar.training.engine.photometric_task import Preview, ViewConfig
+from avatar.training.engine.optimization_task import OptimizationTask
+from avatar.training.engine.photometric_task import PhotometricConfig, Preview
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.random_state import seeded
+from avatar.training.engine.random_state import fixed_seed
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
-from avatar.training.student.init_blend_shapes import seed_blend_shapes
+from avatar.training.student.init_blend_shapes import init_blend_shapes
 from avatar.training.student.pretrain import PretrainFieldTask
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.track import TrackConfig, TrackTask
+from smplxpp.core.spread import spread_inside
 
 TRACK, PRETRAIN = "track", "pretrain"
 """Folders of what comes before a training."""
@@ -59,11 +60,15 @@ class Session:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of a `ViewTask`."""
+        """Of a `PhotometricTask`."""
         return {"perceptual": self.perceptual, "distributed": self.distributed, "preview": self.preview}
 
     def run(
-        self, make: Callable[[], GradientTask], config: ViewConfig | PretrainConfig, *, keep_end: bool = False
+        self,
+        make: Callable[[], OptimizationTask],
+        config: PhotometricConfig | PretrainConfig,
+        *,
+        keep_end: bool = False,
     ) -> Progress:
         """Train what `make` gives."""
         loop = LoopConfig(
@@ -75,10 +80,10 @@ class Session:
         )
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
-    def run_alone(self, make: Callable[[], GradientTask], config: ViewConfig | PretrainConfig) -> Progress:
+    def run_alone(self, make: Callable[[], OptimizationTask], config: PhotometricConfig | PretrainConfig) -> Progress:
         """Train what `make` gives on the first process; the others wait. A checkpoint of the end is kept."""
         together = self.distributed or Distributed()
-        return together.from_first(lambda: self.run(make, config, keep_end=True))
+        return together.run_on_rank0(lambda: self.run(make, config, keep_end=True))
 
     def within(self, name: str) -> Session:
         """The same in a folder of its own, without previews."""
@@ -97,9 +102,9 @@ def fit_teacher(
     session: Session,
 ) -> tuple[TeacherAvatar, Progress]:
     """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
-    with seeded(config.seed):
+    with fixed_seed(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
-    teacher.centre(sequence.motion(frame) for frame in evenly(sequence.train_frames, CENTRED_ON))
+    teacher.centre(sequence.motion(frame) for frame in spread_inside(sequence.train_frames, CENTRED_ON))
     track = None
     if config.track is not None:
         track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))
@@ -131,7 +136,7 @@ def follow_surface(
     task = TrackTask(sequence, avatar, config, **{**session.options, "distributed": None})
     progress = session.run_alone(lambda: task, task.config)
     together = session.distributed or Distributed()
-    task.solved.copy_(together.from_first(lambda: task.solved.cpu()))
+    task.solved.copy_(together.run_on_rank0(lambda: task.solved.cpu()))
     return task.track(), progress
 
 
@@ -145,7 +150,7 @@ def bake(
     teacher: TeacherAvatar | None,
 ) -> tuple[Student, Progress]:
     """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
-    with seeded(config.seed):
+    with fixed_seed(config.seed):
         made = Student(student, sequence.rig, gaussians, sequence.train_frames)
     if config.pretrain is not None and teacher is not None and made.field is not None:
         pretrain = config.pretrain
@@ -156,7 +161,7 @@ def bake(
                 teacher,
                 pretrain,
                 config.seed,
-                code_rate=config.code_rate,
+                code_lr_factor=config.code_lr_factor,
                 null_share=config.null_share,
                 imagined=config.imagined,
             ),
@@ -183,9 +188,9 @@ def compensate(
     Args:
         teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so.
     """
-    with seeded(config.seed):
+    with fixed_seed(config.seed):
         made = student.with_blend_shapes(shapes)
-        if config.seeded and teacher is not None and teacher.track is not None:
-            seed_blend_shapes(made, sequence, teacher.track)
+        if config.init_from_track and teacher is not None and teacher.track is not None:
+            init_blend_shapes(made, sequence, teacher.track)
     progress = session.run(lambda: CompensateTask(sequence, made, config, **session.options), config)
     return made.eval(), progress

@@ -26,7 +26,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.random_state import seeded
+from avatar.training.engine.random_state import fixed_seed
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitScene, fit_reference
 from avatar.training.student.bake import BakeConfig
@@ -237,7 +237,7 @@ class BaselinePiece(Piece):
 
     def make(self, shop: Workshop, get: Get, session: Session) -> tuple[Baseline, Progress]:
         sequence = shop.sequence(self.ground)
-        with seeded(self.config.seed):
+        with fixed_seed(self.config.seed):
             model = self._untrained(shop, get)
         progress = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
         return model.eval(), progress

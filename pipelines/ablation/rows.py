@@ -128,7 +128,7 @@ def ablation_pieces(
         pieces[name] = CompensatePiece(
             ground=ground,
             student=baked,
-            teacher=teacher if preset.compensate.seeded else "",
+            teacher=teacher if preset.compensate.init_from_track else "",
             shapes=replace(preset.blend_shapes, **shapes),
             config=replace(preset.compensate, null_share=max(preset.compensate.null_share, null)),
         )

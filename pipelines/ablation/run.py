@@ -258,8 +258,8 @@ class WithoutCode(nn.Module):
         super().__init__()
         self.model, self.rig = model, model.rig
 
-    def forward(self, motion: Motion, eyes: Tensor) -> PosedAvatar:
-        return self.model(motion.without_code(), eyes)
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        return self.model(motion.without_code(), camera_centers)
 
 
 def ablation_table(result: AblationResult) -> FigureTable:

@@ -124,7 +124,7 @@ class Ablate:
             preset = preset.shortened(self.iterations_share)
         if self.seed < 0:
             raise InputError("option seed", expected="a number, at least 0", received=str(self.seed))
-        preset = preset.seeded(self.seed)
+        preset = preset.with_seed(self.seed)
         if self.gaussians is not None:
             sampling = replace(preset.fit.sampling, count=self.gaussians)
             preset = replace(preset, fit=replace(preset.fit, sampling=sampling))

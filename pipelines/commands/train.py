@@ -112,7 +112,7 @@ class Train:
         config = self.config()
         with join_processes(choose_device(self.device)) as together:
             config = replace(config, preset=with_batch(config.preset, least=together.world_size))
-            scene = together.from_first(lambda: open_scene(self.run_folder, inputs))
+            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs))
             held_out = bool(scene.capture.splits.novel_view_cameras)
 
             def bar(name: str, total: int) -> AbstractContextManager:
@@ -164,7 +164,7 @@ class Train:
         share = 1.0 if self.iterations_share is None else self.iterations_share
         if not 0.0 < share < math.inf:
             raise InputError("option iterations-share", expected="a number above 0", received=f"{share:g}")
-        preset = _changed(training_preset(self.preset).seeded(self.seed).shortened(share), given, self.gaussians)
+        preset = _changed(training_preset(self.preset).with_seed(self.seed).shortened(share), given, self.gaussians)
         if self.batch is not None:
             preset = with_batch(preset, self.batch)
         if self.perceptual in ("lpips", "st-lpips"):

@@ -21,9 +21,9 @@ from avatar.models.model_file import load_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.rig.posed import AvatarModel
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.photometric_task import ViewConfig
+from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_shortage
+from avatar.training.engine.resource_errors import explain_resource_errors
 from avatar.training.presets import LOCAL, TrainingPreset
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from pipelines.runs.digests import code_digest, sha256_file
@@ -117,7 +117,7 @@ class Training:
 
     def seconds_left(self) -> float:
         """The same on every process; 0 when time is over."""
-        return self.together.from_first(lambda: max(0.0, self.deadline - time.monotonic()))
+        return self.together.run_on_rank0(lambda: max(0.0, self.deadline - time.monotonic()))
 
 
 def train(
@@ -156,7 +156,7 @@ def train(
 
 
 def _fit(training: Training) -> StageRecord:
-    return training.together.from_first(lambda: _fit_alone(training))
+    return training.together.run_on_rank0(lambda: _fit_alone(training))
 
 
 def _fit_alone(training: Training) -> StageRecord:
@@ -242,7 +242,7 @@ def _bake(training: Training) -> StageRecord:
 def _compensate(training: Training) -> StageRecord:
     config, preset = training.config, training.config.preset
     shapes = config.shapes(training.scene.template.expression_basis.shape[2])
-    needs = (BAKED, TEACHER) if config.teacher and preset.compensate.seeded else (BAKED,)
+    needs = (BAKED, TEACHER) if config.teacher and preset.compensate.init_from_track else (BAKED,)
     path, *teachers = (_require(training, file) for file in needs)
     max_bytes = 1e6 * config.max_megabytes if config.blend_shapes == "pruned" else None
 
@@ -283,7 +283,7 @@ def _require(training: Training, file: str) -> Path:
 def _stage(
     training: Training,
     name: str,
-    config: ViewConfig,
+    config: PhotometricConfig,
     parts: Mapping[str, Any],
     needs: Sequence[str],
     work: Callable[[AvatarSequence, Session], tuple[AvatarModel, Progress]],
@@ -326,18 +326,18 @@ def _stage(
         return (*work(sequence, session), sequence)
 
     def first(temporary: Path) -> StageOutput:
-        together.from_first(lambda: True)
+        together.run_on_rank0(lambda: True)
         with training.options.bar(name, config.iterations) as report:
             model, done, sequence = trained(replace(session, report=report))
-        with explain_shortage(run):
+        with explain_resource_errors(run):
             keep_logs(folder, temporary)
             numbers = {**write(temporary, model, sequence, session), "processes": together.world_size}
             return stage_output(temporary, model, done, sequence, numbers, overlap=scene.overlap)
 
     if not together.first:
-        if together.from_first(bool):
+        if together.run_on_rank0(bool):
             trained(session)
-        return together.from_first(_nothing)
+        return together.run_on_rank0(_nothing)
     with own_run_folder(run, (name, "report")):
         if training.options.force:
             shutil.rmtree(folder, ignore_errors=True)
@@ -353,10 +353,10 @@ def _stage(
             force=training.options.force or unfinished,
         )
         if not record.ran:
-            together.from_first(lambda: False)
+            together.run_on_rank0(lambda: False)
         if record.manifest["numbers"]["finished"]:
             shutil.rmtree(folder, ignore_errors=True)
-    return together.from_first(lambda: record)
+    return together.run_on_rank0(lambda: record)
 
 
 def _nothing() -> Any:
@@ -375,10 +375,10 @@ def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
 
 def with_batch(preset: TrainingPreset, items: int | None = None, *, least: int = 1) -> TrainingPreset:
     """The preset with `items` poses in a step of every training (None: its own), and at least `least`."""
-    return _each(preset, lambda config: {"items": max(least, items or config.items)})
+    return _each(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
 
 
-def _each(preset: TrainingPreset, changes: Callable[[ViewConfig], Mapping[str, Any]]) -> TrainingPreset:
+def _each(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:
     """The preset with changes of the three trainings."""
     trainings = {name: getattr(preset, name) for name in ("teacher", "bake", "compensate")}
     return replace(preset, **{name: replace(config, **changes(config)) for name, config in trainings.items()})

@@ -14,12 +14,12 @@ from avatar.data.views import read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.stages.build_config import TEMPLATE, load_build
 from pipelines.stages.fit import FitInputs, open_cameras, silhouette_overlap
-from pipelines.stages.train_names import spread
 from smplxpp.capture import Capture
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core.spread import spread
 from smplxpp.template.template import Template
 
 CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4

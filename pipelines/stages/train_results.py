@@ -75,7 +75,7 @@ def write_student(
 
     Args:
         max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
-        options: of a `ViewTask`.
+        options: of a `PhotometricTask`.
     """
     name, compact = (Path(file).name for file in (STUDENT, COMPACT_STUDENT))
     small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)

@@ -13,7 +13,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.scan import MM, load_params_of_run, load_scan
 from pipelines.stages.template import load_parts
 from smplxpp.body import load_body, load_params
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -44,12 +44,12 @@ def validate(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) 
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     flips = _flips(template, posed, run)
     checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
-    poses = {"hard poses": hard_poses(reference)}
+    poses = {"hard poses": stress_poses(reference)}
     if inputs.motion is not None:
         motion = load_params(inputs.motion, body=load_body(inputs.body))
         poses["motion"] = motion.select(np.unique(np.linspace(0, len(motion) - 1, MOTION_FRAMES).round().astype(int)))
     for title, params in poses.items():
-        names = list(HARD_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]
+        names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]
         numbers[title], worst = _stretch(template, params, names)
         checks.append(
             Check(f"edge stretch p99.9, {title}", worst, "x", 3.0, 10.0, explanation="the worst part and pose")

@@ -13,7 +13,7 @@ from smplxpp.core.params import BodyParams
 _L_HIP, _R_HIP, _SPINE1, _L_KNEE, _R_KNEE, _SPINE2, _L_ANKLE, _R_ANKLE, _SPINE3 = 1, 2, 3, 4, 5, 6, 7, 8, 9
 _NECK, _L_COLLAR, _R_COLLAR, _HEAD, _L_SHOULDER, _R_SHOULDER, _L_ELBOW, _R_ELBOW = 12, 13, 14, 15, 16, 17, 18, 19
 
-HARD_POSES: dict[str, dict[int, tuple[float, float, float]]] = {
+STRESS_POSES: dict[str, dict[int, tuple[float, float, float]]] = {
     "squat": {
         _L_HIP: (-95, 0, 15),
         _R_HIP: (-95, 0, -15),
@@ -54,16 +54,16 @@ HARD_POSES: dict[str, dict[int, tuple[float, float, float]]] = {
 }
 
 
-def hard_poses(reference: BodyParams) -> BodyParams:
-    """The poses of `HARD_POSES`, in order, with the identity of `reference` (its first frame), face neutral.
+def stress_poses(reference: BodyParams) -> BodyParams:
+    """The poses of `STRESS_POSES`, in order, with the identity of `reference` (its first frame), face neutral.
 
     Returns:
-        BodyParams of `len(HARD_POSES)` frames, root at the reference's translation, hands relaxed (zero).
+        BodyParams of `len(STRESS_POSES)` frames, root at the reference's translation, hands relaxed (zero).
     """
     first = reference.frame(0)
-    count = len(HARD_POSES)
+    count = len(STRESS_POSES)
     pose = np.zeros((count, 55, 3))
-    for row, joints in enumerate(HARD_POSES.values()):
+    for row, joints in enumerate(STRESS_POSES.values()):
         for joint, degrees in joints.items():
             pose[row, joint] = np.radians(degrees)
     return BodyParams.from_full_pose(

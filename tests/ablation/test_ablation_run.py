@@ -122,7 +122,7 @@ def test_tracking_is_left_out_of_the_row_that_says_so(tmp_path):
 def test_a_change_makes_anew_what_depends_on_it_and_nothing_else(shop, tmp_path):
     old = planned(shop, tmp_path)
     preset = tiny_preset()
-    changed = replace(preset, bake=replace(preset.bake, rate=1e-3))
+    changed = replace(preset, bake=replace(preset.bake, lr=1e-3))
     new = Ablation(shop, ablation_pieces(changed, frame=0, training_frames=FRAMES), tmp_path, inputs={})
     for name in ("gaussians", "teacher", "naked_teacher", "outer_teacher"):
         assert new.key(name) == old.key(name)
@@ -135,10 +135,12 @@ def test_a_change_makes_anew_what_depends_on_it_and_nothing_else(shop, tmp_path)
 def test_trained_rows_are_what_they_claim(finished, shop):
     ablation, result = finished
     assert tuple(result.rows) == tuple(PAPER_ROWS) and not result.waiting
-    eyes, motion = torch.tensor([[0.0, 0.5, 2.0]]), shop.sequence("clothed").motion(1)
+    camera_centers, motion = torch.tensor([[0.0, 0.5, 2.0]]), shop.sequence("clothed").motion(1)
     models = {name: ablation.piece(row.piece) for name, row in PAPER_ROWS.items()}
     with torch.no_grad():
-        posed = {name: models[name](motion, eyes) for name in ("no-mesh", "no-gaussians", "full", "no-teacher")}
+        posed = {
+            name: models[name](motion, camera_centers) for name in ("no-mesh", "no-gaussians", "full", "no-teacher")
+        }
     assert posed["no-mesh"].displacements is None
     assert models["no-mesh"].blend_shapes is not None
     assert models["no-gaussians"].blend_shapes is None and posed["no-gaussians"].displacements is not None
@@ -250,11 +252,11 @@ def test_a_pruned_student_is_smaller(finished, shop):
     assert bytes_of["pruned"] < bytes_of["null-code"]
     # The null code's row is Full, told nothing of the frame.
     full, motion = ablation.piece("full"), shop.sequence("clothed").motion(1)
-    eyes = torch.tensor([[0.0, 0.5, 2.0]])
+    camera_centers = torch.tensor([[0.0, 0.5, 2.0]])
     with torch.no_grad():
         full.codes.codes += 1.0  # three steps leave most of them at zero
-        null, own = WithoutCode(full)(motion, eyes), full(motion, eyes)
-        assert torch.equal(null.vertices, full(motion.without_code(), eyes).vertices)
+        null, own = WithoutCode(full)(motion, camera_centers), full(motion, camera_centers)
+        assert torch.equal(null.vertices, full(motion.without_code(), camera_centers).vertices)
     assert not torch.equal(null.vertices, own.vertices)
     assert result.rows["full"].report.models["Full"].bytes == bytes_of["null-code"]
 

@@ -57,7 +57,7 @@ def test_nothing_of_other_choices_is_taken(trained, tmp_path):
     def taken(name: str, preset, *, scene=scene, scale: float = 1.0) -> list[str]:
         return adopt_trained(run, ablation_of(scene, tmp_path / name, preset), scene, scale=scale, perceptual=None)
 
-    assert taken("bake", replace(preset, bake=replace(preset.bake, rate=1e-3))) == ["gaussians", "teacher"]
+    assert taken("bake", replace(preset, bake=replace(preset.bake, lr=1e-3))) == ["gaussians", "teacher"]
     fewer = replace(preset.fit, sampling=replace(preset.fit.sampling, count=400))
     assert taken("fit", replace(preset, fit=fewer)) == []
     shapes = replace(preset.blend_shapes, body_shapes=4)

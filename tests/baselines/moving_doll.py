@@ -178,12 +178,12 @@ def tiny_preset(iterations: int = 3) -> TrainingPreset:
         teacher=FitTeacherConfig(
             **{k: v for k, v in shared.items() if k != "null_share"},
             pretrain=PretrainConfig(iterations=2, batch=2),
-            rate=2e-3,
+            lr=2e-3,
             attributes=0.5,
             track=track,
         ),
-        bake=BakeConfig(**shared, rate=2e-3, views=2, pretrain=PretrainConfig(iterations=2, batch=3), imagined=2),
-        compensate=CompensateConfig(**shared, rate=2e-3, items=1, views=2),
+        bake=BakeConfig(**shared, lr=2e-3, views=2, pretrain=PretrainConfig(iterations=2, batch=3), imagined=2),
+        compensate=CompensateConfig(**shared, lr=2e-3, poses_per_step=1, views=2),
         blend_shapes=BlendShapeConfig(head_shapes=2, body_shapes=3, width=8, jaw=True),
     )
 

@@ -19,7 +19,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
-from avatar.training.engine.random_state import seeded
+from avatar.training.engine.random_state import fixed_seed
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
 from tests.baselines.moving_doll import TORSO, open_moving, params, template
@@ -45,11 +45,11 @@ def sequence(capture):
 
 def config(kind: str) -> PhotographConfig:
     attributes = 0.0 if kind == "mesh" else 0.5
-    return PhotographConfig(iterations=STEPS, views=4, rate=2e-3, attributes=attributes, null_share=0.2)
+    return PhotographConfig(iterations=STEPS, views=4, lr=2e-3, attributes=attributes, null_share=0.2)
 
 
 def made(kind: str, rig: Rig):
-    with seeded(0):
+    with fixed_seed(0):
         return make_baseline(KINDS[kind], rig, sample_on_mesh(rig.template, SAMPLING), (0, 1, 2, 3))
 
 
@@ -72,9 +72,9 @@ def trained(kind: str, sequence: AvatarSequence):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_an_avatar(kind, sequence):
-    model, eyes = made(kind, sequence.rig), torch.tensor([[0.0, 0.5, 2.0], [2.0, 0.5, 0.0]])
+    model, camera_centers = made(kind, sequence.rig), torch.tensor([[0.0, 0.5, 2.0], [2.0, 0.5, 0.0]])
     for motion in (sequence.motion(1), sequence.motion(4)):  # a frame with a code, and one without
-        posed = model(motion, eyes)
+        posed = model(motion, camera_centers)
         assert posed.vertices.shape == (template().vertex_count, 3)
         assert posed.colors.shape == (2, len(posed.gaussians.means), 3)
         assert torch.isfinite(posed.colors).all() and torch.isfinite(posed.gaussians.means).all()
@@ -85,8 +85,8 @@ def test_it_is_an_avatar(kind, sequence):
 def test_residuals_start_at_zero(kind, sequence):
     gaussians = sample_on_mesh(template(), SAMPLING)
     plain = Student(StudentConfig(field=None), sequence.rig, gaussians, ())
-    motion, eyes = sequence.motion(2), torch.tensor([[0.0, 0.5, 2.0]])
-    a, b = made(kind, sequence.rig)(motion, eyes), plain(motion, eyes)
+    motion, camera_centers = sequence.motion(2), torch.tensor([[0.0, 0.5, 2.0]])
+    a, b = made(kind, sequence.rig)(motion, camera_centers), plain(motion, camera_centers)
     torch.testing.assert_close(a.gaussians.means, b.gaussians.means)
     torch.testing.assert_close(a.colors, b.colors)
 

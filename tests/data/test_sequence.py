@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.data.sequence import Item, SequenceConfig, eyes_of
+from avatar.data.sequence import Item, SequenceConfig, camera_centers_of
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from tests.training.dancing_doll import (
@@ -139,7 +139,7 @@ def test_half_the_pixels_keep_points_where_they_are(root, margin):
 def test_eyes_are_the_cameras_places(made):
     views = [made.view(name, 0) for name in TRAIN]
     expected = np.stack([made.capture.cameras[name].position for name in TRAIN])
-    np.testing.assert_allclose(eyes_of(views).numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(camera_centers_of(views).numpy(), expected, atol=1e-6)
 
 
 def test_what_is_missing_is_said(root, tmp_path):

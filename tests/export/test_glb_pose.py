@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.body.stress_poses import hard_poses
+from smplxpp.body.stress_poses import stress_poses
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
@@ -42,7 +42,7 @@ def test_at_rest_the_skin_leaves_the_t_pose(tmp_path):
 
 def test_open_body_in_hard_poses_with_a_face(tmp_path):
     template = open_body_template()
-    poses = hard_poses(BodyParams.rest(betas=10, expressions=52)).select([0, 3])
+    poses = stress_poses(BodyParams.rest(betas=10, expressions=52)).select([0, 3])
     motion = replace(poses, expression=np.random.default_rng(1).uniform(0, 1, (2, 52)))
     write_glb(tmp_path / "a.glb", template, animation=motion)
     reader, expected = GlbReader(tmp_path / "a.glb"), template.pose(motion)

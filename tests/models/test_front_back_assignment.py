@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from avatar.models.front_back_assignment import MapSides, map_sides
+from avatar.models.front_back_assignment import FrontBackAssignment, assign_front_back
 from avatar.models.teacher_avatar import map_frame
 from avatar.render.map_frame import MapFrame
 from avatar.render.mesh_maps import vertex_normals
@@ -34,11 +34,11 @@ def ball(center=(0.0, 0.0, 0.0)) -> SimpleNamespace:
     return mesh(sphere.vertices + np.array(center), sphere.faces)
 
 
-def sides(body: SimpleNamespace | Rig, points: torch.Tensor, normals: torch.Tensor) -> MapSides:
-    return map_sides(body, MapFrame.of(body.vertices.numpy()), SIZE, points, normals)
+def sides(body: SimpleNamespace | Rig, points: torch.Tensor, normals: torch.Tensor) -> FrontBackAssignment:
+    return assign_front_back(body, MapFrame.of(body.vertices.numpy()), SIZE, points, normals)
 
 
-def own_sides(body: SimpleNamespace | Rig) -> tuple[MapSides, torch.Tensor]:
+def own_sides(body: SimpleNamespace | Rig) -> tuple[FrontBackAssignment, torch.Tensor]:
     """Of the body's own vertices, and their normals."""
     normals = vertex_normals(body.vertices, body.faces)
     return sides(body, body.vertices, normals), normals
@@ -140,8 +140,8 @@ def test_a_body_turned_round_has_its_sides_changed_over():
     turned = mesh(rig.vertices * turn, rig.faces)
     frame = map_frame(rig)
     there = MapFrame((-frame.center[0], frame.center[1], -frame.center[2]), frame.half_extent)
-    one = map_sides(rig, frame, SIZE, rig.vertices, normals)
-    two = map_sides(turned, there, SIZE, turned.vertices, normals * turn)
+    one = assign_front_back(rig, frame, SIZE, rig.vertices, normals)
+    two = assign_front_back(turned, there, SIZE, turned.vertices, normals * turn)
     apart = rig.vertices[:, 2].abs() > 0.02  # the doll is alike in front and behind: elsewhere both are as near
     assert torch.equal(one.front[apart], ~two.front[apart])
     torch.testing.assert_close(one.behind[apart], two.behind[apart], rtol=0, atol=1e-4)

@@ -19,7 +19,7 @@ from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
 from pipelines.stages.build_config import STAGES, BuildConfig, BuildInputs
 from smplxpp.body import load_params
-from smplxpp.body.stress_poses import hard_poses
+from smplxpp.body.stress_poses import stress_poses
 from smplxpp.clean import simplify
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
@@ -134,7 +134,7 @@ def test_the_template_poses_onto_the_scan(person_run):
     posed = template.pose(params.frame(0))[0]
     scan = read_mesh(FIXTURE / "scans" / "scan_000000.ply").mesh
     np.testing.assert_allclose(posed.max(axis=0), scan.vertices.max(axis=0), atol=0.03)
-    assert np.isfinite(template.pose(hard_poses(params.frame(0)))).all()
+    assert np.isfinite(template.pose(stress_poses(params.frame(0)))).all()
     shown = template.scan_index[template.scan_index >= 0]
     assert shown.max() < scan.vertex_count
 

@@ -232,7 +232,7 @@ def test_torchrun_trains_with_two_processes(fitted, capture):
     assert answer["finished"]
     for stage in STAGES:
         manifest = read_manifest(fitted / stage)
-        assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["items"] >= 2
+        assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["poses_per_step"] >= 2
 
 
 def test_the_option_for_tensorboard_reaches_the_training(fitted, capture, monkeypatch):

@@ -11,7 +11,8 @@ import pytest
 from pipelines.report import Report, write_report
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.train_names import kind_name, spread
+from pipelines.stages.train_names import kind_name
+from smplxpp.core.spread import spread
 from tests.pipelines.training_runs import STAGES, train
 from tests.training.dancing_doll import write_dance, write_dance_run
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import load_body
-from smplxpp.body.stress_poses import hard_poses
+from smplxpp.body.stress_poses import stress_poses
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
@@ -110,7 +110,7 @@ def test_bounds_warn_and_fail():
 
 def test_the_body_itself_in_hard_poses():
     body = load_body()
-    params = hard_poses(BodyParams.rest(betas=body.num_betas, expressions=body.num_expressions))
+    params = stress_poses(BodyParams.rest(betas=body.num_betas, expressions=body.num_expressions))
     posed = body.forward(params)
     for index in range(len(params)):
         frame = posed.frame(index)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.stress_poses import hard_poses
+from smplxpp.body.stress_poses import stress_poses
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 from tests.template.test_template import template_of
@@ -22,7 +22,7 @@ def test_only_the_body_is_left_and_it_poses_as_before(template):
     count = template.body_vertex_count
     assert naked.part_names == ("body",) and naked.vertex_count == naked.body_vertex_count == count
     assert len(naked.faces) == template.part_faces("body").sum() and not naked.cloth_mask.any()
-    params = hard_poses(BodyParams.rest(betas=template.betas, expressions=6))
+    params = stress_poses(BodyParams.rest(betas=template.betas, expressions=6))
     np.testing.assert_array_equal(naked.pose(params), template.pose(params)[:, :count])
 
 

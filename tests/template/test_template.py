@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.stress_poses import hard_poses
+from smplxpp.body.stress_poses import stress_poses
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, UPPER
 from smplxpp.core.params import BodyParams
@@ -65,7 +65,7 @@ def template(open_body):
 
 
 def test_the_body_poses_as_its_model(open_body, template):
-    params = hard_poses(BodyParams.rest(betas=template.betas, expressions=6))
+    params = stress_poses(BodyParams.rest(betas=template.betas, expressions=6))
     expression = np.random.default_rng(1).uniform(0, 1, (len(params), 6))
     params = replace(params, expression=expression, transl=np.array([[0.1, 1.0, -2.0]] * len(params)))
     expected = open_body.forward(params)
@@ -81,7 +81,7 @@ def test_the_body_poses_as_its_model(open_body, template):
 
 
 def test_the_identity_is_its_own(template):
-    params = hard_poses(BodyParams.rest(betas=template.betas, expressions=6))
+    params = stress_poses(BodyParams.rest(betas=template.betas, expressions=6))
     other = replace(params, betas=np.full((len(params), 4), 3.0))
     assert np.array_equal(template.pose(params), template.pose(other))
 
@@ -99,7 +99,7 @@ def test_pose_correctives_hand_means_and_hand_components_survive_the_file(tmp_pa
     body = replace(random.body_model, **hands)
     template = template_of(body, np.array([0.4, -0.2]))
     params = replace(
-        hard_poses(BodyParams.rest(betas=template.betas, expressions=3)),
+        stress_poses(BodyParams.rest(betas=template.betas, expressions=3)),
         **{f"{side}_hand_pose": rng.normal(size=(4, 6)) for side in ("left", "right")},
     )
     expected = body.forward(params)

@@ -15,7 +15,7 @@ from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.engine.optimization_task import GradientTask
+from avatar.training.engine.optimization_task import OptimizationTask
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
@@ -29,7 +29,7 @@ from tests.training.engine.test_photometric_tasks import BAKE, TEACHER
 from tests.training.engine.toy import copied, same_state
 from tests.training.tracking.test_track import CONFIG as TRACKING
 
-CONFIG = PretrainConfig(iterations=40, batch=2, rate=1e-2)
+CONFIG = PretrainConfig(iterations=40, batch=2, lr=1e-2)
 APART = replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True)
 STUDENT = StudentConfig(field=TINY_FIELD, control_points=40)
 TASKS = ("displacements", "zero residuals", "field")
@@ -61,7 +61,7 @@ def make_teacher(frames, config=APART, *, moved: float = 0.0) -> TeacherAvatar:
     return teacher
 
 
-def make(kind: str, frames, track, config=CONFIG, **changes) -> GradientTask:
+def make(kind: str, frames, track, config=CONFIG, **changes) -> OptimizationTask:
     """A task from the same start every time."""
     if kind == "displacements":
         return PretrainTeacherTask(frames, make_teacher(frames), config, 0, track)
@@ -69,7 +69,7 @@ def make(kind: str, frames, track, config=CONFIG, **changes) -> GradientTask:
         return PretrainTeacherTask(frames, make_teacher(frames, replace(APART, zero_output=False)), config, 0, None)
     teacher = make_teacher(frames, moved=0.05)
     student = Student(STUDENT, frames.rig, gaussians(), frames.train_frames)
-    options = {"code_rate": 5.0, "null_share": 0.25, "imagined": 4, **changes}
+    options = {"code_lr_factor": 5.0, "null_share": 0.25, "imagined": 4, **changes}
     return PretrainFieldTask(frames, student, teacher, config, 0, **options)
 
 
@@ -99,22 +99,24 @@ def test_every_pose_comes_once_an_epoch_in_another_order(kind, frames, track):
     task = make(kind, frames, track)
     poses = 8 if kind == "field" else 4
     per_epoch = poses // CONFIG.batch
-    epochs = [[n for k in range(e * per_epoch, (e + 1) * per_epoch) for n in task.items(k)[0]] for e in range(6)]
+    epochs = [
+        [n for k in range(e * per_epoch, (e + 1) * per_epoch) for n in task.micro_batches(k)[0]] for e in range(6)
+    ]
     assert all(sorted(epoch) == list(range(poses)) for epoch in epochs)
     assert len({tuple(epoch) for epoch in epochs}) > 1
 
 
 def test_no_pose_comes_twice_where_batches_leave_some_over(frames, track):
     task = make("displacements", frames, track, replace(CONFIG, batch=3))
-    assert all(len(set(task.items(k)[0])) == 3 for k in range(8))
-    assert {n for k in range(8) for n in task.items(k)[0]} == {0, 1, 2, 3}
+    assert all(len(set(task.micro_batches(k)[0])) == 3 for k in range(8))
+    assert {n for k in range(8) for n in task.micro_batches(k)[0]} == {0, 1, 2, 3}
     assert make("displacements", frames, track, replace(CONFIG, batch=99)).batch == 4
 
 
 @pytest.mark.parametrize("kind", TASKS)
 def test_a_batch_costs_the_mean_of_its_poses(kind, frames, track):
     task = make(kind, frames, track, null_share=0.0)
-    task.items(0)
+    task.micro_batches(0)
     both, *single = (float(task.loss(item)[0].detach()) for item in ((1, 3), (1,), (3,)))
     assert both == pytest.approx(np.mean(single), rel=1e-5)
 

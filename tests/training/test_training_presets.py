@@ -16,9 +16,9 @@ def test_the_papers_numbers():
     paper = training_preset("paper")
     iterations = (paper.teacher.iterations, paper.bake.iterations, paper.compensate.iterations)
     assert iterations == (600_000, 30_000, 100_000)
-    assert paper.fit.sampling.count == 270_000 and paper.compensate.items == 4
+    assert paper.fit.sampling.count == 270_000 and paper.compensate.poses_per_step == 4
     assert (paper.blend_shapes.head_shapes, paper.blend_shapes.body_shapes) == (8, 20)
-    assert paper.teacher.rate == paper.bake.rate == paper.compensate.rate == 5e-4
+    assert paper.teacher.lr == paper.bake.lr == paper.compensate.lr == 5e-4
     for stage in (paper.teacher, paper.bake, paper.compensate):
         weights = stage.weights
         assert (weights.dssim, weights.perceptual, weights.normal, weights.alpha) == (0.2, 0.01, 0.02, 0.0)
@@ -28,9 +28,9 @@ def test_the_papers_numbers():
 @pytest.mark.parametrize("name", TRAINING_PRESETS)
 def test_a_seed_reaches_every_stage_and_nothing_else(name):
     preset = training_preset(name)
-    seeded = preset.seeded(7)
-    assert {getattr(seeded, stage).seed for stage in STAGES} == {7} and seeded.fit.sampling.seed == 7
-    assert seeded.seeded(0) == preset.seeded(0)
+    reseeded = preset.with_seed(7)
+    assert {getattr(reseeded, stage).seed for stage in STAGES} == {7} and reseeded.fit.sampling.seed == 7
+    assert reseeded.with_seed(0) == preset.with_seed(0)
 
 
 @pytest.mark.parametrize("name", TRAINING_PRESETS)

@@ -26,7 +26,7 @@ def teach(capture: Path, folder: Path, together: Distributed) -> None:
     torch.manual_seed(together.rank)
     frames = sequence(capture)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
-    config = FitTeacherConfig(pretrain=None, rate=1e-3, attributes=0.5, **{**STEPS, "items": 4, "iterations": 4})
+    config = FitTeacherConfig(pretrain=None, lr=1e-3, attributes=0.5, **{**STEPS, "poses_per_step": 4, "iterations": 4})
     task = TeacherTask(frames, teacher, config, distributed=together)
     run_training(task, LoopConfig(iterations=4, evaluate_every=4), folder, key="k")
     learned = {name: value.detach().contiguous() for name, value in task.learned.items()}

@@ -8,8 +8,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from avatar.models.networks.config import require_at_least
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 
 STORED_BYTES = 2
 """Bytes of a stored coefficient (half precision)."""

@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from avatar.models.networks.config import require_at_least
 from avatar.models.networks.control_points import ControlPoints
 from avatar.models.networks.sparse_rows import SparseRows
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from avatar.models.networks.config import require_choice
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.teacher import TeacherConfig
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from avatar.models.networks.config import require_at_least
 from avatar.models.networks.layers import (
     GAIN,
     SLOPE,
@@ -26,6 +25,7 @@ from avatar.models.networks.layers import (
     ToMaps,
 )
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 
 STYLE_RATE = 0.01
 """Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""

@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from avatar.models.networks.config import require_choice
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 POSITION, COLOUR = 3, 3
 OTHER = 7

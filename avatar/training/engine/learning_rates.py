@@ -10,7 +10,7 @@ from smplxpp.core.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRates:
-    """Adam's step of every attribute at the start; all fall exponentially to `final` times that.
+    """Adam's step of every attribute at the start; all fall exponentially to `lr_final_factor` times that.
 
     Attributes:
         normal_offset: pixels along the normal, which has the silhouettes to meet. A pixel is the median over the
@@ -18,7 +18,7 @@ class LearningRates:
         offset: pixels in every direction; slow, so that texture stays where several views agree on it.
         log_scales, quats, opacity_logits: of the parameters as they are stored.
         dc: of colours in [0, 1]. sh: of the coefficients that depend on the view.
-        final: share left at the last step.
+        lr_final_factor: share left at the last step.
     """
 
     normal_offset: float = 0.1
@@ -28,7 +28,7 @@ class LearningRates:
     opacity_logits: float = 3e-2
     dc: float = 2e-3
     sh: float = 5e-4
-    final: float = 0.1
+    lr_final_factor: float = 0.1
 
     def __post_init__(self) -> None:
         for f in fields(self):

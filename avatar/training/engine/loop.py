@@ -15,7 +15,7 @@ from torch import Tensor
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.metrics_log import append_metrics, truncate_metrics
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_shortage
+from avatar.training.engine.resource_errors import explain_resource_errors
 from avatar.training.engine.tensorboard_log import TensorboardLog
 
 STATE_FILE = "state.safetensors"
@@ -144,28 +144,28 @@ def run_training(
     def save() -> None:
         save_checkpoint(state, Checkpoint(done, spent_before + spent, key, task.state()))
 
-    with explain_shortage(folder), ExitStack() as stack:
+    with explain_resource_errors(folder), ExitStack() as stack:
         done, spent_before = _begin(task, state, metrics, key)
         first, spent, unsaved = done, 0.0, 0.0
-        together.from_first(open_events)
+        together.run_on_rank0(open_events)
         if not done:
-            together.from_first(evaluate)
+            together.run_on_rank0(evaluate)
         while done < config.iterations and spent < config.max_seconds:
             begin = time.perf_counter()
             values = task.step(done)
-            took = together.from_first(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
+            took = together.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
             done, spent, unsaved = done + 1, spent + took, unsaved + took
             last = done == config.iterations
             if done % config.log_every == 0 or last:
                 logged = values
-                together.from_first(log_step)
+                together.run_on_rank0(log_step)
             if done % config.evaluate_every == 0 or last:
-                together.from_first(evaluate)
+                together.run_on_rank0(evaluate)
             if unsaved >= config.checkpoint_seconds and not last:
-                together.from_first(save)
+                together.run_on_rank0(save)
                 unsaved = 0.0
         if done < config.iterations or (config.keep_end and done > first):
-            together.from_first(save)
+            together.run_on_rank0(save)
         return progress()
 
 
@@ -185,6 +185,6 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float
             0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()}
         )
 
-    checkpoint = task.distributed.from_first(start)
+    checkpoint = task.distributed.run_on_rank0(start)
     task.restore(checkpoint.tensors)
     return checkpoint.iteration, checkpoint.seconds

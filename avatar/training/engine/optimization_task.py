@@ -27,14 +27,14 @@ class OptimiserConfig:
 
     Attributes:
         iterations: T.
-        schedule: share of a group's rate at step t, counted from 0. With f the group's `final`:
+        schedule: share of a group's rate at step t, counted from 0. With f the group's `lr_final_factor`:
             cosine `f + (1 - f) (1 + cos(pi t / T)) / 2` (Loshchilov and Hutter 2017), exponential `f^(t / T)`,
             constant 1.
         warmup: steps over which the rates also rise linearly from `1 / warmup` to 1; 0 for none.
         betas, eps: Adam's.
-        clip: largest norm of all gradients together; longer ones are scaled down to it.
-        amp: networks in bfloat16 on CUDA, where the task says so with `GradientTask.autocast`. bfloat16 has float32's
-            range, so that no gradient needs scaling. Without effect on the CPU.
+        max_grad_norm: largest norm of all gradients together; longer ones are scaled down to it.
+        amp: networks in bfloat16 on CUDA, where the task says so with `OptimizationTask.autocast`. bfloat16 has
+            float32's range, so that no gradient needs scaling. Without effect on the CPU.
     """
 
     iterations: int
@@ -42,7 +42,7 @@ class OptimiserConfig:
     warmup: int = 0
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-8
-    clip: float = math.inf
+    max_grad_norm: float = math.inf
     amp: bool = False
 
     def __post_init__(self) -> None:
@@ -55,18 +55,18 @@ class OptimiserConfig:
             ("warmup", self.warmup, 0 <= self.warmup < math.inf, "a number of steps, at least 0"),
             ("betas", self.betas, all(0.0 <= beta < 1.0 for beta in self.betas), "two numbers in [0, 1)"),
             ("eps", self.eps, 0.0 < self.eps < math.inf, "a positive number"),
-            ("clip", self.clip, self.clip > 0.0, "a positive number"),
+            ("max_grad_norm", self.max_grad_norm, self.max_grad_norm > 0.0, "a positive number"),
         ):
             if not fits:
                 raise InputError(f"optimiser: {name}", expected=expected, received=repr(value))
 
-    def share(self, iteration: int, final: float) -> float:
+    def lr_factor(self, iteration: int, lr_final_factor: float) -> float:
         """Of a rate, at a step counted from 0."""
         at = iteration / self.iterations
         rising = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
         if self.schedule == "cosine":
-            return rising * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * at)))
-        return rising * (final**at if self.schedule == "exponential" else 1.0)
+            return rising * (lr_final_factor + (1.0 - lr_final_factor) * 0.5 * (1.0 + math.cos(math.pi * at)))
+        return rising * (lr_final_factor**at if self.schedule == "exponential" else 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,30 +76,30 @@ class ParameterGroup:
     Attributes:
         name: with the tensor's own, `name.own`, its key in checkpoints. Groups may share a name, not a key.
         parameters: leaves that require a gradient, all of one device.
-        rate: Adam's step at the start. final: share of it at the end; the schedule says how it gets there.
+        lr: Adam's step at the start. lr_final_factor: share of it left at the end; the schedule says how it gets there.
     """
 
     name: str
     parameters: Mapping[str, Tensor]
-    rate: float
-    final: float = 0.05
+    lr: float
+    lr_final_factor: float = 0.05
 
     def __post_init__(self) -> None:
         assert all(value.is_leaf and value.requires_grad for value in self.parameters.values()), self.name
-        if not 0.0 < self.rate < math.inf:
-            raise InputError(f"learning rate {self.name}", expected="a positive number", received=repr(self.rate))
-        if not 0.0 < self.final <= 1.0:
+        if not 0.0 < self.lr < math.inf:
+            raise InputError(f"learning rate {self.name}", expected="a positive number", received=repr(self.lr))
+        if not 0.0 < self.lr_final_factor <= 1.0:
             raise InputError(
-                f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.final)
+                f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.lr_final_factor)
             )
 
 
-class GradientTask(ABC):
+class OptimizationTask(ABC):
     """A task of `run_training` that Adam solves: the mean loss of a step's micro-batches goes down.
 
-    A subclass says what the micro-batches of a step are (`items`) and what each costs (`loss`). Micro-batches of one
-    process are taken one after the other and their gradients added up, so that a step needs the memory of one; several
-    processes share them out.
+    A subclass says what the micro-batches of a step are (`micro_batches`) and what each costs (`loss`). Micro-batches
+    of one process are taken one after the other and their gradients added up, so that a step needs the memory of one;
+    several processes share them out.
 
     Args:
         groups: what is learned.
@@ -117,23 +117,23 @@ class GradientTask(ABC):
         assert len(self.learned) == len(keyed) > 0, "parameters need keys of their own"
         self.device = keyed[0][1].device
         self.optimiser = torch.optim.Adam(
-            [{"params": list(group.parameters.values()), "lr": group.rate} for group in groups],
+            [{"params": list(group.parameters.values()), "lr": group.lr} for group in groups],
             betas=config.betas,
             eps=config.eps,
             fused=True,
         )
 
     @abstractmethod
-    def items(self, iteration: int) -> Sequence[Any]:
+    def micro_batches(self, iteration: int) -> Sequence[Any]:
         """The micro-batches of a step: one or more, decided by its number alone, the same on every process."""
 
     @abstractmethod
     def loss(self, item: Any) -> tuple[Tensor, Mapping[str, float]]:
         """The loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
 
-    def share(self, iteration: int, group: ParameterGroup) -> float:
+    def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
         """Of a group's rate at a step: the configuration's schedule."""
-        return self.optimiser_config.share(iteration, group.final)
+        return self.optimiser_config.lr_factor(iteration, group.lr_final_factor)
 
     def name_of(self, item: Any) -> str:
         """A micro-batch in the user's words: "frame 12, cameras Cam001 Cam002"."""
@@ -158,9 +158,9 @@ class GradientTask(ABC):
             DivergedError: a loss or gradient is not finite, on any process; nothing has changed.
             InputError: fewer items than processes.
         """
-        items = self.items(iteration)
+        items = self.micro_batches(iteration)
         for group, told in zip(self.optimiser.param_groups, self.groups, strict=True):
-            group["lr"] = told.rate * self.share(iteration, told)
+            group["lr"] = told.lr * self.lr_factor(iteration, told)
         self.optimiser.zero_grad(set_to_none=True)
         outcomes = self.distributed.share_out(items, lambda own: self._backward(own, len(items)))
         for item, figures in zip(items, outcomes, strict=True):
@@ -168,8 +168,8 @@ class GradientTask(ABC):
                 raise _diverged(iteration, self.name_of(item))
         parameters = list(self.learned.values())
         self.distributed.sum_gradients(parameters)
-        if self.optimiser_config.clip < math.inf:
-            torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.clip)
+        if self.optimiser_config.max_grad_norm < math.inf:
+            torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.max_grad_norm)
         self.optimiser.step()
         return {**_means(outcomes), "items": [self.name_of(item) for item in items]}
 

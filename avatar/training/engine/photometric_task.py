@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, evenly, eyes_of
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
@@ -21,36 +21,37 @@ from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.render.avatar_view import Rendering, render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar
 from avatar.training.engine.learning_rates import LearningRates
-from avatar.training.engine.optimization_task import GradientTask, OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError
+from smplxpp.core.spread import spread_inside
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewConfig:
+class PhotometricConfig:
     """What every stage chooses.
 
     Attributes:
-        iterations: steps. items: poses in a step (the batch). views: cameras that look at each pose.
-        rate: Adam's step of the networks at the start. final: share of every rate at the end (cosine).
+        iterations: steps. poses_per_step: the batch. views: cameras that look at each pose.
+        lr: Adam's step of the networks at the start. lr_final_factor: share of every one left at the end (cosine).
         attributes: of the Gaussians' own attributes: multiple of the reference fit's rates; 0 leaves them as they are.
         weights: of the losses.
         perceptual_every: steps between those with the perceptual term, which then counts as many times.
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
             found there first.
         eps2d: see `rasterize`.
-        betas: Adam's. amp: networks in bfloat16 on CUDA. clip: largest norm of the gradient.
+        betas: Adam's. amp: networks in bfloat16 on CUDA. max_grad_norm: largest norm of the gradient.
         evaluations: how often held-out views are measured, evenly. evaluated: how many frames of either kind then.
         seed: of the order of frames and views and of all noise.
     """
 
     iterations: int
-    items: int = 1
+    poses_per_step: int = 1
     views: int = 1
-    rate: float = 5e-4
-    final: float = 0.05
+    lr: float = 5e-4
+    lr_final_factor: float = 0.05
     attributes: float = 0.0
     weights: ReconstructionWeights = field(default_factory=ReconstructionWeights)
     perceptual_every: int = 1
@@ -58,7 +59,7 @@ class ViewConfig:
     eps2d: float = 0.1
     betas: tuple[float, float] = (0.9, 0.999)
     amp: bool = False
-    clip: float = math.inf
+    max_grad_norm: float = math.inf
     evaluations: int = 6
     evaluated: int = 2
     seed: int = 0
@@ -66,7 +67,7 @@ class ViewConfig:
     def __post_init__(self) -> None:
         for name, least in (
             ("iterations", 1),
-            ("items", 1),
+            ("poses_per_step", 1),
             ("views", 1),
             ("attributes", 0.0),
             ("perceptual_every", 1),
@@ -82,14 +83,16 @@ class ViewConfig:
 
     def optimiser(self) -> OptimiserConfig:
         """Of these steps."""
-        return OptimiserConfig(iterations=self.iterations, betas=self.betas, eps=1e-15, amp=self.amp, clip=self.clip)
+        return OptimiserConfig(
+            iterations=self.iterations, betas=self.betas, eps=1e-15, amp=self.amp, max_grad_norm=self.max_grad_norm
+        )
 
     @property
     def evaluate_every(self) -> int:
         return max(1, self.iterations // self.evaluations)
 
 
-class ViewTask(GradientTask):
+class PhotometricTask(OptimizationTask):
     """A stage whose micro-batches are frames with some of their cameras.
 
     Args:
@@ -105,7 +108,7 @@ class ViewTask(GradientTask):
         self,
         sequence: AvatarSequence,
         model: AvatarModel,
-        config: ViewConfig,
+        config: PhotometricConfig,
         groups: Sequence[ParameterGroup],
         *,
         perceptual: PerceptualDistance | None = None,
@@ -118,11 +121,11 @@ class ViewTask(GradientTask):
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence))
         super().__init__((*groups, *attributes), config.optimiser(), distributed)
 
-    def items(self, iteration: int) -> Sequence[Item]:
+    def micro_batches(self, iteration: int) -> Sequence[Item]:
         """The step's frames and cameras; those of the next are read meanwhile."""
         self.iteration = iteration
         now, soon = (
-            self.sequence.items(k, count=self.config.items, views=self.config.views, seed=self.config.seed)
+            self.sequence.items(k, count=self.config.poses_per_step, views=self.config.views, seed=self.config.seed)
             for k in (iteration, iteration + 1)
         )
         self.sequence.expect(soon[self.distributed.rank :: self.distributed.world_size])
@@ -176,7 +179,7 @@ class ViewTask(GradientTask):
         images: dict[str, np.ndarray] = {}
         for kind, frames in (("novel_view", self.sequence.train_frames), ("novel_pose", splits.novel_pose_frames)):
             quality = {}
-            for frame in evenly(frames, self.config.evaluated):
+            for frame in spread_inside(frames, self.config.evaluated):
                 for camera in cameras:
                     if self.sequence.capture.file(camera, frame) is None:
                         continue
@@ -192,7 +195,7 @@ class ViewTask(GradientTask):
     def measure(self, view: View, frame: int) -> tuple[Any, np.ndarray]:
         """Figures and the rendered uint8 image of a whole view."""
         with torch.no_grad():
-            posed = self.model(self.sequence.motion(frame), eyes_of([view]))
+            posed = self.model(self.sequence.motion(frame), camera_centers_of([view]))
             seen = render_view(posed, 0, view, self.sequence.background, eps2d=self.config.eps2d)
             quality = view_quality(view, seen.image, seen.alpha, self.sequence.background, head=None)
         return quality, eight_bit(seen.image).numpy()
@@ -223,7 +226,7 @@ def attribute_groups(gaussians: LearnedGaussians, multiple: float, pixel: float)
             f"gaussians.{name}",
             {name: getattr(gaussians, name)},
             multiple * getattr(rates, name) * unit.get(name, 1.0),
-            rates.final,
+            rates.lr_final_factor,
         )
         for name in LEARNED
         if getattr(gaussians, name).numel()

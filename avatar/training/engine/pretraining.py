@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.training.engine.optimization_task import GradientTask, OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.errors import InputError
 
 KNOWN_BYTES = 1 << 30
@@ -21,13 +21,13 @@ class PretrainConfig:
 
     Attributes:
         iterations: steps of Adam. batch: poses a step.
-        rate, final, warmup, betas: of Adam, see `OptimiserConfig`.
+        lr, lr_final_factor, warmup, betas: of Adam, see `OptimiserConfig`.
     """
 
     iterations: int
     batch: int = 1
-    rate: float = 5e-4
-    final: float = 0.05
+    lr: float = 5e-4
+    lr_final_factor: float = 0.05
     warmup: int = 0
     betas: tuple[float, float] = (0.9, 0.999)
 
@@ -52,14 +52,14 @@ class PretrainConfig:
         return replace(self, iterations=max(1, round(share * self.iterations)))
 
 
-class PretrainTask(GradientTask):
+class PretrainTask(OptimizationTask):
     """One batch a step, in an order that changes from epoch to epoch."""
 
     def __init__(self, groups: Sequence[ParameterGroup], config: PretrainConfig, count: int, seed: int) -> None:
         super().__init__(groups, config.optimiser())
         self.batch, self.count, self.seed = min(config.batch, count), count, seed
 
-    def items(self, iteration: int) -> Sequence[tuple[int, ...]]:
+    def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
         """The numbers of the poses of a step: each at most once an epoch, what batches leave over in another one."""
         per_epoch = self.count // self.batch
         epoch, place = divmod(iteration, per_epoch)

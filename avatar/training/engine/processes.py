@@ -85,7 +85,7 @@ class Distributed:
                     parameter.grad = torch.empty_like(parameter)
                 parameter.grad.copy_(summed.view(parameter.shape))
 
-    def from_first(self, work: Callable[[], T]) -> T:
+    def run_on_rank0(self, work: Callable[[], T]) -> T:
         """What `work` gives on the first process, on all; the others wait. Its error is raised on all."""
         if self.world_size == 1:
             return work()

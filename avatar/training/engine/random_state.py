@@ -9,7 +9,7 @@ import torch
 
 
 @contextmanager
-def seeded(seed: int) -> Iterator[None]:
+def fixed_seed(seed: int) -> Iterator[None]:
     """Random numbers of the CPU within the block follow from `seed`; those after it are as if it had not been."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

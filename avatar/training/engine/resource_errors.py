@@ -17,7 +17,7 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
-def explain_shortage(folder: Path) -> Iterator[None]:
+def explain_resource_errors(folder: Path) -> Iterator[None]:
     """Turn errors of memory and disk within the block into an `InputError`; all others pass.
 
     Args:

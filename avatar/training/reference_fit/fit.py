@@ -33,7 +33,7 @@ from avatar.metrics.view_quality import (
 from avatar.models.learned_gaussians import LEARNED
 from avatar.render.api import rasterize
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
-from avatar.training.engine.optimization_task import GradientTask, OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.initial_colors import colors_from_views
 from smplxpp.core.errors import InputError
@@ -126,7 +126,7 @@ def fit_reference(
     return FitResult(gaussians, splats, progress, quality, images, task.heads)
 
 
-class FitTask(GradientTask):
+class FitTask(OptimizationTask):
     """A reference fit, as `run_training` wants it; a step renders one view."""
 
     def __init__(
@@ -156,7 +156,10 @@ class FitTask(GradientTask):
         unit = {"normal_offset": pixel, "offset": pixel}
         groups = [
             ParameterGroup(
-                "gaussians", {name: value}, getattr(config.rates, name) * unit.get(name, 1.0), config.rates.final
+                "gaussians",
+                {name: value},
+                getattr(config.rates, name) * unit.get(name, 1.0),
+                config.rates.lr_final_factor,
             )
             for name, value in self.parameters.items()
         ]
@@ -207,7 +210,7 @@ class FitTask(GradientTask):
         )
         return image[0], alpha[0, ..., 0]
 
-    def items(self, iteration: int) -> list[View]:
+    def micro_batches(self, iteration: int) -> list[View]:
         """One view."""
         return [self.train[self.view_index(iteration)]]
 

@@ -9,21 +9,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
-from avatar.models.networks.config import require_choice
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Motion
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
 from avatar.training.engine.pretraining import PretrainConfig
-from avatar.training.student.distillation import TeacherSource
+from avatar.training.student.distillation import DistillationTargets
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True, kw_only=True)
-class BakeConfig(ViewConfig):
+class BakeConfig(PhotometricConfig):
     """Choices of the bake: `L_bak = L_rec + a L_non + b L_sem`.
 
     Attributes:
@@ -33,7 +33,7 @@ class BakeConfig(ViewConfig):
         images: what renderings are compared with: the "teacher"'s, or "photographs".
         nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
         tau: radians a metre, of the semantic labels.
-        code_rate: Adam's step of the frame codes, as a multiple of `rate`.
+        code_lr_factor: Adam's step of the frame codes, as a multiple of `lr`.
         null_share: of the poses that are shown with the null code, so that it means something.
         pose_noise: radians, standard deviation on the theta that the field sees; skinning has the true pose.
     """
@@ -46,21 +46,21 @@ class BakeConfig(ViewConfig):
     nonrigid: float = 0.1
     semantic: float = 1.0
     tau: float = TAU
-    code_rate: float = 1.0
+    code_lr_factor: float = 1.0
     null_share: float = 0.0
     pose_noise: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("bake: images", self.images, ("teacher", "photographs"))
-        for name in ("imagined", "nonrigid", "semantic", "code_rate", "pose_noise"):
+        for name in ("imagined", "nonrigid", "semantic", "code_lr_factor", "pose_noise"):
             if not getattr(self, name) >= 0.0:
                 raise InputError(f"bake: {name}", expected="at least 0", received=repr(getattr(self, name)))
         if not 0.0 <= self.null_share <= 1.0:
             raise InputError("bake: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
 
 
-class BakeTask(ViewTask):
+class BakeTask(PhotometricTask):
     """Field, frame codes and local attributes learn from the teacher; without one, from the photographs alone.
 
     Args:
@@ -80,13 +80,15 @@ class BakeTask(ViewTask):
         groups = []
         if student.field is not None:
             groups = [
-                ParameterGroup("field", dict(student.field.named_parameters()), config.rate, config.final),
-                ParameterGroup("codes", {"codes": student.codes.codes}, config.rate * config.code_rate, config.final),
+                ParameterGroup("field", dict(student.field.named_parameters()), config.lr, config.lr_final_factor),
+                ParameterGroup(
+                    "codes", {"codes": student.codes.codes}, config.lr * config.code_lr_factor, config.lr_final_factor
+                ),
             ]
         super().__init__(sequence, student, config, groups, **options)
         self.student, self.config, self.source = student, config, None
         if teacher is not None:
-            self.source = TeacherSource(
+            self.source = DistillationTargets(
                 teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)
             )
             teacher_config = teacher.config
@@ -99,7 +101,7 @@ class BakeTask(ViewTask):
         """Of one frame."""
         motion = self._seen(self.sequence.motion(item.frame))
         views = self.views(item)
-        posed = self.student(motion, eyes_of(views))
+        posed = self.student(motion, camera_centers_of(views))
         if self.source is None:
             total, terms, _ = self.compared(posed, views)
             return total, {"loss": float(total.detach()), **terms}

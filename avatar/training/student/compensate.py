@@ -8,31 +8,31 @@ from typing import Any
 
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.models.student import Student
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import ViewConfig, ViewTask, pixel_size
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask, pixel_size
 from smplxpp.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompensateConfig(ViewConfig):
+class CompensateConfig(PhotometricConfig):
     """Choices of the compensation.
 
     Attributes:
-        iterations: 100k, and items: 4, in the paper.
-        rate: of the mapping networks. position_rate: of U, pixels. color_rate: of C, colours in [0, 1].
+        iterations: 100k, and poses_per_step: 4, in the paper.
+        lr: of the mapping networks. position_lr: of U, pixels. color_lr: of C, colours in [0, 1].
         null_share: of the poses that are shown with the null code.
-        seeded: the blend shapes start from what the field left over of the surface that the teacher followed, see
-            `seed_blend_shapes`; False: from zero, as in the paper.
+        init_from_track: the blend shapes start from what the field left over of the surface that the teacher
+            followed, see `init_blend_shapes`; False: from zero, as in the paper.
     """
 
     iterations: int = 100_000
-    items: int = 4
-    position_rate: float = 0.02
-    color_rate: float = 1e-3
+    poses_per_step: int = 4
+    position_lr: float = 0.02
+    color_lr: float = 1e-3
     null_share: float = 0.0
-    seeded: bool = False
+    init_from_track: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,7 +40,7 @@ class CompensateConfig(ViewConfig):
             raise InputError("compensation: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
 
 
-class CompensateTask(ViewTask):
+class CompensateTask(PhotometricTask):
     """U, C and the mapping networks H and B learn from photographs by `L_rec`; field and codes are frozen.
 
     Args:
@@ -57,9 +57,11 @@ class CompensateTask(ViewTask):
         mapping = {f"head.{name}": value for name, value in shapes.head.named_parameters()}
         mapping |= {f"body.{name}": value for name, value in shapes.body.named_parameters()}
         groups = [
-            ParameterGroup("mapping", mapping, config.rate, config.final),
-            ParameterGroup("positions", {"U": shapes.U}, config.position_rate * pixel_size(sequence), config.final),
-            ParameterGroup("colors", {"C": shapes.C}, config.color_rate, config.final),
+            ParameterGroup("mapping", mapping, config.lr, config.lr_final_factor),
+            ParameterGroup(
+                "positions", {"U": shapes.U}, config.position_lr * pixel_size(sequence), config.lr_final_factor
+            ),
+            ParameterGroup("colors", {"C": shapes.C}, config.color_lr, config.lr_final_factor),
         ]
         super().__init__(sequence, student, config, groups, **options)
         self.student, self.config = student, config
@@ -70,6 +72,6 @@ class CompensateTask(ViewTask):
         motion = self.sequence.motion(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
             motion = motion.without_code()
-        posed = self.student(motion, eyes_of(views))
+        posed = self.student(motion, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         return total, {"loss": float(total.detach()), **terms}

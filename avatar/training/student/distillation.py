@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
-from avatar.data.sequence import AvatarSequence, eyes_of
+from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
 from avatar.losses.deformation import semantic_labels
 from avatar.losses.reconstruction import Target
@@ -23,7 +23,7 @@ SEEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Lesson:
+class DistillationTarget:
     """What the student is to imitate in one view.
 
     Attributes:
@@ -34,7 +34,7 @@ class Lesson:
     labels: Tensor
 
 
-class TeacherSource:
+class DistillationTargets:
     """The frozen teacher, asked for lessons; the latest used are kept, in half precision.
 
     Args:
@@ -75,7 +75,7 @@ class TeacherSource:
         rig, teacher = self.sequence.rig, self.teacher
         return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
 
-    def lessons(self, frame: int, views: Sequence[View]) -> list[Lesson]:
+    def lessons(self, frame: int, views: Sequence[View]) -> list[DistillationTarget]:
         """What the teacher shows in views of a frame."""
         keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
         # Taken before others are put in, which may push them out.
@@ -83,8 +83,8 @@ class TeacherSource:
         missing = [k for k in range(len(keys)) if k not in lessons]
         if missing:
             with torch.no_grad():
-                eyes = eyes_of([views[k] for k in missing])
-                posed = self.teacher(self.sequence.motion(frame), eyes)
+                camera_centers = camera_centers_of([views[k] for k in missing])
+                posed = self.teacher(self.sequence.motion(frame), camera_centers)
                 for index, k in enumerate(missing):
                     draw = partial(self._draw, posed, index, views[k])
                     lessons[k] = self._kept.get(keys[k], draw)
@@ -100,6 +100,6 @@ class TeacherSource:
         return tuple(tensor.half() for tensor in tensors)
 
 
-def _lesson(tensors: tuple[Tensor, ...]) -> Lesson:
+def _lesson(tensors: tuple[Tensor, ...]) -> DistillationTarget:
     image, alpha, labels, *normals = (tensor.float() for tensor in tensors)
-    return Lesson(Target(image, alpha, normals[0] if normals else None), labels)
+    return DistillationTarget(Target(image, alpha, normals[0] if normals else None), labels)

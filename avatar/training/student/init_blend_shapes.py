@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, evenly
+from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.binding import on_triangles
 from avatar.gaussians.frames import triangle_frames
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.student import Student
 from avatar.models.tracked_surface import Track
+from smplxpp.core.spread import spread_inside
 
 FRAMES = 256
 """At most as many, spread over the training's, are looked at."""
@@ -18,7 +19,7 @@ STEPS, RATE, POSE_NOISE, WEIGHT_DECAY = 600, 3e-3, 0.03, 1e-3
 """Of the regression from poses to coefficients: Adam's steps and rate, radians, share of the weights."""
 
 
-def seed_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) -> None:
+def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) -> None:
     """Set U's columns of the body and the network that drives them; C and the head's columns stay.
 
     With `r_t = R^T (dv_track - dv_field)` at the Gaussians in frame t, `U z_t` are the first principal components of
@@ -30,7 +31,7 @@ def seed_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     local = triangle_frames(rig.vertices, rig.faces).rotations[bound.face_index]
     residuals, poses = [], []
     with torch.no_grad():
-        for frame in evenly(sequence.train_frames, FRAMES):
+        for frame in spread_inside(sequence.train_frames, FRAMES):
             motion = sequence.motion(frame)
             left = track.displacements(frame)
             if student.field is not None:

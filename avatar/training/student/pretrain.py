@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
 from avatar.data.sequence import AvatarSequence
-from avatar.models.front_back_assignment import map_sides
+from avatar.models.front_back_assignment import assign_front_back
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -35,7 +35,7 @@ class PretrainFieldTask(PretrainTask):
 
     Args:
         student: with a field. teacher: whose maps are learned.
-        code_rate: rate of the frame codes, as a multiple of the field's.
+        code_lr_factor: rate of the frame codes, as a multiple of the field's.
         null_share: of the training poses that are shown with the null code too.
         imagined: number of imagined poses.
     """
@@ -48,13 +48,13 @@ class PretrainFieldTask(PretrainTask):
         config: PretrainConfig,
         seed: int,
         *,
-        code_rate: float,
+        code_lr_factor: float,
         null_share: float,
         imagined: int,
     ) -> None:
         groups = [
-            ParameterGroup("field", dict(student.field.named_parameters()), config.rate, config.final),
-            ParameterGroup("codes", {"codes": student.codes.codes}, config.rate * code_rate, config.final),
+            ParameterGroup("field", dict(student.field.named_parameters()), config.lr, config.lr_final_factor),
+            ParameterGroup("codes", {"codes": student.codes.codes}, config.lr * code_lr_factor, config.lr_final_factor),
         ]
         frames = sequence.train_frames
         super().__init__(groups, config, len(frames) + imagined, seed)
@@ -64,9 +64,9 @@ class PretrainFieldTask(PretrainTask):
         self._known = ByteCache(KNOWN_BYTES)
         self.iteration = 0
 
-    def items(self, iteration: int) -> Sequence[tuple[int, ...]]:
+    def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
         self.iteration = iteration
-        return super().items(iteration)
+        return super().micro_batches(iteration)
 
     def name_of(self, item: tuple[int, ...]) -> str:
         frames = self.sequence.train_frames
@@ -115,7 +115,7 @@ class _MapLookup:
     def __init__(self, teacher: TeacherAvatar, points: Tensor) -> None:
         rig, size = teacher.rig, teacher.config.out_size
         vertices, normals = rig.vertices[points], vertex_normals(rig.vertices, rig.faces)[points]
-        sides = map_sides(rig, teacher.frame, size, vertices, normals)
+        sides = assign_front_back(rig, teacher.frame, size, vertices, normals)
         self.sampler = MapSampler(teacher.frame, size, vertices, sides.front)
         self.stays = (sides.behind > HIDDEN) & ~rig.cloth_mask[points]
 

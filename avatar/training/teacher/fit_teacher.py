@@ -9,18 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.models.networks.teacher import Residuals
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.tracking.track import TrackConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitTeacherConfig(ViewConfig):
+class FitTeacherConfig(PhotometricConfig):
     """Choices of the teacher's training.
 
     Attributes:
@@ -39,34 +39,36 @@ class FitTeacherConfig(ViewConfig):
     track: TrackConfig | None = None
 
 
-class TeacherTask(ViewTask):
+class TeacherTask(PhotometricTask):
     """`L_rec` of the teacher's renderings."""
 
     def __init__(
         self, sequence: AvatarSequence, teacher: TeacherAvatar, config: FitTeacherConfig, **options: Any
     ) -> None:
-        networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
+        networks = ParameterGroup(
+            "networks", dict(teacher.networks.named_parameters()), config.lr, config.lr_final_factor
+        )
         super().__init__(sequence, teacher, config, [networks], **options)
         self.teacher, self.config = teacher, config
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Of one frame: the networks run once for all its cameras."""
         views = self.views(item)
-        motion, eyes = self.sequence.motion(item.frame), eyes_of(views)
-        maps = self._maps(item, eyes)
-        posed = self.teacher.posed(motion, eyes, maps)
+        motion, camera_centers = self.sequence.motion(item.frame), camera_centers_of(views)
+        maps = self._maps(item, camera_centers)
+        posed = self.teacher.posed(motion, camera_centers, maps)
         total, terms, _ = self.compared(posed, views)
         if self.config.displacement:
             moved = maps.shape[..., :3].square().mean()
             total = total + self.config.displacement * moved
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
 
-    def _maps(self, item: Item, eyes: Tensor) -> Residuals:
+    def _maps(self, item: Item, camera_centers: Tensor) -> Residuals:
         motion = self.sequence.motion(item.frame)
-        noise = self.generator(item.frame).normal(size=eyes.shape) * self.config.view_jitter
+        noise = self.generator(item.frame).normal(size=camera_centers.shape) * self.config.view_jitter
         center = motion.root_from_world.inverse()[:3, 3]
-        away = (eyes - center).norm(dim=-1, keepdim=True)
-        jittered = eyes + away * torch.tensor(noise, dtype=eyes.dtype, device=eyes.device)
+        away = (camera_centers - center).norm(dim=-1, keepdim=True)
+        jittered = camera_centers + away * torch.tensor(noise, dtype=camera_centers.dtype, device=camera_centers.device)
         with self.autocast():
             maps = self.teacher.residual_maps(motion, jittered)
         return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)

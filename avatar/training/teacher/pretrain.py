@@ -30,7 +30,9 @@ class PretrainTeacherTask(PretrainTask):
     def __init__(
         self, sequence: AvatarSequence, teacher: TeacherAvatar, config: PretrainConfig, seed: int, track: Track | None
     ) -> None:
-        networks = ParameterGroup("networks", dict(teacher.networks.named_parameters()), config.rate, config.final)
+        networks = ParameterGroup(
+            "networks", dict(teacher.networks.named_parameters()), config.lr, config.lr_final_factor
+        )
         super().__init__([networks], config, len(sequence.train_frames), seed)
         self.sequence, self.teacher, self.track = sequence, teacher, track
         self._known = ByteCache(KNOWN_BYTES)
@@ -64,7 +66,7 @@ class PretrainTeacherTask(PretrainTask):
 
     def _all_residuals(self, frame: int) -> Residuals:
         cameras = self.sequence.cameras(frame, 0, 1, self.seed)
-        eyes = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
-        eyes = torch.tensor(eyes, dtype=torch.float32, device=self.sequence.device)
+        camera_centers = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
+        camera_centers = torch.tensor(camera_centers, dtype=torch.float32, device=self.sequence.device)
         with self.autocast():
-            return self.teacher.residual_maps(self.sequence.motion(frame), eyes)
+            return self.teacher.residual_maps(self.sequence.motion(frame), camera_centers)

@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, eyes_of
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import ViewConfig, ViewTask
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
 from smplxpp.core.errors import InputError
 
 
@@ -27,12 +27,12 @@ class Level:
     """A part of the steps of a frame.
 
     Attributes:
-        halvings: of the images. steps: of Adam. rate: metres, at its first step; it falls to `LEVEL_END` of that.
+        halvings: of the images. steps: of Adam. lr: metres, at its first step; it falls to `LEVEL_END` of that.
     """
 
     halvings: int
     steps: int
-    rate: float
+    lr: float
 
 
 LEVEL_END = 0.1
@@ -46,9 +46,9 @@ class TrackConfig:
         levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
         control_points: on the template. views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
-        still: weight of the mean distance that control points off the clothes move, a metre: parameters say where the
-            body is, and few pixels cannot tell better. Not applied to a template without clothes.
-        extrapolation: share of the motion between the two frames before that a frame starts with.
+        body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
+            parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
+        clothes. extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
         reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
             comes first.
@@ -59,7 +59,7 @@ class TrackConfig:
     control_points: int = 2400
     views: int = 4
     smoothness: float = 80.0
-    still: float = 0.0
+    body_motion_weight: float = 0.0
     extrapolation: float = 1.0
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
@@ -68,9 +68,15 @@ class TrackConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.rate <= 0 for level in self.levels):
+        if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.lr <= 0 for level in self.levels):
             raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
-        for name, least in (("control_points", 1), ("views", 1), ("smoothness", 0), ("still", 0), ("extrapolation", 0)):
+        for name, least in (
+            ("control_points", 1),
+            ("views", 1),
+            ("smoothness", 0),
+            ("body_motion_weight", 0),
+            ("extrapolation", 0),
+        ):
             if not getattr(self, name) >= least:
                 raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
 
@@ -85,7 +91,7 @@ class TrackConfig:
         return replace(self, levels=levels)
 
 
-class TrackTask(ViewTask):
+class TrackTask(PhotometricTask):
     """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels."""
 
     def __init__(self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, **options: Any) -> None:
@@ -97,7 +103,7 @@ class TrackTask(ViewTask):
         first = frames[0] if config.reference is None else config.reference
         self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
         self.row = {frame: row for row, frame in enumerate(frames)}
-        shared = ViewConfig(
+        shared = PhotometricConfig(
             iterations=len(frames) * config.steps,
             views=config.views,
             weights=config.weights,
@@ -111,7 +117,7 @@ class TrackTask(ViewTask):
         self.avatar, self.track_config = avatar, config
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
-    def items(self, iteration: int) -> Sequence[Item]:
+    def micro_batches(self, iteration: int) -> Sequence[Item]:
         """One frame, until its steps are done."""
         self.iteration = iteration
         place, step = divmod(iteration, self.track_config.steps)
@@ -124,10 +130,10 @@ class TrackTask(ViewTask):
         frame = self.order[place]
         return Item(frame, self.sequence.cameras(frame, step, self.track_config.views, self.track_config.seed))
 
-    def share(self, iteration: int, group: ParameterGroup) -> float:
+    def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
         """The rate itself: the level's, falling exponentially."""
         level, step = self._level(iteration)
-        return level.rate * LEVEL_END ** (step / level.steps)
+        return level.lr * LEVEL_END ** (step / level.steps)
 
     def _level(self, iteration: int) -> tuple[Level, int]:
         """The level of a step, and the step's number within it."""
@@ -148,12 +154,12 @@ class TrackTask(ViewTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """`L_rec`, the roughness of the displacements, and how far the body moves."""
         views = self.views(item)
-        posed = self.avatar(self.sequence.motion(item.frame), eyes_of(views))
+        posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         cage, controls = self.avatar.cage, self.avatar.controls
         total = total + self.track_config.smoothness * cage.roughness(controls)
-        if self.track_config.still and not cage.off_clothes.all():
-            total = total + self.track_config.still * cage.motion_off_clothes(controls)
+        if self.track_config.body_motion_weight and not cage.off_clothes.all():
+            total = total + self.track_config.body_motion_weight * cage.motion_off_clothes(controls)
         return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:

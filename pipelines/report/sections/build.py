@@ -27,7 +27,7 @@ from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from pipelines.stages.scan import MM, load_params_of_run, load_scan
 from pipelines.stages.template import load_parts, load_weights
 from smplxpp.body import load_body, load_params
-from smplxpp.body.stress_poses import HARD_POSES, hard_poses
+from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.json_values import jsonable
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
@@ -269,7 +269,7 @@ def _fidelity_section(
 
 def _poses_section(template: Template, reference: BodyParams, inputs: BuildInputs) -> Section:
     pictures = []
-    for name, vertices in zip(HARD_POSES, template.pose(hard_poses(reference)), strict=True):
+    for name, vertices in zip(STRESS_POSES, template.pose(stress_poses(reference)), strict=True):
         pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
     if inputs.motion is not None:
         motion = load_params(inputs.motion, body=load_body(inputs.body))

@@ -9,21 +9,21 @@ import pytest
 import torch
 
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.optimization_task import DivergedError, GradientTask, OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.errors import InputError
 from tests.training.engine.toy import Toy, copied, same_state
 
 CONFIG = OptimiserConfig(iterations=40)
 
 
-class Single(GradientTask):
+class Single(OptimizationTask):
     """One parameter with a loss of its own."""
 
-    def __init__(self, value: torch.Tensor, loss, config: OptimiserConfig = CONFIG, rate: float = 0.1) -> None:
+    def __init__(self, value: torch.Tensor, loss, config: OptimiserConfig = CONFIG, lr: float = 0.1) -> None:
         self.value, self.of = value.requires_grad_(), loss
-        super().__init__([ParameterGroup("only", {"value": self.value}, rate)], config)
+        super().__init__([ParameterGroup("only", {"value": self.value}, lr)], config)
 
-    def items(self, iteration: int) -> list[int]:
+    def micro_batches(self, iteration: int) -> list[int]:
         return [iteration]
 
     def loss(self, item: int):
@@ -42,7 +42,7 @@ def test_micro_batches_are_one_step_on_their_mean():
     ]
     for k in range(40):
         metrics = task.step(k)
-        losses = torch.stack([twin.loss(item)[0] for item in twin.items(k)])
+        losses = torch.stack([twin.loss(item)[0] for item in twin.micro_batches(k)])
         for optimiser in adam:
             optimiser.zero_grad()
         losses.mean().backward()
@@ -65,7 +65,7 @@ def test_it_learns():
 
 def test_numbers_are_means_over_the_items_that_have_them():
     task, twin = Toy(CONFIG), Toy(CONFIG)
-    losses = [twin.loss(item)[0].item() for item in twin.items(1)]  # batches 3, 4, 5
+    losses = [twin.loss(item)[0].item() for item in twin.micro_batches(1)]  # batches 3, 4, 5
     metrics = task.step(1)
     assert metrics["loss"] == pytest.approx(np.mean(losses))
     assert metrics["odd_loss"] == pytest.approx(np.mean([losses[0], losses[2]]))
@@ -85,30 +85,30 @@ def test_what_has_no_gradient_stays_and_has_no_moments():
 @pytest.mark.parametrize("final", [0.05, 1.0])
 def test_schedules_begin_and_end_where_they_should(final):
     cosine = OptimiserConfig(iterations=80)
-    assert [cosine.share(t, final) for t in (0, 40, 80)] == pytest.approx([1.0, (1.0 + final) / 2.0, final])
+    assert [cosine.lr_factor(t, final) for t in (0, 40, 80)] == pytest.approx([1.0, (1.0 + final) / 2.0, final])
     exponential = OptimiserConfig(iterations=80, schedule="exponential")
-    assert [exponential.share(t, final) for t in (0, 40, 80)] == pytest.approx([1.0, math.sqrt(final), final])
+    assert [exponential.lr_factor(t, final) for t in (0, 40, 80)] == pytest.approx([1.0, math.sqrt(final), final])
     constant = OptimiserConfig(iterations=80, schedule="constant")
-    assert {constant.share(t, final) for t in range(81)} == {1.0}
+    assert {constant.lr_factor(t, final) for t in range(81)} == {1.0}
 
 
 @pytest.mark.parametrize("schedule", ["cosine", "exponential", "constant"])
 def test_warming_up_rises_linearly_to_the_schedule(schedule):
     plain = OptimiserConfig(iterations=50, schedule=schedule)
     warm = OptimiserConfig(iterations=50, schedule=schedule, warmup=10)
-    shares = [warm.share(t, 0.1) / plain.share(t, 0.1) for t in range(50)]
+    shares = [warm.lr_factor(t, 0.1) / plain.lr_factor(t, 0.1) for t in range(50)]
     assert shares == pytest.approx([min(1.0, (t + 1) / 10) for t in range(50)])
 
 
-@pytest.mark.parametrize("clip", [0.5, 1e9])
-def test_clipping_shortens_all_gradients_together(clip):
-    """With a huge eps Adam's first step is the gradient's own length, `rate g / (|g| + eps)`."""
+@pytest.mark.parametrize("max_grad_norm", [0.5, 1e9])
+def test_clipping_shortens_all_gradients_together(max_grad_norm):
+    """With a huge eps Adam's first step is the gradient's own length, `lr g / (|g| + eps)`."""
     start = torch.tensor([3.0, 4.0])
-    gentle = OptimiserConfig(iterations=4, schedule="constant", eps=1e6, clip=clip)
-    task = Single(start.clone(), lambda v: 0.5 * v.square().sum(), gentle, rate=1e6)
+    gentle = OptimiserConfig(iterations=4, schedule="constant", eps=1e6, max_grad_norm=max_grad_norm)
+    task = Single(start.clone(), lambda v: 0.5 * v.square().sum(), gentle, lr=1e6)
     task.step(0)
     moved = start - task.value.detach()
-    torch.testing.assert_close(moved, start * min(1.0, clip / 5.0), rtol=1e-4, atol=0)
+    torch.testing.assert_close(moved, start * min(1.0, max_grad_norm / 5.0), rtol=1e-4, atol=0)
 
 
 def test_a_loss_that_is_not_a_number_changes_nothing_and_names_the_batch():
@@ -211,8 +211,8 @@ def test_networks_are_in_bfloat16_on_cuda_where_wanted():
         {"betas": (-0.1, 0.9)},
         {"eps": 0.0},
         {"eps": math.nan},
-        {"clip": 0.0},
-        {"clip": math.nan},
+        {"max_grad_norm": 0.0},
+        {"max_grad_norm": math.nan},
     ],
 )
 def test_choices_out_of_range_are_refused_by_name(change):
@@ -223,12 +223,12 @@ def test_choices_out_of_range_are_refused_by_name(change):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rate": 0.0}, "learning rate net"),
-        ({"rate": math.inf}, "learning rate net"),
-        ({"final": 0.0}, "final learning rate net"),
-        ({"final": 1.5}, "final learning rate net"),
+        ({"lr": 0.0}, "learning rate net"),
+        ({"lr": math.inf}, "learning rate net"),
+        ({"lr_final_factor": 0.0}, "final learning rate net"),
+        ({"lr_final_factor": 1.5}, "final learning rate net"),
     ],
 )
 def test_rates_out_of_range_are_refused_by_the_groups_name(change, words):
     with pytest.raises(InputError, match=words):
-        ParameterGroup(**{"name": "net", "parameters": {"a": torch.zeros(2).requires_grad_()}, "rate": 1.0, **change})
+        ParameterGroup(**{"name": "net", "parameters": {"a": torch.zeros(2).requires_grad_()}, "lr": 1.0, **change})

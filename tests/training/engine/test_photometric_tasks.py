@@ -19,7 +19,7 @@ from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.photometric_task import pixel_size
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
-from avatar.training.student.distillation import TeacherSource
+from avatar.training.student.distillation import DistillationTargets
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from smplxpp.core.errors import InputError
@@ -29,9 +29,9 @@ from tests.training.engine.toy import copied, same_state
 
 WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 STEPS = {"iterations": 6, "views": 2, "weights": WEIGHTS, "evaluations": 2, "evaluated": 1}
-TEACHER = FitTeacherConfig(pretrain=None, rate=1e-2, attributes=0.5, **STEPS)
-BAKE = BakeConfig(rate=1e-2, null_share=0.3, pose_noise=0.01, **STEPS)
-COMPENSATE = CompensateConfig(items=2, rate=1e-2, null_share=0.3, attributes=0.2, **STEPS)
+TEACHER = FitTeacherConfig(pretrain=None, lr=1e-2, attributes=0.5, **STEPS)
+BAKE = BakeConfig(lr=1e-2, null_share=0.3, pose_noise=0.01, **STEPS)
+COMPENSATE = CompensateConfig(poses_per_step=2, lr=1e-2, null_share=0.3, attributes=0.2, **STEPS)
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8, jaw=True)
 STUDENT = StudentConfig(field=TINY_FIELD)
 STAGES = ("teacher", "bake", "bake alone", "compensate")
@@ -109,7 +109,7 @@ def test_the_bakes_semantic_term_is_zero_for_equal_geometry(frames):
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, varied(gaussians()))  # at zero residuals: skinning alone
     student = Student(STUDENT, frames.rig, teacher.gaussians.snapshot(), frames.train_frames)
     task = BakeTask(frames, student, replace(BAKE, null_share=0.0, pose_noise=0.0, attributes=0.5), teacher=teacher)
-    _, terms = task.loss(task.items(0)[0])
+    _, terms = task.loss(task.micro_batches(0)[0])
     assert terms["semantic"] < 1e-3  # lessons are kept in half precision
     assert terms["nonrigid"] < 1e-5 and terms["l1"] < 2e-3
 
@@ -136,7 +136,7 @@ def test_the_bake_compares_with_the_teachers_images_or_with_photographs(frames):
         ("alone", None, {}),
     ):
         task = bake_of(frames, source, **changes)
-        terms[name] = task.loss(task.items(0)[0])[1]
+        terms[name] = task.loss(task.micro_batches(0)[0])[1]
     assert terms["by default"] == terms["teacher"] and terms["teacher"]["l1"] < 2e-3
     assert terms["photographs"]["l1"] > 0.02
     # Maps and labels are the teacher's still.
@@ -146,14 +146,14 @@ def test_the_bake_compares_with_the_teachers_images_or_with_photographs(frames):
 
 
 def test_a_bake_on_photographs_without_labels_has_nothing_rendered_by_the_teacher(frames, monkeypatch):
-    monkeypatch.setattr(TeacherSource, "_draw", None)
+    monkeypatch.setattr(DistillationTargets, "_draw", None)
     task = bake_of(frames, taught(frames), images="photographs", semantic=0.0)
-    _, terms = task.loss(task.items(0)[0])
+    _, terms = task.loss(task.micro_batches(0)[0])
     assert "semantic" not in terms and terms["nonrigid"] > 0
     for changes in ({"images": "photographs"}, {"semantic": 0.0}):
         asking = bake_of(frames, taught(frames), **changes)
         with pytest.raises(TypeError):
-            asking.loss(asking.items(0)[0])
+            asking.loss(asking.micro_batches(0)[0])
 
 
 def test_the_bakes_maps_are_the_surface_that_its_teacher_remembers(frames):
@@ -164,7 +164,7 @@ def test_the_bakes_maps_are_the_surface_that_its_teacher_remembers(frames):
     teacher.remember(Track(row, swing[:, None].expand(-1, 24, -1), ControlCage(frames.rig, 24)))
     task = bake_of(frames, teacher, images="photographs", semantic=0.0)
     for number in range(4):
-        (item,) = task.items(number)
+        (item,) = task.micro_batches(number)
         expected = float(swing[row[item.frame]].abs().sum()) / TINY_TEACHER.position_scale
         assert task.loss(item)[1]["nonrigid"] == pytest.approx(expected, rel=1e-3)
 
@@ -209,7 +209,7 @@ def test_steps_at_half_the_size_come_first(frames):
     task = make("teacher", frames, coarse=0.5)
     sizes = []
     for k in range(6):
-        item = task.items(k)[0]
+        item = task.micro_batches(k)[0]
         whole = frames.view(item.cameras[0], item.frame)
         sizes.append(task.views(item)[0].camera.height / whole.camera.height)
     assert all(size < 0.52 for size in sizes[:3]) and sizes[3:] == [1.0] * 3
@@ -222,7 +222,7 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
     config = replace(TEACHER, weights=weights, perceptual_every=2, view_jitter=0.0)
     task = TeacherTask(frames, teacher, config, perceptual=MeanDifference())
     for k, weight in ((0, 0.5), (1, 0.0)):
-        total, terms = task.loss(task.items(k)[0])
+        total, terms = task.loss(task.micro_batches(k)[0])
         assert ("perceptual" in terms) == bool(weight)
         assert float(total.detach()) == pytest.approx(terms["l1"] + weight * terms.get("perceptual", 0.0), rel=1e-5)
 
@@ -241,17 +241,23 @@ def test_held_out_views_and_poses_are_measured_and_shown(frames):
 
 def test_noise_follows_from_seed_step_and_frame(frames):
     task = make("bake alone", frames)
-    task.items(3)
+    task.micro_batches(3)
     draws = [task.generator(frame).random() for frame in (0, 1, 0)]
     assert draws[0] == draws[2] != draws[1]
-    task.items(4)
+    task.micro_batches(4)
     assert task.generator(0).random() != draws[0]
 
 
 def test_what_cannot_be_trained_is_refused(frames):
     with pytest.raises(InputError, match="blend shapes"):
         CompensateTask(frames, Student(STUDENT, frames.rig, gaussians(), (0,)), COMPENSATE)
-    for change in ({"iterations": 0}, {"items": 0}, {"coarse": -0.1}, {"seed": -1}, {"attributes": float("nan")}):
+    for change in (
+        {"iterations": 0},
+        {"poses_per_step": 0},
+        {"coarse": -0.1},
+        {"seed": -1},
+        {"attributes": float("nan")},
+    ):
         with pytest.raises(InputError, match=next(iter(change))):
             replace(TEACHER, **change)
     for change in ({"null_share": 1.5}, {"semantic": -1.0}, {"pose_noise": float("nan")}, {"images": "drawings"}):
@@ -304,10 +310,10 @@ def test_a_held_out_view_of_nobody_measures_nothing(frames, monkeypatch):
 
 def test_half_precision_is_the_networks_alone(frames):
     teacher, motion = taught(frames), frames.motion(1)
-    eyes = torch.tensor([[0.3, 0.7, 2.2]])
-    exact, centre = teacher.inputs(motion, eyes), teacher.position_input(motion)
+    camera_centers = torch.tensor([[0.3, 0.7, 2.2]])
+    exact, centre = teacher.inputs(motion, camera_centers), teacher.position_input(motion)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        half, half_centre = teacher.inputs(motion, eyes), teacher.position_input(motion)
+        half, half_centre = teacher.inputs(motion, camera_centers), teacher.position_input(motion)
     assert torch.equal(half.positions, exact.positions) and torch.equal(half_centre, centre)
     assert (half.cosines is None) == (exact.cosines is None)
     assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)

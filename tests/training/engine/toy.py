@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.training.engine.optimization_task import GradientTask, OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
 
 
-class Toy(GradientTask):
+class Toy(OptimizationTask):
     """Batches of a step are numbered on; `odd` has a gradient from odd ones alone, `unused` from none.
 
     Args:
@@ -35,15 +35,15 @@ class Toy(GradientTask):
         p = {name: (0.5 * torch.randn(shape, generator=random)).requires_grad_() for name, shape in shapes.items()}
         super().__init__(
             [
-                ParameterGroup("net", {name: p[name] for name in ("first", "second")}, rate=1e-2),
-                ParameterGroup("offsets", {name: p[name] for name in ("odd", "unused")}, rate=2e-2, final=0.5),
+                ParameterGroup("net", {name: p[name] for name in ("first", "second")}, lr=1e-2),
+                ParameterGroup("offsets", {name: p[name] for name in ("odd", "unused")}, lr=2e-2, lr_final_factor=0.5),
             ],
             config,
             distributed,
         )
         self.p, self.batches, self.poison = p, batches, poison
 
-    def items(self, iteration: int) -> list[int]:
+    def micro_batches(self, iteration: int) -> list[int]:
         return [iteration * self.batches + k for k in range(self.batches)]
 
     def name_of(self, item: int) -> str:

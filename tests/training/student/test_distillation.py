@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.data.sequence import eyes_of
-from avatar.training.student.distillation import TeacherSource
+from avatar.data.sequence import camera_centers_of
+from avatar.training.student.distillation import DistillationTargets
 from tests.training.dancing_doll import sequence, write_dance
 from tests.training.engine.test_photometric_tasks import taught
 
@@ -16,8 +16,8 @@ def frames(tmp_path_factory):
     return sequence(write_dance(tmp_path_factory.mktemp("captures") / "dance"))
 
 
-def source(frames, **options) -> TeacherSource:
-    return TeacherSource(taught(frames), frames, **{"eps2d": 0.1, "tau": 8.0, "normals": True, **options})
+def source(frames, **options) -> DistillationTargets:
+    return DistillationTargets(taught(frames), frames, **{"eps2d": 0.1, "tau": 8.0, "normals": True, **options})
 
 
 def test_lessons_show_what_the_teacher_renders(frames):
@@ -26,7 +26,7 @@ def test_lessons_show_what_the_teacher_renders(frames):
     own, views = source(frames), [frames.view(name, 1) for name in ("Ring0", "Ring2")]
     lessons = own.lessons(1, views)
     with torch.no_grad():
-        posed = own.teacher(frames.motion(1), eyes_of(views))
+        posed = own.teacher(frames.motion(1), camera_centers_of(views))
     for index, (view, lesson) in enumerate(zip(views, lessons, strict=True)):
         seen = render_view(posed, index, view, frames.background, normals=True, extra=own.labels)
         torch.testing.assert_close(lesson.target.image, seen.image, rtol=1e-3, atol=1e-3)
@@ -47,7 +47,7 @@ def test_maps_are_the_teachers(frames):
 def test_a_lesson_is_drawn_once(frames, monkeypatch):
     own, views = source(frames), [frames.view("Ring1", 0)]
     first = own.lessons(0, views)[0]
-    monkeypatch.setattr(TeacherSource, "_draw", None)
+    monkeypatch.setattr(DistillationTargets, "_draw", None)
     again = own.lessons(0, views)[0]
     assert torch.equal(first.target.image, again.target.image) and torch.equal(first.labels, again.labels)
 

@@ -15,7 +15,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.teacher import local_offsets
 from avatar.models.student import Student, StudentConfig
 from avatar.models.tracked_surface import ControlCage, Track
-from avatar.training.student.init_blend_shapes import _components, seed_blend_shapes
+from avatar.training.student.init_blend_shapes import _components, init_blend_shapes
 from tests.training.dancing_doll import TINY_FIELD, dance, gaussians, sequence, varied, write_dance
 from tests.training.engine.toy import copied, same_state
 
@@ -82,7 +82,7 @@ def error(frames: AvatarSequence, made: Student, track: Track) -> float:
 def test_the_gaussians_come_to_the_followed_surface(shapes, config, frames):
     made, track = student(frames, shapes, **config), followed(frames)
     before = error(frames, made, track)
-    seed_blend_shapes(made, frames, track)
+    init_blend_shapes(made, frames, track)
     # What is left: poses are blurred for the networks, and blends of joints are no rotations.
     assert before > 0.01 and error(frames, made, track) < 0.25 * before
 
@@ -94,7 +94,7 @@ def test_what_is_left_over_is_the_way_from_the_students_mesh_to_the_surface(fram
         "avatar.training.student.init_blend_shapes._components",
         lambda shapes, left: seen.append(left) or _components(shapes, left),
     )
-    seed_blend_shapes(made, frames, track)
+    init_blend_shapes(made, frames, track)
     rotations = triangle_frames(rig.vertices, rig.faces).rotations[made.gaussians.face_index]
 
     def at(displacements: torch.Tensor) -> torch.Tensor:
@@ -109,7 +109,7 @@ def test_what_is_left_over_is_the_way_from_the_students_mesh_to_the_surface(fram
 def test_one_column_takes_what_there_is_of_one_field(frames):
     made, track = student(frames, replace(SHAPES, body_shapes=1), field=None), followed(frames, 1)
     before = error(frames, made, track)
-    seed_blend_shapes(made, frames, track)
+    init_blend_shapes(made, frames, track)
     assert error(frames, made, track) < 0.25 * before
 
 
@@ -121,7 +121,7 @@ def test_what_follows_the_field_alone_leaves_the_gaussians_where_they_are(frames
     controls = torch.stack([moved[made.field.points] for moved in found])
     cage = ControlCage(frames.rig, 24)
     track = Track({frame: row for row, frame in enumerate(frames.train_frames)}, controls, cage)
-    seed_blend_shapes(made, frames, track)
+    init_blend_shapes(made, frames, track)
     assert max(float(moved.abs().max()) for moved in found) > 0.005
     with torch.no_grad():
         for frame in frames.train_frames:
@@ -136,7 +136,7 @@ def test_columns_of_the_body_and_their_network_change_and_nothing_else(shapes, f
         for value in (made.blend_shapes.U, made.blend_shapes.C):
             value.normal_()
     before = copied(made.state_dict())
-    seed_blend_shapes(made, frames, followed(frames))
+    init_blend_shapes(made, frames, followed(frames))
     after = made.state_dict()
     changed = {name for name, value in after.items() if not torch.equal(value, before[name])}
     assert changed == {"blend_shapes.U", *(name for name in before if name.startswith("blend_shapes.body."))}
@@ -151,7 +151,7 @@ def test_the_same_bits_whatever_torchs_random_numbers_were(frames):
     for number, each in enumerate(made):
         torch.manual_seed(number)
         before = torch.random.get_rng_state()
-        seed_blend_shapes(each, frames, followed(frames))
+        init_blend_shapes(each, frames, followed(frames))
         assert torch.equal(before, torch.random.get_rng_state())
     assert same_state(*(each.state_dict() for each in made))
 
@@ -198,7 +198,7 @@ def test_poses_between_those_of_the_frames_have_displacements_between(frames):
     controls = torch.zeros(4, 24, 3)
     controls[:, :, 0] = torch.tensor([0.03, 0.0, -0.03, 0.0])[:, None]
     track = Track({frame: row for row, frame in enumerate(frames.train_frames)}, controls, cage)
-    seed_blend_shapes(made, frames, track)
+    init_blend_shapes(made, frames, track)
     one, two = dance().frame(a), dance().frame(b)
     middle = frames.rig.motion(replace(one, body_pose=0.5 * (one.body_pose + two.body_pose)))
     at = [made.blend_shapes.body(m.pose).item() for m in (frames.motion(a), middle, frames.motion(b))]
@@ -210,5 +210,5 @@ def test_many_more_frames_than_are_looked_at(frames, monkeypatch):
     seen = []
     track = followed(frames)
     monkeypatch.setattr(Track, "displacements", lambda self, frame: seen.append(frame) or self.cage(self.controls[0]))
-    seed_blend_shapes(student(frames), frames, track)
+    init_blend_shapes(student(frames), frames, track)
     assert seen == [frames.train_frames[1], frames.train_frames[3]]

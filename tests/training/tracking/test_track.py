@@ -76,7 +76,7 @@ def test_the_template_is_the_surface_of_its_own_frame(frames, tmp_path):
 
 
 def test_with_a_prior_the_body_stays_and_the_dress_swings(frames, track, tmp_path):
-    found, _ = follow_surface(frames, painted(), replace(CONFIG, still=2.0), Session(tmp_path))
+    found, _ = follow_surface(frames, painted(), replace(CONFIG, body_motion_weight=2.0), Session(tmp_path))
     body = ~torch.tensor(template().cloth_mask)
     for frame in (1, 3):
         free, held = (one.displacements(frame)[body].norm(dim=-1).mean() for one in (track, found))
@@ -89,9 +89,9 @@ def test_without_clothes_there_is_no_prior(frames):
     bound = sample_on_mesh(naked.rig.template, SamplingConfig(count=300, sh_degree=1))
     losses = []
     for still in (0.0, 2.0):
-        made = TrackTask(naked, TrackedAvatar(naked.rig, bound, 8), replace(CONFIG, still=still))
+        made = TrackTask(naked, TrackedAvatar(naked.rig, bound, 8), replace(CONFIG, body_motion_weight=still))
         made.avatar.controls.data.fill_(0.01)
-        losses.append(made.loss(made.items(0)[0])[0])
+        losses.append(made.loss(made.micro_batches(0)[0])[0])
     assert torch.equal(*losses)
 
 
@@ -100,7 +100,7 @@ def test_frames_are_taken_from_the_reference_outwards(frames):
         frames, TrackedAvatar(frames.rig, gaussians(), CONFIG.control_points), replace(CONFIG, reference=2)
     )
     assert made.order == [2, 1, 3, 0]
-    met = [made.items(k)[0].frame for k in range(0, made.config.iterations, CONFIG.steps)]
+    met = [made.micro_batches(k)[0].frame for k in range(0, made.config.iterations, CONFIG.steps)]
     assert met == made.order
 
 
@@ -116,7 +116,7 @@ def test_a_frame_starts_from_its_neighbours_carried_on(frames):
 def test_rates_fall_within_every_level(frames):
     made = task(frames)
     group = made.groups[0]
-    rates = [made.share(k, group) for k in range(2 * CONFIG.steps)]
+    rates = [made.lr_factor(k, group) for k in range(2 * CONFIG.steps)]
     assert rates[0] == 1e-2 and rates[8] == 6e-3
     assert rates[:8] == sorted(set(rates[:8]), reverse=True) and len(set(rates[:8])) == 8
     assert rates[CONFIG.steps :] == rates[: CONFIG.steps]
@@ -138,7 +138,7 @@ def test_resumed_in_the_middle_of_a_frame_bit_for_bit(frames):
 def test_networks_learn_what_was_followed_before_they_render(frames, track):
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
-    learning = PretrainTeacherTask(frames, teacher, PretrainConfig(iterations=120, batch=2, rate=1e-2), 0, track)
+    learning = PretrainTeacherTask(frames, teacher, PretrainConfig(iterations=120, batch=2, lr=1e-2), 0, track)
     losses = [learning.step(k)["loss"] for k in range(120)]
     # Two steps see all frames; networks as small as these take up a tenth.
     assert np.mean(losses[-2:]) < 0.93 * np.mean(losses[:2])
@@ -149,7 +149,7 @@ def test_the_teacher_follows_first_within_its_time(frames, tmp_path):
         iterations=3,
         pretrain=PretrainConfig(iterations=1),
         views=1,
-        rate=1e-3,
+        lr=1e-3,
         weights=CONFIG.weights,
         track=CONFIG,
         evaluations=1,
@@ -169,7 +169,7 @@ def test_what_was_found_is_taken_up_without_a_step(frames, track, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}, {"still": -1.0}]
+    "change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}, {"body_motion_weight": -1.0}]
 )
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError):
