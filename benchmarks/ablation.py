@@ -15,9 +15,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from benchmarks.machine import store_results
-from pipelines.ablation.stage import ABLATION, RESULTS_FILE
+from pipelines.ablation.ablate import RESULTS_FILE
 from pipelines.commands.ablate import Ablate
 from pipelines.commands.options import OptionalPath
+from pipelines.runs.layout import ABLATION
 from smplxpp.core.errors import InputError
 
 SHOWN = ("psnr", "ssim", "perceptual", "psnr_head")

@@ -15,9 +15,9 @@ from PIL import Image
 
 from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
 from pipelines.figures.evaluation import read_tiles
+from pipelines.runs.artefacts import load_params_of_run, load_scan
+from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.evaluate_config import EVALUATE_STAGE
-from pipelines.stages.scan import load_params_of_run, load_scan
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError

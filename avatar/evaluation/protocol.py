@@ -80,7 +80,7 @@ def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
         InputError: a set that was asked for is empty, or all are; unknown cameras or frames; a frame without
             parameters.
     """
-    splits = _splits(capture, config)
+    splits = measured_splits(capture, config)
     pairs = {
         "training": _taking_turns(capture, splits.train_cameras, splits.train_frames, config),
         "novel_view": capture.views(splits.novel_view_cameras, splits.train_frames[:: config.every]),
@@ -130,7 +130,7 @@ def truth_frames(capture: Capture, config: ProtocolConfig, sets: Mapping[str, Vi
     """
     if capture.recording.meshes is None:
         return {}
-    splits = _splits(capture, config)
+    splits = measured_splits(capture, config)
     wanted = {"held_out" if name.startswith("novel_pose") else "training" for name in sets}
     out = {}
     for name, frames in (("training", splits.train_frames), ("held_out", splits.novel_pose_frames)):
@@ -145,7 +145,7 @@ def _has_truth(capture: Capture, frame: int) -> bool:
     return capture.truth_mesh(frame) is not None and capture.params(frame) is not None
 
 
-def _splits(capture: Capture, config: ProtocolConfig) -> Splits:
+def measured_splits(capture: Capture, config: ProtocolConfig) -> Splits:
     """The capture's splits with the user's choice of what is held out."""
     for what, chosen, known in (
         ("cameras", config.held_out_cameras, capture.cameras),

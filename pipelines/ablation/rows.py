@@ -1,30 +1,27 @@
-"""What the ablation's rows are, and the pieces that they are made from."""
+"""What the ablation's rows are, and the stages that make their models."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 from avatar.baselines.photograph_task import PhotographConfig
 from avatar.baselines.point_mlp import PointMLPConfig
 from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig
+from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import StudentConfig
 from avatar.training.presets import LOCAL, TrainingPreset
-from pipelines.ablation.pieces import (
-    CLOTHED,
-    NAKED,
-    OUTER,
-    BakePiece,
-    BaselinePiece,
-    CompensatePiece,
-    FitPiece,
-    Piece,
-    PrunedPiece,
-    SamePiece,
-    TeacherPiece,
-)
+from avatar.training.student.bake import BakeConfig
+from pipelines.ablation.stages import BaselineStage, PrunedStage
+from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
+from pipelines.stages.bake import BakeStage
+from pipelines.stages.bind import BindStage
+from pipelines.stages.compensate import CompensateStage
+from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage
+from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
 
 PRUNED_SHARE, PRUNED_MEGABYTES = 0.3, 20.0
@@ -37,12 +34,12 @@ class Row:
     """One line of the table.
 
     Attributes:
-        title: as tables have it. piece: that is measured. note: what is different, in words.
+        title: as tables have it. model: the stage that makes what is measured. note: what is different, in words.
         null_code: the avatar is driven by the null code in every frame.
     """
 
     title: str
-    piece: str
+    model: str
     note: str
     null_code: bool = False
 
@@ -107,69 +104,174 @@ def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
     return {name: row for name, row in ROWS.items() if name in chosen}
 
 
-def ablation_pieces(
-    preset: TrainingPreset, *, frame: int, training_frames: int, built_frame: int | None = None
-) -> dict[str, Piece]:
-    """Every piece that rows may need, by name; a preset decides all sizes and iterations.
+def ablation_stages(preset: TrainingPreset, *, training_frames: int) -> dict[str, ModelStage]:
+    """Every stage that rows may need, by name; a preset decides all sizes and iterations.
+
+    Those of the full system may stand in the run already, made by `smplxpp train`.
 
     Args:
-        frame: that Gaussians are fitted to. training_frames: number of them.
-        built_frame: the training frame whose surface the template is, if any.
+        training_frames: number of them, which decides how long the bake without a teacher trains.
     """
-    pieces: dict[str, Piece] = {}
-    student = preset.student()
+    plan = _Plan(preset)
+    plan.full_system(training_frames)
+    plan.options()
+    plan.baselines()
+    return plan.stages
 
-    def bake(name: str, *, student: StudentConfig = student, source: str = "teacher", **changes: float) -> None:
-        pieces[name] = BakePiece(source=source, student=student, config=replace(preset.bake, **changes))
 
-    def compensate(
-        name: str, baked: str, *, ground: str = CLOTHED, teacher: str = "teacher", null: float = 0.0, **shapes: int
+class _Plan:
+    """Stages by name, each made from those before it."""
+
+    def __init__(self, preset: TrainingPreset) -> None:
+        self.preset, self.student = preset, preset.student()
+        self.stages: dict[str, ModelStage] = {}
+
+    def full_system(self, training_frames: int) -> None:
+        """The paper's rows."""
+        preset = self.preset
+        for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
+            own = {} if prefix else {"fit": (BIND_STAGE,), "teacher": (TEACHER_STAGE,), "bake": (BAKE_STAGE,)}
+            self._add(
+                BindStage(
+                    name=_folder(f"{prefix}gaussians"),
+                    ground=ground,
+                    config=preset.fit,
+                    elsewhere=own.get("fit", ()),
+                )
+            )
+            self._add(
+                TeacherStage(
+                    name=_folder(f"{prefix}teacher"),
+                    ground=ground,
+                    gaussians=self.stages[f"{prefix}gaussians"],
+                    networks=preset.networks.teacher,
+                    config=preset.teacher,
+                    elsewhere=own.get("teacher", ()),
+                )
+            )
+            self._bake(f"{prefix}bake", f"{prefix}teacher", ground=ground, elsewhere=own.get("bake", ()))
+        self._compensate("full", "bake", elsewhere=(COMPENSATE_STAGE,))
+        self._compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
+        self._bake("no_field_bake", student=replace(self.student, field=None, control_points=0))
+        self._compensate("no_field", "no_field_bake")
+        steps = _without_teacher(preset, training_frames)
+        self._bake("no_teacher_bake", "gaussians", config=replace(preset.bake, iterations=steps))
+        self._compensate("no_teacher", "no_teacher_bake", teacher=None)
+
+    def options(self) -> None:
+        """Variants of ours."""
+        preset, teacher = self.preset, self.preset.teacher
+        if teacher.track is None:
+            self.stages["untracked"] = self.stages["full"]
+        else:
+            from_zero = replace(teacher, track=None, pretrain=None)
+            self._add(
+                replace(self.stages["teacher"], name=_folder("untracked_teacher"), config=from_zero, elsewhere=())
+            )
+            self._bake("untracked_bake", "untracked_teacher")
+            self._compensate("untracked", "untracked_bake", teacher=None)
+        self._compensate("local", "bake", shapes=replace(preset.blend_shapes, **LOCAL))
+        self._compensate("gated", "bake", shapes=replace(preset.blend_shapes, gated=True))
+        self._add(
+            PrunedStage(
+                name=_folder("pruned"),
+                student=self.stages["full"],
+                keep=PRUNED_SHARE,
+                max_bytes=1e6 * PRUNED_MEGABYTES,
+            )
+        )
+        self._bake("control_bake", student=replace(self.student, control_points=CONTROL_POINTS))
+        self._compensate("control", "control_bake")
+        if preset.bake.null_share and preset.compensate.null_share:
+            self.stages["null_code"] = self.stages["full"]
+        else:
+            share = max(preset.bake.null_share, NULL_SHARE)
+            self._bake("null_code_bake", config=replace(preset.bake, null_share=share))
+            self._compensate("null_code", "null_code_bake", null_share=NULL_SHARE)
+
+    def baselines(self) -> None:
+        """Avatars of other kinds: as many steps on photographs as the student's bake and compensation together."""
+        preset = self.preset
+        steps = preset.bake.iterations + preset.compensate.iterations
+        own = {f.name: getattr(preset.bake, f.name) for f in fields(PhotographConfig)}
+        photographs = replace(PhotographConfig(**own), iterations=steps)
+        fixed, skinned = StudentConfig(field=None), replace(preset.bake, iterations=steps)
+        self._bake("lbs", "gaussians", student=fixed, config=skinned)
+        self._bake("lbs_naked", "naked_gaussians", ground=NAKED, student=fixed, config=skinned)
+        # As fine as half the teacher's maps: charts of an atlas waste less of them than two views of a body.
+        unet = UVUNetConfig(size=preset.networks.teacher.out_size // 2)
+        mesh = TexturedMeshConfig(preset.networks.field, preset.fit.sampling)
+        for name, ground, model, config in (
+            ("mlp", CLOTHED, PointMLPConfig(), photographs),
+            ("uv", NAKED, unet, photographs),
+            ("mesh", CLOTHED, mesh, replace(photographs, attributes=0.0)),
+        ):
+            gaussians = self.stages["gaussians" if ground == CLOTHED else "naked_gaussians"]
+            self._add(BaselineStage(name=_folder(name), ground=ground, gaussians=gaussians, model=model, config=config))
+        outer = replace(self.stages["gaussians"], name=_folder("outer_gaussians"), ground=OUTER, elsewhere=())
+        self._add(outer)
+        self._add(
+            replace(
+                self.stages["teacher"],
+                name=_folder("outer_teacher"),
+                ground=OUTER,
+                gaussians=outer,
+                elsewhere=(),
+            )
+        )
+
+    def _bake(
+        self,
+        name: str,
+        source: str = "teacher",
+        *,
+        ground: str = CLOTHED,
+        student: StudentConfig | None = None,
+        config: BakeConfig | None = None,
+        elsewhere: tuple[str, ...] = (),
     ) -> None:
-        pieces[name] = CompensatePiece(
-            ground=ground,
-            student=baked,
-            teacher=teacher if preset.compensate.init_from_track else "",
-            shapes=replace(preset.blend_shapes, **shapes),
-            config=replace(preset.compensate, null_share=max(preset.compensate.null_share, null)),
+        self._add(
+            BakeStage(
+                name=_folder(name),
+                ground=ground,
+                source=self.stages[source],
+                student=student or self.student,
+                config=config or self.preset.bake,
+                elsewhere=elsewhere,
+            )
         )
 
-    teacher = preset.teacher
-    if teacher.track is not None:
-        teacher = replace(teacher, track=replace(teacher.track, reference=built_frame, seed=teacher.seed))
-    for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
-        fit = f"{prefix}gaussians"
-        pieces[fit] = FitPiece(ground=ground, config=replace(preset.fit, evaluations=1), frame=frame)
-        pieces[f"{prefix}teacher"] = TeacherPiece(
-            ground=ground, gaussians=fit, networks=preset.networks.teacher, config=teacher
+    def _compensate(
+        self,
+        name: str,
+        baked: str,
+        *,
+        ground: str = CLOTHED,
+        teacher: str | None = "teacher",
+        shapes: BlendShapeConfig | None = None,
+        null_share: float = 0.0,
+        elsewhere: tuple[str, ...] = (),
+    ) -> None:
+        own = self.preset.compensate
+        self._add(
+            CompensateStage(
+                name=_folder(name),
+                ground=ground,
+                student=self.stages[baked],
+                teacher=self.stages[teacher] if teacher is not None and own.init_from_track else None,
+                shapes=shapes or self.preset.blend_shapes,
+                config=replace(own, null_share=max(own.null_share, null_share)),
+                elsewhere=elsewhere,
+            )
         )
-        pieces[f"{prefix}bake"] = BakePiece(
-            ground=ground, source=f"{prefix}teacher", student=student, config=preset.bake
-        )
-    compensate("full", "bake")
-    compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
-    bake("no_field_bake", student=replace(student, field=None, control_points=0))
-    compensate("no_field", "no_field_bake")
-    bake("no_teacher_bake", source="gaussians", iterations=_without_teacher(preset, training_frames))
-    compensate("no_teacher", "no_teacher_bake", teacher="")
 
-    if teacher.track is None:
-        pieces["untracked"] = SamePiece(student="full")
-    else:
-        from_zero = replace(teacher, track=None, pretrain=None)
-        pieces["untracked_teacher"] = replace(pieces["teacher"], config=from_zero)
-        bake("untracked_bake", source="untracked_teacher")
-        compensate("untracked", "untracked_bake", teacher="")
-    compensate("local", "bake", **LOCAL)
-    compensate("gated", "bake", gated=True)
-    pieces["pruned"] = PrunedPiece(student="full", keep=PRUNED_SHARE, max_bytes=1e6 * PRUNED_MEGABYTES)
-    bake("control_bake", student=replace(student, control_points=CONTROL_POINTS))
-    compensate("control", "control_bake")
-    if preset.bake.null_share and preset.compensate.null_share:
-        pieces["null_code"] = SamePiece(student="full")
-    else:
-        bake("null_code_bake", null_share=max(preset.bake.null_share, NULL_SHARE))
-        compensate("null_code", "null_code_bake", null=NULL_SHARE)
-    return pieces | _baseline_pieces(preset, pieces)
+    def _add(self, stage: ModelStage) -> None:
+        self.stages[Path(stage.name).name] = stage
+
+
+def _folder(name: str) -> str:
+    """The folder of a stage that an ablation makes."""
+    return f"{ABLATION}/{name}"
 
 
 def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
@@ -183,24 +285,3 @@ def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
         return bake.iterations
     seen = teacher.iterations * teacher.views + training_frames * teacher.track.steps * teacher.track.views
     return bake.iterations + math.ceil(seen / bake.views)
-
-
-def _baseline_pieces(preset: TrainingPreset, pieces: Mapping[str, Piece]) -> dict[str, Piece]:
-    """Avatars of other kinds: as many steps on photographs as the student's bake and compensation have together."""
-    steps = preset.bake.iterations + preset.compensate.iterations
-    own = {f.name: getattr(preset.bake, f.name) for f in fields(PhotographConfig)}
-    photographs = replace(PhotographConfig(**own), iterations=steps)
-    still = StudentConfig(field=None)
-    skinned = replace(preset.bake, iterations=steps)
-    # As fine as half the teacher's maps: charts of an atlas waste less of them than two views of a body.
-    unet = UVUNetConfig(size=preset.networks.teacher.out_size // 2)
-    mesh = TexturedMeshConfig(preset.networks.field, preset.fit.sampling)
-    return {
-        "lbs": BakePiece(source="gaussians", student=still, config=skinned),
-        "lbs_naked": BakePiece(ground=NAKED, source="naked_gaussians", student=still, config=skinned),
-        "mlp": BaselinePiece(gaussians="gaussians", model=PointMLPConfig(), config=photographs),
-        "uv": BaselinePiece(ground=NAKED, gaussians="naked_gaussians", model=unet, config=photographs),
-        "mesh": BaselinePiece(gaussians="gaussians", model=mesh, config=replace(photographs, attributes=0.0)),
-        "outer_gaussians": replace(pieces["gaussians"], ground=OUTER),
-        "outer_teacher": replace(pieces["teacher"], ground=OUTER, gaussians="outer_gaussians"),
-    }

@@ -20,7 +20,7 @@ from smplxpp.core.errors import InputError
 if TYPE_CHECKING:
     from avatar.training.engine.loop import Progress as TrainingProgress
     from avatar.training.presets import TrainingPreset
-    from pipelines.ablation.stage import AblationOutcome
+    from pipelines.ablation.ablate import AblationOutcome
 
 
 UNTOLD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "force", "json")
@@ -73,9 +73,9 @@ class Ablate:
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig
         from avatar.training.engine.device import choose_device
+        from pipelines.ablation.ablate import AblationRun, ablate
         from pipelines.ablation.rows import ablation_rows
-        from pipelines.ablation.stage import AblationRun, ablate
-        from pipelines.stages.train_inputs import TrainInputs
+        from pipelines.stages.scene import TrainInputs
 
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:

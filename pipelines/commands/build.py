@@ -13,13 +13,13 @@ import tyro
 
 from pipelines.commands.options import OptionalPath
 from pipelines.commands.progress import stage_progress
+from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, TRAIN_STAGES
 from pipelines.runs.stage import StageRecord
-from pipelines.stages.build_config import FIT_STAGE, STAGES, TRAIN_STAGES, BuildConfig, BuildInputs
-from pipelines.stages.evaluate_config import EVALUATE_STAGE
+from pipelines.stages.build_config import BuildConfig, BuildInputs
 from smplxpp.capture import find_reference
 from smplxpp.core.errors import InputError
 
-StageName = Literal[STAGES]  # type: ignore[valid-type]
+StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ class Build:
     """Surface samples of the validation."""
     seed: int = 0
     """Seed of the samples."""
-    from_stage: StageName = STAGES[0]
+    from_stage: StageName = BUILD_STAGES[0]
     """First stage to run; earlier ones must stand."""
-    until_stage: StageName = STAGES[-1]
+    until_stage: StageName = BUILD_STAGES[-1]
     """Last stage to run."""
     no_report: bool = False
     """Leave out report.html, the pictures of every stage."""
@@ -79,8 +79,8 @@ class Build:
         from pipelines.stages.build import build
 
         config, inputs = self.config(), self.inputs()
-        count = STAGES.index(self.until_stage) - STAGES.index(self.from_stage) + 1
-        whole = self.until_stage == STAGES[-1] and not self.no_report
+        count = BUILD_STAGES.index(self.until_stage) - BUILD_STAGES.index(self.from_stage) + 1
+        whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
             records = build(self.out, inputs, config, first=self.from_stage, last=self.until_stage, progress=step)
             if whole and not self._report_stands(records):
@@ -97,7 +97,7 @@ class Build:
         """Whether the report was written after every stage, those of other commands among them."""
         report = self.out / "report.html"
         manifests = [record.folder / "manifest.json" for record in records.values()]
-        manifests += [self.out / name / "manifest.json" for name in (FIT_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)]
+        manifests += [self.out / name / "manifest.json" for name in (BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)]
         made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
         return report.is_file() and report.stat().st_mtime_ns > max(made)
 
@@ -129,7 +129,8 @@ class Build:
                 subject=found.subject,
                 scan=found.scan,
                 params=found.params,
-                frame=found.params_frame,
+                frame=found.frame,
+                params_row=found.params_frame,
                 labels=labels,
                 label_maps={} if labels else found.label_maps,
                 cameras=None if labels else found.cameras_file,
@@ -144,6 +145,7 @@ class Build:
             scan=self.scan,
             params=self.params,
             frame=self.frame,
+            params_row=self.frame,
             labels=self.labels,
             label_set="4ddress" if label_set == "auto" else label_set,
             body=self.body,

@@ -75,7 +75,7 @@ class Evaluate:
         from pipelines.report.sections.build import rewrite_report
         from pipelines.stages.evaluate import evaluate
         from pipelines.stages.evaluate_config import REPORT_FILE
-        from pipelines.stages.train_inputs import TrainInputs
+        from pipelines.stages.scene import TrainInputs
 
         protocol = ProtocolConfig(sets=self.sets, every=self.every, held_out_frames=self.hold_out_frames)
         if min(self.speed_size) < 1:

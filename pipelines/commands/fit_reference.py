@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,7 +17,7 @@ from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalInt, OptionalPath
 from pipelines.commands.progress import training_progress
 from pipelines.runs.stage import StageRecord
-from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
     from avatar.training.reference_fit.config import FitConfig
@@ -66,24 +67,25 @@ class FitReference:
         """Fit, write the report, print the figures."""
         require_avatar("fitting Gaussians")
         from avatar.training.engine.device import choose_device
+        from avatar.training.engine.processes import Distributed
         from pipelines.report.sections.build import rewrite_report
-        from pipelines.stages.fit import FitInputs, fit
+        from pipelines.runs.layout import BIND_STAGE, REPORT_FILE
+        from pipelines.stages.bind import BindStage
+        from pipelines.stages.models import Trainer, TrainOptions
+        from pipelines.stages.scene import TrainInputs, open_frame
 
-        inputs = FitInputs(self.capture, self.frame, self.params, self.body, self.hold_out, self.scale)
-        if not self.max_minutes > 0:
-            raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
+        require_positive("option max-minutes", self.max_minutes, finite=False)
         config = self.config()
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        scene = open_frame(self.run_folder, inputs, self.frame)
+        device = choose_device(self.device)
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:
-            record = fit(
-                self.run_folder,
-                inputs,
-                config,
-                device=choose_device(self.device),
-                max_seconds=60.0 * self.max_minutes,
-                force=self.force,
-                progress=progress,
+            options = TrainOptions(
+                max_seconds=60.0 * self.max_minutes, force=self.force, bar=lambda name, total: nullcontext(progress)
             )
-        report = self.run_folder / "report.html"
+            trainer = Trainer(self.run_folder, scene, options, Distributed(device=device), scale=self.scale)
+            record = trainer.make(BindStage(name=BIND_STAGE, config=config, by_hand=True))
+        report = self.run_folder / REPORT_FILE
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
         if not self.json:
@@ -105,8 +107,7 @@ class FitReference:
         count = config.sampling.count if self.gaussians is None else self.gaussians
         iterations = config.iterations if self.iterations is None else self.iterations
         for name, value, least in (("gaussians", count, 1), ("iterations", iterations, 1), ("seed", self.seed, 0)):
-            if value < least:
-                raise InputError(f"option {name}", expected=f"a number, at least {least}", received=str(value))
+            require_at_least(f"option {name}", value, least)
         sampling = replace(config.sampling, count=count, seed=self.seed)
         return replace(config, sampling=sampling, iterations=iterations, seed=self.seed)
 

@@ -13,9 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
+from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, TRAIN_STAGES
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.build_config import FIT_STAGE, STAGES, TRAIN_STAGES
-from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from smplxpp.core.errors import InputError
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
@@ -51,8 +50,8 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         InputError: the folder holds no run.
     """
     run = Path(run)
-    others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(STAGES))
-    stages = [_stage(run, name) for name in sorted([*STAGES, *others])]
+    others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(BUILD_STAGES))
+    stages = [_stage(run, name) for name in sorted([*BUILD_STAGES, *others])]
     _mark_outdated(stages)
     metrics = _read_json(run / "metrics.json")
     if not metrics and all(stage["state"] == "missing" for stage in stages):
@@ -84,7 +83,7 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
 
 def _remedy(run: Path, stage: str) -> str:
     """The command that makes a stage."""
-    if stage == FIT_STAGE:
+    if stage == BIND_STAGE:
         return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
     if stage in TRAIN_STAGES:
         return f"smplxpp train --run {run} --capture DIR (with the training's options)"

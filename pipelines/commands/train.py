@@ -18,8 +18,8 @@ from rich.table import Table
 from pipelines.commands.extras import require_avatar
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath
 from pipelines.commands.progress import training_progress
+from pipelines.runs.layout import BIND_STAGE
 from pipelines.runs.stage import StageRecord
-from pipelines.stages.build_config import FIT_STAGE
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -103,8 +103,9 @@ class Train:
             logging.disable(logging.WARNING)  # the first process says it
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
-        from pipelines.stages.train import TrainOptions, train, with_batch
-        from pipelines.stages.train_inputs import TrainInputs, open_scene
+        from pipelines.stages.models import TrainOptions
+        from pipelines.stages.scene import TrainInputs, open_scene
+        from pipelines.stages.train import train, with_batch
 
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
         if not self.max_minutes > 0:
@@ -119,13 +120,12 @@ class Train:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
             options = TrainOptions(
-                stages=self.stages(),
                 max_seconds=60.0 * self.max_minutes,
                 force=self.force,
                 tensorboard=self.tensorboard,
                 bar=bar,
             )
-            records = train(self.run_folder, inputs, scene, config, options, together)
+            records = train(self.run_folder, inputs, scene, config, options, together, steps=self.stages())
             if not together.first:
                 return None
         return self._finish(records)
@@ -242,7 +242,7 @@ def _print(records: dict[str, StageRecord], report: Path) -> None:
         stage = record.folder.name
         views = (
             numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
-            if stage == FIT_STAGE
+            if stage == BIND_STAGE
             else (numbers.get("novel_view", {}))
         )
         poses = numbers.get("novel_pose", {})

@@ -1,7 +1,17 @@
-"""Run folders: one folder a stage, skipped while its configuration, inputs and version stand.
+"""The one resumable stage: skipped while it stands, resumed where it was, made anew, or refused; recorded once.
 
-A stage lies in `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so a kill at
-any moment loses at most the stage under way.
+A stage lies in `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so that a
+kill at any moment loses at most the stage under way. A stage that takes long keeps its state in `RUN/<NN_stage>_work/`,
+which goes when it is finished.
+
+| what lies there | what is done |
+|---|---|
+| the stage with its key, finished, its files unchanged | skipped |
+| the stage with its key, stopped before its end, or state with its key | resumed |
+| state with another key | refused: hours may lie in it, only the user can say that they may go |
+| anything else | made anew |
+
+The key is a digest of configuration, inputs, code (`pipelines.runs.code`), versions of libraries.
 """
 
 from __future__ import annotations
@@ -9,20 +19,72 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pipelines.runs.checks import Check
-from pipelines.runs.digests import sha256_file, versions
-from smplxpp.core.atomic import atomic_folder
+from pipelines.runs.code import code_of
+from pipelines.runs.digests import GEOMETRY, sha256_file, versions
+from smplxpp.core.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_values import jsonable
 
-SCHEMA = 1
+SCHEMA = 2
+MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
+DIFFERENCES_SHOWN = 3
+Decision = Literal["skip", "resume", "redo"]
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stage:
+    """What decides a stage.
+
+    Attributes:
+        name: its folder in the run, `85_bake` or `ablation/full`; not part of the key.
+        config: dataclass or mapping of every choice.
+        inputs: SHA-256 by name of everything that it reads.
+        code: modules that do its work; what they import belongs to them.
+        libraries: whose versions decide what comes out.
+        seed: of what is drawn.
+        resumable: it keeps state in a work folder.
+        sources: files of the run by the names that `inputs` has for them, where those differ.
+    """
+
+    name: str
+    config: Any
+    inputs: Mapping[str, str]
+    code: tuple[str, ...]
+    libraries: Sequence[str] = GEOMETRY
+    seed: int = 0
+    resumable: bool = False
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """All that the key is made of, as JSON values."""
+        return {
+            "schema": SCHEMA,
+            "config": jsonable(self.config),
+            "inputs": dict(self.inputs),
+            "code": code_of(*self.code),
+            "versions": versions(self.libraries),
+        }
+
+    @cached_property
+    def key(self) -> str:
+        """The hash by which the stage is recognised."""
+        return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def work_name(self) -> str:
+        """The folder of the state of a stage under way."""
+        return f"{self.name}_work"
 
 
 @dataclass
@@ -35,79 +97,93 @@ class StageOutput:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A finished stage: its folder and manifest, and whether this call ran it."""
+    """A stage that stands: its folder and manifest, and whether this call ran it."""
 
     folder: Path
     manifest: dict[str, Any]
     ran: bool
 
+    @property
+    def finished(self) -> bool:
+        """False for a stage that a limit of time stopped."""
+        return is_finished(self.manifest)
 
-def stage_key(*, config: Any, inputs: Mapping[str, str]) -> str:
-    """The hash by which a finished stage is recognised: configuration, inputs and versions."""
-    content = {"schema": SCHEMA, "config": jsonable(config), "inputs": dict(inputs), "versions": versions()}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+def is_finished(manifest: Mapping[str, Any]) -> bool:
+    """Whether a stage came to its end; one that says nothing of it did."""
+    return bool(manifest["numbers"].get("finished", True))
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a finished stage, or None where there is none that can be read."""
-    path = Path(folder) / "manifest.json"
-    try:
-        manifest = json.loads(path.read_text())
-    except (OSError, ValueError):
+    """The manifest of a stage, or None where there is none of this version that can be read."""
+    return _record(Path(folder) / MANIFEST)
+
+
+def standing(folder: Path, stage: Stage) -> StageRecord | None:
+    """What lies in a folder, if it is this stage with its files unchanged; it may be unfinished."""
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.get("key") != stage.key or not _intact(folder, manifest):
         return None
-    return manifest if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA else None
+    return StageRecord(folder, manifest, ran=False)
 
 
-def _intact(folder: Path, manifest: dict[str, Any]) -> bool:
-    files = manifest.get("files", {})
-    return all((folder / name).is_file() and sha256_file(folder / name) == digest for name, digest in files.items())
+def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
+    """What `run_stage` will do.
+
+    Raises:
+        InputError: the state of a stage under way is of another configuration, other inputs or other code.
+    """
+    if force:
+        return "redo"
+    found = standing(run / stage.name, stage)
+    if found is not None and found.finished:
+        return "skip"
+    work = run / stage.work_name
+    if not any(work.rglob("*.safetensors")):
+        return "redo" if found is None else "resume"
+    record = _record(work / STATE_RECORD) or {}
+    if record.get("key") != stage.key:
+        raise InputError(
+            f"state of {stage.name} in {work}",
+            expected="these options, inputs and code",
+            received=f"another one's: {differences(record, stage.identity)}",
+            remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
+            "(--force does)",
+        )
+    return "resume"
 
 
-def run_stage(
-    run: Path,
-    name: str,
-    work: Callable[[Path], StageOutput],
-    *,
-    config: Any,
-    inputs: Mapping[str, str],
-    seed: int = 0,
-    force: bool = False,
-) -> StageRecord:
+def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, force: bool = False) -> StageRecord:
     """Run `work(folder)` and keep its files as `run/name`, unless the stage already stands.
 
     Args:
-        work: writes its files into the folder it is given and returns checks and numbers.
-        config: dataclass or mapping, part of the key.
-        inputs: SHA-256 by name of everything the stage reads.
-        force: run even if the stage stands.
+        work: writes its files into the folder it is given and returns checks and numbers. A resumable stage finds its
+            state in `run/work_name`.
+        force: run even if the stage stands; state of one under way goes.
+
+    Raises:
+        InputError: see `decide`.
     """
-    folder = Path(run) / name
-    key = stage_key(config=config, inputs=inputs)
-    manifest = read_manifest(folder)
-    if not force and manifest is not None and manifest.get("key") == key and _intact(folder, manifest):
-        log.info("%s: stands, skipped", name)
-        return StageRecord(folder, manifest, ran=False)
+    run = Path(run)
+    folder, state = run / stage.name, run / stage.work_name
+    decision = decide(run, stage, force=force)
+    if decision == "skip":
+        log.info("%s: stands, skipped", stage.name)
+        shutil.rmtree(state, ignore_errors=True)
+        return StageRecord(folder, read_manifest(folder) or {}, ran=False)
+    if decision == "redo":
+        shutil.rmtree(state, ignore_errors=True)
+    if stage.resumable:
+        state.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(state / STATE_RECORD, json.dumps({"key": stage.key, **stage.identity}, indent=1))
     begin = time.perf_counter()
     with atomic_folder(folder) as temporary:
         output = work(temporary)
-        files = {
-            p.relative_to(temporary).as_posix(): sha256_file(p) for p in sorted(temporary.rglob("*")) if p.is_file()
-        }
-        manifest = {
-            "schema": SCHEMA,
-            "stage": name,
-            "key": key,
-            "config": jsonable(config),
-            "inputs": dict(inputs),
-            "versions": versions(),
-            "seed": seed,
-            "seconds": round(time.perf_counter() - begin, 4),
-            "checks": [jsonable(check.as_dict()) for check in output.checks],
-            "numbers": jsonable(output.numbers),
-            "files": files,
-        }
-        (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1))
-    log.info("%s: %.2f s", name, manifest["seconds"])
+        manifest = _manifest(stage, output, temporary, time.perf_counter() - begin)
+        (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
+    if is_finished(manifest):
+        shutil.rmtree(state, ignore_errors=True)
+    log.info("%s: %.2f s", stage.name, manifest["seconds"])
     return StageRecord(folder, manifest, ran=True)
 
 
@@ -127,3 +203,56 @@ def require_stage(run: Path, name: str) -> StageRecord:
             remedy="run the build without --from-stage, or from an earlier stage",
         )
     return StageRecord(folder, manifest, ran=False)
+
+
+def differences(record: Mapping[str, Any], identity: Mapping[str, Any]) -> str:
+    """What two stages differ in, in words: options with both values, inputs, modules and libraries by name."""
+    words = []
+    for part in ("config", "inputs", "code", "versions"):
+        old, new = (_leaves(one.get(part, {})) for one in (record, identity))
+        changed = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
+        for name in changed[:DIFFERENCES_SHOWN]:
+            values = f" was {old.get(name)}, is {new.get(name)}" if part in ("config", "versions") else ""
+            words.append(f"{part} {name}{values}")
+        if len(changed) > DIFFERENCES_SHOWN:
+            words.append(f"{len(changed) - DIFFERENCES_SHOWN} more of {part}")
+    return "; ".join(words) or "its record is missing"
+
+
+def _leaves(value: Any, name: str = "") -> dict[str, Any]:
+    """The values of nested mappings by their dotted names."""
+    if isinstance(value, Mapping) and value:
+        return {k: v for key, one in value.items() for k, v in _leaves(one, f"{name}.{key}" if name else key).items()}
+    return {name: value}
+
+
+def _manifest(stage: Stage, output: StageOutput, folder: Path, seconds: float) -> dict[str, Any]:
+    files = {p.relative_to(folder).as_posix(): sha256_file(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    identity = stage.identity
+    return {
+        "schema": SCHEMA,
+        "stage": stage.name,
+        "key": stage.key,
+        "config": identity["config"],
+        "inputs": {stage.sources.get(name, name): digest for name, digest in stage.inputs.items()},
+        "code": identity["code"],
+        "versions": identity["versions"],
+        "seed": stage.seed,
+        "seconds": round(seconds, 4),
+        "checks": [jsonable(check.as_dict()) for check in output.checks],
+        "numbers": jsonable(output.numbers),
+        "files": files,
+    }
+
+
+def _record(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) and content.get("schema") == SCHEMA else None
+
+
+def _intact(folder: Path, manifest: Mapping[str, Any]) -> bool:
+    files = manifest.get("files", {})
+    return all((folder / name).is_file() and sha256_file(folder / name) == digest for name, digest in files.items())

@@ -1,38 +1,83 @@
-"""The build: stages in order, each skipped while it stands, then `metrics.json` and the report."""
+"""The build: stages in order, each skipped while it stands, then `metrics.json`."""
 
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from pipelines.runs.digests import code_digest, sha256_file
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.layout import (
+    ASSEMBLE_STAGE,
+    BUILD_STAGES,
+    CAPTURE_STAGE,
+    CLEAN_STAGE,
+    METRICS_FILE,
+    REGISTER_STAGE,
+    SEGMENT_STAGE,
+    TRANSFER_STAGE,
+    UNPOSE_STAGE,
+    VALIDATE_STAGE,
+)
 from pipelines.runs.lock import own_run_folder
-from pipelines.runs.stage import StageOutput, StageRecord, require_stage, run_stage
-from pipelines.stages import scan, template, validate
-from pipelines.stages.build_config import STAGES, BuildConfig, BuildInputs, save_build
+from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
+from pipelines.stages import assemble, capture, clean, register, segment, transfer, unpose, validate
+from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
 from smplxpp.body import load_body, load_params
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_values import jsonable
+from smplxpp.core.validation import require_choice
 from smplxpp.segment import find_label_set
 
-log = logging.getLogger(__name__)
 METRICS_SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class _Stage:
-    """A stage of the build: its work, the stages it reads, the fields of the configuration and inputs it depends on."""
+class _Part:
+    """A stage of the build.
 
-    work: Callable[[Path], StageOutput]
+    Attributes:
+        module: its `run(folder, build)` does the work; its imports are the stage's code.
+        needs: stages that it reads.
+        settings: fields of the configuration or the inputs that it depends on. files: inputs that it reads.
+    """
+
+    module: ModuleType
     needs: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
+
+
+_GEOMETRY = (REGISTER_STAGE, CLEAN_STAGE)
+PARTS: dict[str, _Part] = {
+    CAPTURE_STAGE: _Part(
+        capture, (), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
+    ),
+    REGISTER_STAGE: _Part(register, (CAPTURE_STAGE,), files=("body",)),
+    SEGMENT_STAGE: _Part(
+        segment, (CAPTURE_STAGE,), settings=("label_set",), files=("labels", "label_maps", "cameras", "scan")
+    ),
+    CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
+    TRANSFER_STAGE: _Part(transfer, _GEOMETRY, settings=("max_influences", "method"), files=("body",)),
+    UNPOSE_STAGE: _Part(unpose, (*_GEOMETRY, TRANSFER_STAGE), files=("body",)),
+    ASSEMBLE_STAGE: _Part(
+        assemble,
+        (CAPTURE_STAGE, *_GEOMETRY, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+        settings=("clearance_mm",),
+        files=("body",),
+    ),
+    VALIDATE_STAGE: _Part(
+        validate,
+        (CAPTURE_STAGE, SEGMENT_STAGE, CLEAN_STAGE, ASSEMBLE_STAGE),
+        settings=("samples", "seed"),
+        files=("body", "motion"),
+    ),
+}
 
 
 def build(
@@ -40,14 +85,14 @@ def build(
     inputs: BuildInputs,
     config: BuildConfig,
     *,
-    first: str = STAGES[0],
-    last: str = STAGES[-1],
+    first: str = BUILD_STAGES[0],
+    last: str = BUILD_STAGES[-1],
     progress: Callable[[str, bool], None] = lambda name, done: None,
 ) -> dict[str, StageRecord]:
     """Build a template in the folder `run`.
 
-    Stages before `first` must stand already; stages after `last` are left alone. A stage whose configuration, inputs
-    and versions have not changed is not run again.
+    Stages before `first` must stand already; stages after `last` are left alone. A stage whose configuration, inputs,
+    code and libraries have not changed is not run again.
 
     Args:
         progress: called with a stage's name before (False) and after (True) it.
@@ -59,82 +104,60 @@ def build(
         InputError: unusable input; every finished stage is kept.
     """
     for name in (first, last):
-        if name not in STAGES:
-            raise InputError("stage", expected=f"one of {', '.join(STAGES)}", received=repr(name))
-    if STAGES.index(first) > STAGES.index(last):
+        require_choice("stage", name, BUILD_STAGES)
+    if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
     _check_inputs(inputs)
-    with own_run_folder(run, (*STAGES, "build", "metrics", "report")):
+    with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)
-        records = _run_stages(run, inputs, config, STAGES.index(first), STAGES.index(last), progress)
+        records = _run_stages(BuildContext(run, inputs, config), first, last, progress)
         write_metrics(run, inputs, records)
     return records
 
 
 def _run_stages(
-    run: Path, inputs: BuildInputs, config: BuildConfig, first: int, last: int, progress: Callable[[str, bool], None]
+    context: BuildContext, first: str, last: str, progress: Callable[[str, bool], None]
 ) -> dict[str, StageRecord]:
-    stages = _stages(run, inputs, config)
-    code = code_digest("smplxpp", "pipelines")
     records: dict[str, StageRecord] = {}
-    for k, name in enumerate(STAGES[: last + 1]):
-        stage = stages[name]
-        if k < first:
-            records[name] = require_stage(run, name)
+    for name in BUILD_STAGES[: BUILD_STAGES.index(last) + 1]:
+        if BUILD_STAGES.index(name) < BUILD_STAGES.index(first):
+            records[name] = require_stage(context.run, name)
             continue
         progress(name, False)
-        settings = {key: getattr(config if hasattr(config, key) else inputs, key) for key in stage.settings}
-        digests = {"code": code}
-        for key in stage.files:
-            digests |= _file_digests(key, getattr(inputs, key))
-        for other in stage.needs:
-            digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
-        records[name] = run_stage(run, name, stage.work, config=settings, inputs=digests, seed=config.seed)
+        stage, module = _stage(name, context, records), PARTS[name].module
+        records[name] = run_stage(context.run, stage, lambda folder, module=module: module.run(folder, context))
         progress(name, True)
     return records
 
 
-def _stages(run: Path, inputs: BuildInputs, config: BuildConfig) -> dict[str, _Stage]:
-    label_files = ("labels", "label_maps", "cameras", "scan")
-    geometry = ("00_capture", "10_register", "30_clean")
-    return {
-        "00_capture": _Stage(
-            lambda f: scan.capture(f, inputs, config), (), ("units", "up", "frame"), ("scan", "params", "body")
-        ),
-        "10_register": _Stage(lambda f: scan.register(f, run, inputs), ("00_capture",), files=("body",)),
-        "20_segment": _Stage(lambda f: scan.segment(f, run, inputs), ("00_capture",), ("label_set",), label_files),
-        "30_clean": _Stage(lambda f: scan.clean(f, run, config), ("00_capture", "20_segment"), ("budgets",)),
-        "40_transfer": _Stage(
-            lambda f: template.transfer(f, run, inputs, config), geometry[1:], ("max_influences", "method"), ("body",)
-        ),
-        "50_unpose": _Stage(
-            lambda f: template.unpose_parts(f, run, inputs), (*geometry[1:], "40_transfer"), files=("body",)
-        ),
-        "60_assemble": _Stage(
-            lambda f: template.assemble(f, run, inputs, config),
-            (*geometry, "20_segment", "40_transfer", "50_unpose"),
-            ("clearance_mm",),
-            ("body",),
-        ),
-        "65_validate": _Stage(
-            lambda f: validate.validate(f, run, inputs, config),
-            ("00_capture", "20_segment", "30_clean", "60_assemble"),
-            ("samples", "seed"),
-            ("body", "motion"),
-        ),
-    }
+def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) -> Stage:
+    """What decides a stage of the build."""
+    part, inputs, config = PARTS[name], context.inputs, context.config
+    digests: dict[str, str] = {}
+    for key in part.files:
+        digests |= _file_digests(key, getattr(inputs, key))
+    for other in part.needs:
+        digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
+    return Stage(
+        name=name,
+        config={key: getattr(config if hasattr(config, key) else inputs, key) for key in part.settings},
+        inputs=digests,
+        code=(part.module.__name__,),
+        seed=config.seed,
+    )
 
 
 def write_metrics(run: Path, inputs: BuildInputs, records: dict[str, StageRecord]) -> Path:
-    """`metrics.json`: every check and number of the finished stages."""
-    content: dict[str, Any] = {
+    """Write `metrics.json`: every check and number of the finished stages."""
+    checks = [{"stage": name, **check} for name, record in records.items() for check in record.manifest["checks"]]
+    content = {
         "schema": METRICS_SCHEMA,
         "subject": inputs.subject,
-        "checks": [{"stage": name, **check} for name, r in records.items() for check in r.manifest["checks"]],
-        "stages": {name: r.manifest["numbers"] for name, r in records.items()},
-        "seconds": {name: r.manifest["seconds"] for name, r in records.items()},
+        "checks": checks,
+        "stages": {name: record.manifest["numbers"] for name, record in records.items()},
+        "seconds": {name: record.manifest["seconds"] for name, record in records.items()},
     }
-    path = run / "metrics.json"
+    path = run / METRICS_FILE
     atomic_write_text(path, json.dumps(jsonable(content), indent=1) + "\n")
     return path
 

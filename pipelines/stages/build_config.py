@@ -7,31 +7,9 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from pipelines.runs.layout import BUILD_FILE
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.labels import LABELS
-
-STAGES: tuple[str, ...] = (
-    "00_capture",
-    "10_register",
-    "20_segment",
-    "30_clean",
-    "40_transfer",
-    "50_unpose",
-    "60_assemble",
-    "65_validate",
-)
-
-FIT_STAGE = "70_bind"
-"""The stage that `smplxpp fit-reference` adds to a build."""
-TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE = TRAIN_STAGES = ("80_teacher", "85_bake", "90_compensate")
-"""The stages that `smplxpp train` adds."""
-GAUSSIANS = f"{FIT_STAGE}/gaussians.safetensors"
-TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
-BAKED = f"{BAKE_STAGE}/student.safetensors"
-STUDENT, COMPACT_STUDENT = (f"{COMPENSATE_STAGE}/{name}.safetensors" for name in ("student", "student_compact"))
-"""Models in a run."""
-TEMPLATE = "60_assemble/smplxpp.npz"
-"""The template in a run."""
 
 
 def _default_budgets() -> dict[str, int]:
@@ -45,7 +23,8 @@ class BuildInputs:
     Attributes:
         subject: name used in the report.
         scan: clothed scan of the reference frame.
-        params: body parameters; row `frame` of a stacked file.
+        params: body parameters. params_row: the frame's row in a file that stacks several.
+        frame: number of the frame in its capture: what trainings take its photographs by.
         labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them or
             views do.
         label_maps: label image by camera name, with `cameras` their camera file.
@@ -58,6 +37,7 @@ class BuildInputs:
     scan: Path
     params: Path
     frame: int = 0
+    params_row: int = 0
     labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
     cameras: Path | None = None
@@ -90,8 +70,19 @@ class BuildConfig:
     seed: int = 0
 
 
-BUILD_FILE = "build.json"
-"""What a run was built from, so that later stages can write its report anew."""
+@dataclass(frozen=True)
+class BuildContext:
+    """What the stages of a build work on.
+
+    Attributes:
+        run: folder of the run, in which the stages before stand.
+    """
+
+    run: Path
+    inputs: BuildInputs
+    config: BuildConfig
+
+
 _PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
 
 

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import version
+from collections.abc import Callable, Iterable
 from itertools import chain
 from pathlib import Path
 
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
-from avatar.evaluation.protocol import SETS, ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.protocol import (
+    SETS,
+    ProtocolConfig,
+    measured_splits,
+    truth_frames,
+    view_sets,
+    with_people,
+)
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.gaussians.bound_file import load_bound
@@ -21,11 +27,13 @@ from avatar.rig.rig import Rig
 from pipelines.figures import encode_png
 from pipelines.figures.evaluation import surface_picture, write_tiles
 from pipelines.runs.checks import Check
-from pipelines.runs.digests import code_digest, sha256_file
+from pipelines.runs.digests import TRAINING, sha256_file
+from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.lock import own_run_folder
-from pipelines.runs.stage import StageOutput, StageRecord, run_stage
-from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, MEASURED, MODEL_FILES, REPORT_FILE
-from pipelines.stages.train_inputs import TrainInputs, open_scene
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
+from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
+from pipelines.stages.held_out import refuse_seen
+from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
@@ -55,28 +63,33 @@ def evaluate(
     """
     files = model_files(run, models)
     scene = open_scene(run, inputs)
-    sets = with_people(scene.capture, view_sets(scene.capture, config.protocol))
+    with_people(scene.capture, view_sets(scene.capture, config.protocol))  # a bad file ends it before work starts
     sequence = AvatarSequence(scene.capture, scene.template, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
-    digests = {
-        **scene.digests,
-        **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
-        "capture/surfaces": _surface_digest(scene.capture, config.protocol, sets),
-        "code": code_digest("smplxpp", "avatar"),
-        "torch": version("torch"),
-    }
+    refuse_seen(
+        run,
+        {path.relative_to(run).parts[0] for path in files.values()},
+        measured_splits(scene.capture, config.protocol),
+    )
+    stage = Stage(
+        name=EVALUATE_STAGE,
+        config={"evaluation": config, "scale": inputs.scale, "device": device},
+        inputs={
+            **scene.digests,
+            **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
+            "capture/surfaces": surface_digest(scene.capture, config.protocol),
+        },
+        code=(__name__,),
+        libraries=TRAINING,
+        seed=config.seed,
+    )
+
+    def work(folder: Path) -> StageOutput:
+        found = evaluate_models(loaded, sequence, config, files=files, progress=progress)
+        return _write(folder, found, scene.overlap)
+
     with own_run_folder(run, (EVALUATE_STAGE, "report")):
-        return run_stage(
-            run,
-            EVALUATE_STAGE,
-            lambda folder: _write(
-                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), scene.overlap
-            ),
-            config={"evaluation": config, "scale": inputs.scale, "device": device},
-            inputs=digests,
-            seed=config.seed,
-            force=force,
-        )
+        return run_stage(run, stage, work, force=force)
 
 
 def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
@@ -210,10 +223,10 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
     return checks
 
 
-def _surface_digest(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> str:
+def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
     """SHA-256 of the true surfaces that are measured."""
     digest = hashlib.sha256()
-    for frame in chain(*truth_frames(capture, protocol, sets).values()):
+    for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
         mesh = capture.truth_mesh(frame)
         digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
     return digest.hexdigest()

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipelines.stages.build_config import BAKED, COMPACT_STUDENT, GAUSSIANS, STUDENT, TEACHER
+from pipelines.runs.layout import BAKED, COMPACT_STUDENT, GAUSSIANS, STUDENT, TEACHER
 
-EVALUATE_STAGE = "95_evaluate"
 REPORT_FILE = "metrics.json"
 MODEL_FILES: Mapping[str, str] = {
     "reference-fit": GAUSSIANS,

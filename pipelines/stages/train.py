@@ -1,57 +1,34 @@
-"""Stages 80 to 90: teacher, bake and compensation on a run's template; resumed, skipped, recorded as stages."""
+"""The training of a run: reference fit, teacher, bake and compensation, each a stage that is made once."""
 
 from __future__ import annotations
 
-import json
 import logging
-import shutil
-import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
-from importlib.metadata import version
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from avatar.data.sequence import AvatarSequence
-from avatar.gaussians.bound_file import load_bound
 from avatar.losses.perceptual import load_metric
 from avatar.losses.reconstruction import ReconstructionWeights
-from avatar.models.model_file import load_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.rig.posed import AvatarModel
-from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_resource_errors
 from avatar.training.presets import LOCAL, TrainingPreset
-from avatar.training.train import Session, bake, compensate, fit_teacher
-from pipelines.runs.digests import code_digest, sha256_file
-from pipelines.runs.lock import own_run_folder
-from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage, stage_key
-from pipelines.stages.build_config import (
-    BAKE_STAGE,
-    BAKED,
-    COMPENSATE_STAGE,
-    FIT_STAGE,
-    GAUSSIANS,
-    TEACHER,
-    TEACHER_STAGE,
-    TEMPLATE,
-)
-from pipelines.stages.fit import fit
-from pipelines.stages.train_inputs import TrainInputs, TrainScene
-from pipelines.stages.train_results import keep_logs, preview_writer, stage_output, write_model, write_student
-from smplxpp.core.atomic import atomic_write_text
+from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TEMPLATE
+from pipelines.runs.stage import StageRecord, is_finished, read_manifest
+from pipelines.stages.bake import BakeStage
+from pipelines.stages.bind import BindStage
+from pipelines.stages.compensate import CompensateStage
+from pipelines.stages.held_out import refuse_seen
+from pipelines.stages.models import ModelStage, Trainer, TrainOptions
+from pipelines.stages.scene import TrainInputs, TrainScene
+from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
-OWN_FIT = "train.json"
-"""Names the reference fit in a run that a training made: one that the user made is never replaced."""
-ONE_STEP = 1e-9
-"""Seconds: a training that is begun takes a step."""
 Shapes = Literal["full", "local", "pruned"]
-Bar = Callable[[str, int], AbstractContextManager[Callable[[Progress], None]]]
+STEPS = ("fit", "teacher", "bake", "compensate")
+"""The steps of a training in their order, as the command line calls them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,295 +50,106 @@ class TrainConfig:
     blend_shapes: Shapes = "full"
     max_megabytes: float = 20.0
 
-    def shapes(self, expression_size: int) -> BlendShapeConfig:
-        """Blend shapes of a template with so many expressions."""
-        local = LOCAL if self.blend_shapes == "local" else {}
-        return replace(self.preset.blend_shapes, expression_size=expression_size, **local)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """How training runs; nothing in it changes what comes out.
-
-    Attributes:
-        stages: of "fit", "teacher", "bake" and "compensate" in this order; those before the first must stand.
-        max_seconds: stop after as long with a checkpoint and what there is.
-        force: train anew even what stands.
-        tensorboard: log for TensorBoard into the folders of the stages.
-        bar: called with a stage's name and iterations; shows its progress.
-    """
-
-    stages: tuple[str, ...] = ("fit", "teacher", "bake", "compensate")
-    max_seconds: float = float("inf")
-    force: bool = False
-    tensorboard: bool = False
-    bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
-
-
-@dataclass(frozen=True, eq=False)
-class Training:
-    """A run, what it is trained on and how, as every stage needs it."""
-
-    run: Path
-    inputs: TrainInputs
-    scene: TrainScene
-    config: TrainConfig
-    options: TrainOptions
-    together: Distributed
-    deadline: float
+    @property
+    def shapes(self) -> BlendShapeConfig:
+        """The blend shapes of the student."""
+        return replace(self.preset.blend_shapes, **(LOCAL if self.blend_shapes == "local" else {}))
 
     @property
-    def device(self) -> str:
-        """ "cpu" or "cuda"."""
-        return self.together.device.split(":")[0]
+    def max_bytes(self) -> float | None:
+        """Of the compact file; None where it has all blend shapes."""
+        return 1e6 * self.max_megabytes if self.blend_shapes == "pruned" else None
 
-    def seconds_left(self) -> float:
-        """The same on every process; 0 when time is over."""
-        return self.together.run_on_rank0(lambda: max(0.0, self.deadline - time.monotonic()))
+
+def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
+    """The stages of a training by their steps."""
+    preset = config.preset
+    fit = BindStage(name=BIND_STAGE, config=preset.fit)
+    teacher = TeacherStage(name=TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher)
+    bake = BakeStage(
+        name=BAKE_STAGE, source=teacher if config.teacher else fit, student=preset.student(), config=preset.bake
+    )
+    compensate = CompensateStage(
+        name=COMPENSATE_STAGE,
+        student=bake,
+        teacher=teacher if config.teacher and preset.compensate.init_from_track else None,
+        shapes=config.shapes,
+        config=preset.compensate,
+        max_bytes=config.max_bytes,
+    )
+    stages: dict[str, ModelStage] = {"fit": fit, "teacher": teacher, "bake": bake, "compensate": compensate}
+    return stages if config.teacher else {name: stage for name, stage in stages.items() if name != "teacher"}
 
 
 def train(
-    run: Path, inputs: TrainInputs, scene: TrainScene, config: TrainConfig, options: TrainOptions, together: Distributed
+    run: Path,
+    inputs: TrainInputs,
+    scene: TrainScene,
+    config: TrainConfig,
+    options: TrainOptions,
+    together: Distributed,
+    *,
+    steps: tuple[str, ...] = STEPS,
 ) -> dict[str, StageRecord]:
-    """Train what is missing of a run, in the order of the stages; every stage that stands is skipped.
+    """Train what is missing of a run, in the order of the steps; every stage that stands is skipped.
 
-    A training that was interrupted, or that `max_seconds` ended, goes on where it was.
+    A training that was interrupted, or that the limit of time ended, goes on where it was.
+
+    Args:
+        steps: of `STEPS`, in this order; the stages of those before the first must stand.
 
     Returns:
-        Records by the stage's name in `options.stages`, up to the first that is not finished.
+        Records by step, up to the first that is not finished.
 
     Raises:
-        InputError: an earlier stage is missing or unfinished, a checkpoint is of another training, memory or disk ran
-            out, or training diverged; checkpoints and finished stages stay.
+        InputError: an earlier stage is missing or unfinished or saw what is held out, a checkpoint is of another
+            training, memory or disk ran out, or training diverged; checkpoints and finished stages stay.
     """
-    if "compensate" in options.stages and not scene.template.expression_basis.shape[2]:
+    if "compensate" in steps and not scene.template.expression_basis.shape[2]:
         raise InputError(
             "template",
             expected="a body with expressions, which drive the head's blend shapes",
             received="none",
             remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
         )
-    training = Training(run, inputs, scene, config, options, together, time.monotonic() + options.max_seconds)
-    steps = {"fit": _fit, "teacher": _teacher, "bake": _bake, "compensate": _compensate}
+    metric = load_metric(config.perceptual, device=together.device)
+    trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
+    stages = model_stages(config)
+    by_hand = together.run_on_rank0(lambda: _fit_by_hand(run, scene, stages["fit"]))
+    if by_hand is not None:
+        trainer.take(stages["fit"], by_hand)
     records: dict[str, StageRecord] = {}
-    for name in options.stages:
-        if name == "teacher" and not config.teacher:
+    for step in steps:
+        if step not in stages:
             continue
-        if records and not training.seconds_left():
+        if records and not trainer.seconds_left():
             break
-        records[name] = steps[name](training)
-        if not records[name].manifest["numbers"]["finished"]:
+        records[step] = by_hand if step == "fit" and by_hand is not None else trainer.make(stages[step])
+        if not records[step].finished:
             break
     return records
 
 
-def _fit(training: Training) -> StageRecord:
-    return training.together.run_on_rank0(lambda: _fit_alone(training))
+def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:
+    """The reference fit of this template that the user made, which is never replaced.
 
-
-def _fit_alone(training: Training) -> StageRecord:
-    """The reference fit of the preset, or the one that the user made."""
-    run, config = training.run, training.config.preset.fit
-    folder, mark = run / FIT_STAGE, run / OWN_FIT
-    manifest = read_manifest(folder)
-    if manifest is not None and manifest["inputs"].get(TEMPLATE) == training.scene.digests[TEMPLATE]:
-        numbers = manifest["numbers"]
-        if numbers["finished"] and _own_fit(mark) != manifest["key"]:
-            log.info(
-                "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
-                FIT_STAGE,
-                f"{numbers['gaussians']:,}",
-                f"{numbers['iterations']:,}",
-            )
-            return StageRecord(folder, manifest, ran=False)
-    with training.options.bar("fit", config.iterations) as progress:
-        record = fit(
-            run,
-            training.inputs.of_frame(training.scene.frame),
-            config,
-            device=training.device,
-            max_seconds=max(training.deadline - time.monotonic(), ONE_STEP),
-            force=training.options.force,
-            progress=progress,
-        )
-    atomic_write_text(mark, json.dumps({"fit": record.manifest["key"]}) + "\n")
-    return record
-
-
-def _own_fit(mark: Path) -> str | None:
-    try:
-        return json.loads(mark.read_text())["fit"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _teacher(training: Training) -> StageRecord:
-    preset, needs = training.config.preset, (GAUSSIANS,)
-    gaussians = load_bound(_require(training, *needs), faces=training.scene.template.faces)
-    config = preset.teacher
-    if config.track is not None:
-        config = replace(config, track=replace(config.track, reference=training.scene.built_frame, seed=config.seed))
-
-    def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
-        return fit_teacher(sequence, gaussians, preset.networks.teacher, config, session)
-
-    return _stage(
-        training,
-        TEACHER_STAGE,
-        config,
-        {"networks": preset.networks.teacher},
-        needs,
-        work,
-        lambda folder, model, sequence, session: write_model(folder / Path(TEACHER).name, model),
-    )
-
-
-def _bake(training: Training) -> StageRecord:
-    config, preset = training.config, training.config.preset
-    needs = (TEACHER,) if config.teacher else (GAUSSIANS,)
-    path = _require(training, *needs)
-
-    def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
-        teacher = load_avatar(path, sequence.rig) if config.teacher else None
-        gaussians = (
-            load_bound(path, faces=sequence.rig.template.faces) if teacher is None else (teacher.gaussians.snapshot())
-        )
-        return bake(sequence, gaussians, preset.student(), preset.bake, session, teacher=teacher)
-
-    return _stage(
-        training,
-        BAKE_STAGE,
-        preset.bake,
-        {"student": preset.student()},
-        needs,
-        work,
-        lambda folder, model, sequence, session: write_model(folder / Path(BAKED).name, model),
-    )
-
-
-def _compensate(training: Training) -> StageRecord:
-    config, preset = training.config, training.config.preset
-    shapes = config.shapes(training.scene.template.expression_basis.shape[2])
-    needs = (BAKED, TEACHER) if config.teacher and preset.compensate.init_from_track else (BAKED,)
-    path, *teachers = (_require(training, file) for file in needs)
-    max_bytes = 1e6 * config.max_megabytes if config.blend_shapes == "pruned" else None
-
-    def work(sequence: AvatarSequence, session: Session) -> tuple[AvatarModel, Progress]:
-        teacher = load_avatar(teachers[0], sequence.rig) if teachers else None
-        student = load_avatar(path, sequence.rig)
-        return compensate(sequence, student, shapes, preset.compensate, session, teacher=teacher)
-
-    return _stage(
-        training,
-        COMPENSATE_STAGE,
-        preset.compensate,
-        {"blend_shapes": shapes, "max_bytes": max_bytes},
-        needs,
-        work,
-        lambda folder, model, sequence, session: write_student(
-            folder, model, sequence, preset.compensate, max_bytes=max_bytes, options=session.options
-        ),
-    )
-
-
-def _require(training: Training, file: str) -> Path:
-    """A model of an earlier stage, finished."""
-    stage = file.split("/")[0]
-    manifest = read_manifest(training.run / stage)
-    there = (training.run / file).is_file() and manifest is not None
-    if not there or not manifest["numbers"]["finished"]:
-        numbers = manifest["numbers"] if there else {}
-        raise InputError(
-            f"run {training.run}",
-            expected=f"a finished {stage}",
-            received=f"{numbers['iterations_done']} of {numbers['iterations']} iterations of it" if there else "none",
-            remedy="give the same command without --stage, which trains what is missing",
-        )
-    return training.run / file
-
-
-def _stage(
-    training: Training,
-    name: str,
-    config: PhotometricConfig,
-    parts: Mapping[str, Any],
-    needs: Sequence[str],
-    work: Callable[[AvatarSequence, Session], tuple[AvatarModel, Progress]],
-    write: Callable[[Path, AvatarModel, AvatarSequence, Session], Mapping[str, Any]],
-) -> StageRecord:
-    """Train one stage unless it stands; the first process writes, the others train with it.
-
-    Args:
-        config: of the training. parts: the rest of its configuration. needs: files of the run that it starts from.
-        work: trains on all processes. write: writes the models into a folder and gives numbers on them.
+    Raises:
+        InputError: it saw a camera or a frame that this training holds out.
     """
-    together, run, scene = training.together, training.run, training.scene
-    metric = load_metric(training.config.perceptual, device=together.device) if config.weights.perceptual else None
-    key_config = {
-        "training": config,
-        **parts,
-        "device": training.device,
-        "scale": training.inputs.scale,
-        "perceptual": None if metric is None else metric.name,
-    }
-    digests = {
-        **{file: sha256_file(run / file) for file in needs},
-        **scene.digests,
-        "code": code_digest("smplxpp", "avatar"),
-        "torch": version("torch"),
-    }
-    folder = run / f"{name}_work"
-    session = Session(
-        folder,
-        stage_key(config=key_config, inputs=digests),
-        metric,
-        together,
-        max(training.seconds_left(), ONE_STEP),
-        tensorboard=training.options.tensorboard,
-        preview=preview_writer(scene.capture, folder),
+    manifest = read_manifest(run / fit.name)
+    if manifest is None or manifest["inputs"].get(TEMPLATE) != scene.digests[TEMPLATE]:
+        return None
+    numbers = manifest["numbers"]
+    if not (numbers["by_hand"] and is_finished(manifest)):
+        return None
+    refuse_seen(run, (fit.name,), scene.capture.splits)
+    log.info(
+        "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
+        fit.name,
+        f"{numbers['gaussians']:,}",
+        f"{numbers['iterations']:,}",
     )
-
-    def trained(session: Session) -> tuple[AvatarModel, Progress, AvatarSequence]:
-        sequence = AvatarSequence(scene.capture, scene.template, device=together.device)
-        return (*work(sequence, session), sequence)
-
-    def first(temporary: Path) -> StageOutput:
-        together.run_on_rank0(lambda: True)
-        with training.options.bar(name, config.iterations) as report:
-            model, done, sequence = trained(replace(session, report=report))
-        with explain_resource_errors(run):
-            keep_logs(folder, temporary)
-            numbers = {**write(temporary, model, sequence, session), "processes": together.world_size}
-            return stage_output(temporary, model, done, sequence, numbers, overlap=scene.overlap)
-
-    if not together.first:
-        if together.run_on_rank0(bool):
-            trained(session)
-        return together.run_on_rank0(_nothing)
-    with own_run_folder(run, (name, "report")):
-        if training.options.force:
-            shutil.rmtree(folder, ignore_errors=True)
-        before = read_manifest(run / name)
-        unfinished = before is not None and before.get("numbers", {}).get("finished") is False
-        record = run_stage(
-            run,
-            name,
-            first,
-            config=key_config,
-            inputs=digests,
-            seed=config.seed,
-            force=training.options.force or unfinished,
-        )
-        if not record.ran:
-            together.run_on_rank0(lambda: False)
-        if record.manifest["numbers"]["finished"]:
-            shutil.rmtree(folder, ignore_errors=True)
-    return together.run_on_rank0(lambda: record)
-
-
-def _nothing() -> Any:
-    """For the processes that only hear what the first one says."""
-    raise AssertionError
+    return StageRecord(run / fit.name, manifest, ran=False)
 
 
 def with_perceptual(preset: TrainingPreset) -> TrainingPreset:

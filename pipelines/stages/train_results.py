@@ -7,10 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from avatar.data.sequence import AvatarSequence
-from avatar.data.views import read_view
 from avatar.metrics.speed import parameter_counts
 from avatar.metrics.view_quality import CONVENTION
 from avatar.models.model_file import load_avatar, save_avatar
@@ -21,29 +18,15 @@ from avatar.training.engine.memory import peak_memory
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.prune import pruned_to
-from avatar.training.train import PRETRAIN, TRACK
-from pipelines.figures.comparison import write_strip
+from avatar.training.train import PRETRAIN, TRACK, Session
 from pipelines.runs.checks import Check
+from pipelines.runs.layout import COMPACT_STUDENT, STUDENT
 from pipelines.runs.stage import StageOutput
-from pipelines.stages.build_config import COMPACT_STUDENT, STUDENT
+from pipelines.stages.models import CLOTHED, Trainer
 from pipelines.stages.train_names import KINDS, kind_name
-from smplxpp.capture import Capture
 
 BEFORE = {TRACK: "track_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
 """Logs of what comes before a training, by its folder."""
-
-
-def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
-    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
-    background = capture.recording.background or (0.0, 0.0, 0.0)
-
-    def write(images: Mapping[str, np.ndarray]) -> None:
-        for name, image in images.items():
-            camera, frame = name.rsplit(" ", 1)
-            real = read_view(capture, camera, int(frame)).photograph(background)
-            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
-
-    return write
 
 
 def keep_logs(work: Path, folder: Path) -> None:
@@ -88,7 +71,27 @@ def write_student(
     return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
 
 
-def stage_output(
+def training_output(
+    trainer: Trainer,
+    session: Session,
+    folder: Path,
+    model: TeacherAvatar | Student,
+    done: Progress,
+    write: Callable[[], Mapping[str, Any]],
+) -> StageOutput:
+    """Write what a training leaves in its stage: logs, the model, numbers, checks; nothing but on the first process.
+
+    Args:
+        write: writes the models and gives numbers on them.
+    """
+    if not trainer.together.first:
+        return StageOutput()
+    keep_logs(session.folder, folder)
+    numbers = {**write(), "processes": trainer.together.world_size}
+    return _output(folder, model, done, trainer.sequence(CLOTHED), numbers, overlap=trainer.scene.overlap)
+
+
+def _output(
     folder: Path,
     model: TeacherAvatar | Student,
     done: Progress,

@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.runs.arrays import save_arrays
+from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_scan_labels
 from pipelines.runs.checks import Check
+from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
-from pipelines.stages.build_config import BuildConfig, BuildInputs
-from pipelines.stages.scan import MM, load_params_of_run, load_scan
-from pipelines.stages.template import load_parts
+from pipelines.stages.build_config import BuildConfig, BuildContext
 from smplxpp.body import load_body, load_params
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
 from smplxpp.metrics import (
     CompareConfig,
     directed_distances,
@@ -26,28 +27,28 @@ from smplxpp.metrics import (
     summarize,
 )
 from smplxpp.metrics.conventions import convention_named
+from smplxpp.metrics.distance import MM
 from smplxpp.template.template import Template
 
 MOTION_FRAMES = 12
 
 
-def validate(folder: Path, run: Path, inputs: BuildInputs, config: BuildConfig) -> StageOutput:
-    """65: distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
-    template = Template.load(run / "60_assemble" / "smplxpp.npz")
-    scan, _, _ = load_scan(run)
-    with np.load(run / "20_segment" / "labels.npz") as labels:
-        face_labels = labels["face_labels"]
-    reference = load_params_of_run(run)
+def run(folder: Path, build: BuildContext) -> StageOutput:
+    """distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
+    template = Template.load(build.run / TEMPLATE)
+    scan, _, _ = load_scan(build.run)
+    face_labels = load_scan_labels(build.run)
+    reference = load_params_of_run(build.run)
     posed = template.mesh.with_vertices(template.pose(reference)[0])
-    checks, numbers = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, config)
+    checks, numbers = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
-    flips = _flips(template, posed, run)
+    flips = _flips(template, posed, build.run)
     checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
     poses = {"hard poses": stress_poses(reference)}
-    if inputs.motion is not None:
-        motion = load_params(inputs.motion, body=load_body(inputs.body))
-        poses["motion"] = motion.select(np.unique(np.linspace(0, len(motion) - 1, MOTION_FRAMES).round().astype(int)))
+    if build.inputs.motion is not None:
+        motion = load_params(build.inputs.motion, body=load_body(build.inputs.body))
+        poses["motion"] = motion.select(spread(range(len(motion)), MOTION_FRAMES))
     for title, params in poses.items():
         names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]
         numbers[title], worst = _stretch(template, params, names)

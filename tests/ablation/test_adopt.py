@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-
-from avatar.training.engine.processes import Distributed
 from pipelines.ablation.adopt import adopt_trained
 from pipelines.ablation.pieces import Workshop
-from pipelines.ablation.rows import ablation_pieces
 from pipelines.ablation.run import Ablation, Observer
+
+from avatar.training.engine.processes import Distributed
+from pipelines.ablation.rows import ablation_pieces
+from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.train import TrainConfig, TrainOptions, train
-from pipelines.stages.train_inputs import TrainInputs, open_scene
 from tests.baselines.moving_doll import tiny_preset, write_moving_capture, write_moving_run
 
 

@@ -7,8 +7,8 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
 from pipelines.runs.checks import Check
+from pipelines.runs.layout import BUILD_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
-from pipelines.stages.build_config import STAGES
 from smplxpp.core.errors import InputError
 
 
@@ -24,8 +24,8 @@ def add_stage(run, name, checks=()):
 def run(tmp_path):
     folder = tmp_path / "dancer"
     good, doubtful = Check("mean error", 0.5, "mm", 1, 2), Check("p95 error", 4.0, "mm", 3, 6)
-    for name in STAGES:
-        add_stage(folder, name, [good, doubtful] if name == STAGES[-1] else [])
+    for name in BUILD_STAGES:
+        add_stage(folder, name, [good, doubtful] if name == BUILD_STAGES[-1] else [])
     (folder / "metrics.json").write_text(json.dumps({"schema": 1, "subject": "Dancer"}))
     (folder / "report.html").write_text("<!doctype html>")
     return folder
@@ -35,35 +35,39 @@ def test_a_whole_run(run):
     summary, checks = summarise_run(run)
     assert summary["subject"] == "Dancer" and summary["verdict"] == "warn"
     assert summary["counts"] == {"pass": 1, "warn": 1, "fail": 0}
-    assert [stage["stage"] for stage in summary["stages"]] == list(STAGES)
+    assert [stage["stage"] for stage in summary["stages"]] == list(BUILD_STAGES)
     assert all(stage["state"] == "done" and stage["bytes"] == 1000 for stage in summary["stages"])
     assert summary["unfinished"] == [] and summary["remedy"] is None
     assert summary["report"] == str(run / "report.html")
-    assert [check.stage for check in checks] == [STAGES[-1]] * 2
+    assert [check.stage for check in checks] == [BUILD_STAGES[-1]] * 2
 
 
 def test_a_run_under_way_names_what_is_missing_and_how_to_make_it(tmp_path, capsys):
-    add_stage(tmp_path, STAGES[0])
+    add_stage(tmp_path, BUILD_STAGES[0])
     result = Inspect(tmp_path).run()
-    assert result["unfinished"] == list(STAGES[1:]) and STAGES[1] in result["remedy"]
+    assert result["unfinished"] == list(BUILD_STAGES[1:]) and BUILD_STAGES[1] in result["remedy"]
     printed = capsys.readouterr().out
-    assert "missing" in printed and f"--from-stage {STAGES[1]}" in printed and "none yet" in printed
+    assert "missing" in printed and f"--from-stage {BUILD_STAGES[1]}" in printed and "none yet" in printed
 
 
 def test_damage_is_seen(run):
-    (run / STAGES[2] / "data.bin").unlink()
-    (run / STAGES[3] / "manifest.json").write_text("{broken")
+    (run / BUILD_STAGES[2] / "data.bin").unlink()
+    (run / BUILD_STAGES[3] / "manifest.json").write_text("{broken")
     (run / "metrics.json").write_text("[]")
     summary, _ = summarise_run(run)
     states = {stage["stage"]: stage["state"] for stage in summary["stages"]}
-    assert states[STAGES[2]] == "incomplete" and states[STAGES[3]] == "unreadable" and states[STAGES[4]] == "done"
-    assert summary["unfinished"] == [STAGES[2], STAGES[3]] and summary["subject"] is None
+    assert (
+        states[BUILD_STAGES[2]] == "incomplete"
+        and states[BUILD_STAGES[3]] == "unreadable"
+        and states[BUILD_STAGES[4]] == "done"
+    )
+    assert summary["unfinished"] == [BUILD_STAGES[2], BUILD_STAGES[3]] and summary["subject"] is None
 
 
 def test_a_stage_of_another_pipeline_is_listed_in_its_place(run):
     add_stage(run, "70_bind")
     names = [stage["stage"] for stage in summarise_run(run)[0]["stages"]]
-    assert names == sorted([*STAGES, "70_bind"])
+    assert names == sorted([*BUILD_STAGES, "70_bind"])
 
 
 def test_metrics_alone_are_enough_for_the_checks(tmp_path):

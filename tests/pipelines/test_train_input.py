@@ -14,7 +14,7 @@ from PIL import Image
 from pipelines.commands import extras
 from pipelines.commands import train as command
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.train_inputs import TrainInputs, open_scene
+from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
 from tests.pipelines.training_runs import refused, train

@@ -20,12 +20,11 @@ from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluat
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.arrays import load_arrays
+from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
+from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE
 from pipelines.runs.stage import StageRecord, require_stage
-from pipelines.stages.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs, load_build
-from pipelines.stages.evaluate_config import EVALUATE_STAGE
-from pipelines.stages.scan import MM, load_params_of_run, load_scan
-from pipelines.stages.template import load_parts, load_weights
+from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_body, load_params
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.json_values import jsonable
@@ -33,6 +32,7 @@ from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
 from smplxpp.metrics import point_to_surface
+from smplxpp.metrics.distance import MM
 from smplxpp.template.template import Template
 
 HEIGHT = 640
@@ -45,7 +45,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
     template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
-    records = {**records, **({} if fit is None else {FIT_STAGE: fit})}
+    records = {**records, **({} if fit is None else {BIND_STAGE: fit})}
     trainings = standing_trainings(run, records.values())
     records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
     template = Template.load(run / "60_assemble" / "smplxpp.npz")
@@ -79,7 +79,9 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     key_numbers += [
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber(
-            "scan to template", f"{sum(seconds[name] for name in STAGES):.1f} s", "all stages, validation included"
+            "scan to template",
+            f"{sum(seconds[name] for name in BUILD_STAGES):.1f} s",
+            "all stages, validation included",
         ),
         *(() if fit is None else fit_key_numbers(fit)),
         *training_key_numbers(trainings),
@@ -103,7 +105,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         provenance={
             "configuration": jsonable(config),
             "versions": versions(),
-            "inputs (SHA-256)": {k: v for k, v in inputs_of.items() if not k.startswith(STAGES)},
+            "inputs (SHA-256)": {k: v for k, v in inputs_of.items() if not k.startswith(BUILD_STAGES)},
             "seed": {"samples": config.seed},
         },
     )
@@ -122,7 +124,7 @@ def rewrite_report(run: Path) -> Path | None:
     build = load_build(run)
     if build is None:
         return None
-    return write_build_report(run, *build, {name: require_stage(run, name) for name in STAGES})
+    return write_build_report(run, *build, {name: require_stage(run, name) for name in BUILD_STAGES})
 
 
 def _sheet(mesh: TriangleMesh, cameras: list, **colors) -> bytes:

@@ -1,10 +1,11 @@
-"""The ablation of a run: `RUN/ablation/` with a folder a trained piece, the table, and the rows beside each other."""
+"""The ablation of a run: rows trained as ordinary stages in `RUN/ablation/`, measured, in one table."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,33 +13,23 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from avatar.evaluation.evaluate import Evaluation, EvaluationConfig
-from avatar.evaluation.report import view_key
+from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.tables import FigureTable
 from avatar.losses.perceptual import load_metric
 from avatar.training.engine.loop import Progress
+from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset
-from pipelines.ablation.adopt import adopt_trained
-from pipelines.ablation.pieces import CLOTHED, Workshop
-from pipelines.ablation.rows import Row, ablation_pieces
-from pipelines.ablation.run import (
-    ROWS_FOLDER,
-    Ablation,
-    AblationResult,
-    Observer,
-    ablation_table,
-    row_figures,
-    unfinished,
-)
+from pipelines.ablation.measure import PICTURES, closure, measure_row
+from pipelines.ablation.rows import Row, ablation_stages
+from pipelines.ablation.table import AblationResult, ablation_table, row_figures
 from pipelines.figures import caption, encode_png, row
-from pipelines.runs.lock import own_run_folder
-from pipelines.stages.train_inputs import TrainInputs, open_scene
+from pipelines.runs.layout import ABLATION
+from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
+from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.json_values import jsonable
 
-ABLATION = "ablation"
-PICTURES = "pictures"
 RESULTS_FILE = "results.json"
 
 
@@ -48,8 +39,8 @@ class AblationRun:
 
     Attributes:
         command: in words, for `results.json`.
-        device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' pieces anew.
-        training: called with the name of a piece and its progress. measuring: with a row, frames done, all frames.
+        device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' stages anew.
+        training: called with the name of a stage and its progress. measuring: with a row, frames done, all frames.
     """
 
     command: str = ""
@@ -66,7 +57,7 @@ class AblationOutcome:
 
     Attributes:
         folder: `RUN/ablation`. table: of the finished rows. results: as in `results.json`.
-        waiting: pieces that are still to be trained; none when all is finished.
+        waiting: stages that are still to be trained; none when all is finished.
     """
 
     folder: Path
@@ -83,7 +74,9 @@ def ablate(
     config: EvaluationConfig,
     how: AblationRun | None = None,
 ) -> AblationOutcome:
-    """Train and measure rows on a capture with a run's template; what stands is not done again.
+    """Train and measure rows on a capture with a run's template, as far as time allows; what stands is kept.
+
+    The full system comes first, whatever its place: most rows share its stages.
 
     Raises:
         InputError: no template, or a capture that cannot be trained or measured on.
@@ -91,32 +84,59 @@ def ablate(
     how = how or AblationRun()
     scene = open_scene(run, inputs)
     config = _measured(config, scene.capture)
-    folder = run / ABLATION
     weights = (preset.teacher.weights, preset.bake.weights, preset.compensate.weights)
     perceptual = load_metric(config.metric, device=how.device) if any(w.perceptual for w in weights) else None
-    shop = Workshop(scene.capture, scene.template, how.device)
-    with own_run_folder(folder, (RESULTS_FILE,)):
-        ablation = Ablation(
-            shop,
-            ablation_pieces(
-                preset,
-                frame=scene.frame,
-                training_frames=len(shop.sequence(CLOTHED).train_frames),
-                built_frame=scene.built_frame,
-            ),
-            folder,
-            inputs=scene.digests,
-            perceptual=perceptual,
+    options = TrainOptions(max_seconds=how.max_seconds, bar=_bar(how))
+    trainer = Trainer(run, scene, options, Distributed(device=how.device), scale=inputs.scale, perceptual=perceptual)
+    stages = ablation_stages(preset, training_frames=len(trainer.sequence(CLOTHED).train_frames))
+    made: set[str] = set()
+    found: dict[str, Any] = {}
+    for name in sorted(rows, key=lambda name: name != "full"):
+        model = stages[rows[name].model]
+        if not all(_train(trainer, stage, how, made) for stage in closure(model)):
+            continue
+        measured = measure_row(
+            trainer,
+            name,
+            rows[name],
+            model,
+            config,
+            force=how.force,
+            in_time=bool(trainer.seconds_left()),
+            progress=lambda done, total, name=name: how.measuring(name, done, total),
         )
-        if how.force:
-            ablation.forget(rows)
-        else:
-            adopt_trained(run, ablation, scene, scale=inputs.scale, perceptual=perceptual)
-        observer = Observer(how.training, how.measuring, lambda name, found: _keep_pictures(folder, name, found))
-        result = ablation.run(rows, config, max_seconds=how.max_seconds, observer=observer)
-        waiting = unfinished(ablation, rows, result.waiting)
-        about = {"command": how.command, "preset": preset, "scale": inputs.scale, "device": how.device}
-        return _write(folder, result, about, waiting)
+        if measured is not None:
+            found[name] = measured
+    result = AblationResult({name: found[name] for name in rows if name in found})
+    needed = {stage.name: stage for name in rows if name not in found for stage in closure(stages[rows[name].model])}
+    waiting = [Path(name).name for name, stage in needed.items() if not _stands(trainer, stage)]
+    about = {"command": how.command, "preset": preset, "scale": inputs.scale, "device": how.device}
+    return _write(run / ABLATION, result, about, waiting)
+
+
+def _train(trainer: Trainer, stage: ModelStage, how: AblationRun, made: set[str]) -> bool:
+    """Make a stage unless it stands; whether it is finished then. `made` holds those of this call."""
+    anew = how.force and stage.name not in made
+    if not anew and _stands(trainer, stage):
+        return True
+    if not trainer.seconds_left():
+        return False
+    made.add(stage.name)
+    return trainer.make(stage, force=anew).finished
+
+
+def _stands(trainer: Trainer, stage: ModelStage) -> bool:
+    found = trainer.found(stage)
+    return found is not None and found.finished
+
+
+def _bar(how: AblationRun) -> Bar:
+    """The progress of a stage under its name alone."""
+
+    def bar(name: str, total: int) -> AbstractContextManager[Callable[[Progress], None]]:
+        return nullcontext(lambda progress: how.training(Path(name).name, progress))
+
+    return bar
 
 
 def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:
@@ -126,15 +146,6 @@ def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:
         return config
     sets = ("novel_view", "novel_pose") if splits.novel_pose_frames else ("novel_view",)
     return replace(config, protocol=replace(config.protocol, sets=sets))
-
-
-def _keep_pictures(folder: Path, name: str, evaluation: Evaluation) -> None:
-    """Photograph and rendering of every shown view side by side, for the rows' strips."""
-    for view in evaluation.views:
-        (rendered,) = view.rendered.values()
-        path = folder / ROWS_FOLDER / name / PICTURES / f"{view.set}_{view_key(view.camera, view.frame)}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(path, encode_png(np.concatenate([view.truth, rendered], axis=1)))
 
 
 def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiting: list[str]) -> AblationOutcome:
@@ -165,10 +176,10 @@ def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiti
 def _write_strips(folder: Path, result: AblationResult) -> None:
     """A strip a view: the photograph, then what each row shows, under their titles."""
     first = next(iter(result.rows))
-    for path in sorted((folder / ROWS_FOLDER / first / PICTURES).glob("*.png")):
+    for path in sorted(result.rows[first].folder.glob("*.png")):
         pictures = []
-        for name, one in result.rows.items():
-            pair = folder / ROWS_FOLDER / name / PICTURES / path.name
+        for one in result.rows.values():
+            pair = one.folder / path.name
             if not pair.is_file():
                 continue
             photograph, rendered = np.split(_read(pair), 2, axis=1)

@@ -10,20 +10,25 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.views import read_views
+from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
-from pipelines.stages.build_config import TEMPLATE, load_build
-from pipelines.stages.fit import FitInputs, open_cameras, silhouette_overlap
-from smplxpp.capture import Capture
+from pipelines.runs.layout import TEMPLATE
+from pipelines.stages.build_config import load_build
+from smplxpp.body import load_body
+from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.core.spread import spread
+from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
 CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
 """Training frames, and cameras of each, in whose images the template has to stand."""
+STANDS_IN_IMAGES = 0.3
+"""Overlap of template and masks below which nothing can be learned."""
 OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
 """Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
 
@@ -45,10 +50,6 @@ class TrainInputs:
     hold_out: tuple[str, ...] = ()
     scale: float = 1.0
 
-    def of_frame(self, frame: int) -> FitInputs:
-        """The same for a reference fit to one frame."""
-        return FitInputs(self.capture, frame, self.params, self.body, self.hold_out, self.scale)
-
 
 @dataclass(frozen=True, eq=False)
 class TrainScene:
@@ -59,6 +60,7 @@ class TrainScene:
         capture: its splits are what is trained on and held out; unusable frames and views are left out.
         frame: the reference frame of the fit.
         built_frame: the one that the template was built from, if it is trained on; then both are one.
+        template_frame: the one whose scan the template is made of, if that scan is the capture's own.
         overlap: mean IoU of silhouettes and masks in `CHECKED_FRAMES` training frames.
         digests: SHA-256 by name of everything that is read.
     """
@@ -67,8 +69,58 @@ class TrainScene:
     capture: Capture
     frame: int
     built_frame: int | None
+    template_frame: int | None
     overlap: float
     digests: dict[str, str]
+
+
+def open_template(run: Path) -> Template:
+    """The template of a run.
+
+    Raises:
+        InputError: none has been built.
+    """
+    path = run / TEMPLATE
+    if not path.is_file():
+        raise InputError(
+            f"run {run}",
+            expected=f"a template, {TEMPLATE}",
+            received="none",
+            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+        )
+    return Template.load(path)
+
+
+def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
+    """Open the template of a run and one frame of a capture, for a reference fit; see `open_scene`.
+
+    Raises:
+        InputError: no template; a capture that lacks images, masks, cameras or parameters of the frame; a template
+            that does not stand in the images.
+    """
+    template = open_template(run)
+    capture, train, held_out = open_cameras(inputs)
+    if frame not in capture.frames:
+        raise InputError(
+            f"capture {capture.name}",
+            expected=f"frame {frame}",
+            received=f"frames {capture.frames[0]} to {capture.frames[-1]}",
+            remedy="choose another with --frame",
+        )
+    params = capture.params(frame)
+    if params is None:
+        raise InputError(
+            f"capture {capture.name}",
+            expected=f"body parameters of frame {frame}",
+            received="none",
+            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+        )
+    capture = replace(capture, splits=Splits(train, held_out, (frame,), ()))
+    overlap = silhouette_overlap(
+        template.mesh.with_vertices(template.pose(params)[0]), read_views(capture, frame, train)
+    )
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE)}
+    return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
 def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
@@ -80,15 +132,7 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
         InputError: no template; no training camera, image, mask or parameters; images of another size than their
             camera; nobody in the masks; a template that does not stand in the images, or parameters of another body.
     """
-    path = run / TEMPLATE
-    if not path.is_file():
-        raise InputError(
-            f"run {run}",
-            expected=f"a template, {TEMPLATE}",
-            received="none",
-            remedy="make one with `smplxpp build --capture DIR --out RUN`",
-        )
-    template = Template.load(path)
+    template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
     capture, params = _with_params(_opened(inputs))
@@ -103,13 +147,76 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
-    digests = {TEMPLATE: sha256_file(path), **_digests(capture, params)}
-    return TrainScene(template, capture, frame, built_frame, overlap, digests)
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **_digests(capture, params)}
+    return TrainScene(template, capture, frame, built_frame, _template_frame(run, inputs), overlap, digests)
+
+
+def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
+    """The frame of the capture whose scan the template was built from."""
+    built = load_build(run)
+    if built is None or inputs.capture.resolve() not in built[0].scan.resolve().parents:
+        return None
+    return built[0].frame
+
+
+def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[str, ...]]:
+    """The capture, and the names of the cameras to train on and of those held out.
+
+    Raises:
+        InputError: unknown cameras, none, or none to train on.
+    """
+    body = None if inputs.body is None else load_body(inputs.body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    if not capture.cameras or not capture.presence().any():
+        raise InputError(
+            f"capture {capture.name}",
+            expected="cameras and their images",
+            received="none",
+            remedy="a scan alone makes a template; a fit needs the views: see docs/captures.md",
+        )
+    unknown = sorted(set(inputs.hold_out) - set(capture.cameras))
+    if unknown:
+        raise InputError(
+            "option hold-out", expected=f"cameras among {', '.join(capture.cameras)}", received=", ".join(unknown)
+        )
+    if not 0.0 < inputs.scale <= 1.0:
+        raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
+    if inputs.scale != 1.0:
+        capture = capture.resized(inputs.scale)
+    splits = capture.splits
+    held_out = inputs.hold_out or splits.novel_view_cameras
+    # Cameras that the splits hold out and the option does not are trained on; those of neither are not.
+    known = {*splits.train_cameras, *splits.novel_view_cameras}
+    train = tuple(name for name in capture.cameras if name in known and name not in held_out)
+    if not train:
+        raise InputError("cameras", expected="at least one to train on", received="all held out")
+    return capture, train, tuple(held_out)
+
+
+def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:
+    """Mean intersection over union of the posed template's silhouette and the masks.
+
+    Raises:
+        InputError: so little that template and images do not belong together.
+    """
+    values = []
+    for view in views:
+        mask, mesh = view.alpha.numpy() > 127, rasterize_mesh(posed, view.camera).mask
+        values.append((mask & mesh).sum() / max((mask | mesh).sum(), 1))
+    mean = float(np.mean(values))
+    if mean < STANDS_IN_IMAGES:
+        raise InputError(
+            "template in the images",
+            expected="a silhouette on the masks",
+            received=f"a mean overlap (IoU) of {mean:.2f} over {len(views)} views",
+            remedy="check --frame and --params, and that cameras and template share one world",
+        )
+    return mean
 
 
 def _opened(inputs: TrainInputs) -> Capture:
     """The capture with the user's held-out cameras and scale; frames as it splits them."""
-    capture, train, held_out = open_cameras(inputs.of_frame(0))
+    capture, train, held_out = open_cameras(inputs)
     old = capture.splits
     if not old.train_frames:
         raise InputError(

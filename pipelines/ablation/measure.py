@@ -1,0 +1,143 @@
+"""A row of the ablation is measured: a stage whose model is what a player's file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor, nn
+
+from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
+from avatar.evaluation.report import EvalReport, view_key
+from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import Motion
+from pipelines.ablation.rows import Row
+from pipelines.figures import encode_png
+from pipelines.runs.digests import TRAINING
+from pipelines.runs.layout import ABLATION
+from pipelines.runs.lock import own_run_folder
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, decide, run_stage
+from pipelines.stages.evaluate import surface_digest
+from pipelines.stages.models import CLOTHED, ModelStage, Trainer
+from smplxpp.core.atomic import atomic_write_bytes
+
+ROWS_FOLDER = f"{ABLATION}/rows"
+PLAYER_FILE, REPORT_FILE, PICTURES = "player.safetensors", "report.json", "pictures"
+TIMED = ("seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining")
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A row that was trained and measured.
+
+    Attributes:
+        row: what it is. report: of its one model, named by the row's title. folder: of its pictures.
+        seconds: of training steps, over all stages that it took. iterations: likewise.
+    """
+
+    row: Row
+    report: EvalReport
+    folder: Path
+    seconds: float
+    iterations: int
+
+
+class WithoutCode(nn.Module):
+    """An avatar that is driven by the null code in every frame, as it is online."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model, self.rig = model, model.rig
+
+    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
+        return self.model(motion.without_code(), camera_centers)
+
+
+def closure(stage: ModelStage) -> list[ModelStage]:
+    """A stage after all that it is made from, each once."""
+
+    def walk(one: ModelStage) -> Iterator[ModelStage]:
+        for needed in one.needs.values():
+            yield from walk(needed)
+        yield one
+
+    return list({found.name: found for found in walk(stage)}.values())
+
+
+def row_stage(trainer: Trainer, name: str, row: Row, model: ModelStage, config: EvaluationConfig) -> Stage:
+    """What decides the figures of a row whose model is trained."""
+    trained = trainer.path(model)
+    record = trainer.found(model)
+    assert record is not None
+    return Stage(
+        name=f"{ROWS_FOLDER}/{name}",
+        config={"row": row, "evaluation": config, "device": trainer.device, "scale": trainer.scale},
+        inputs={
+            **trainer.scene.digests,
+            "model": record.manifest["files"][model.file],
+            "capture/surfaces": surface_digest(trainer.scene.capture, config.protocol),
+        },
+        code=(__name__, type(model).__module__),
+        libraries=TRAINING,
+        seed=config.seed,
+        sources={"model": trained.relative_to(trainer.run).as_posix()},
+    )
+
+
+def measure_row(
+    trainer: Trainer,
+    name: str,
+    row: Row,
+    model: ModelStage,
+    config: EvaluationConfig,
+    *,
+    force: bool = False,
+    in_time: bool = True,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RowResult | None:
+    """Measure a row unless it stands; None where it does not stand and there is no time left for it."""
+    stage = row_stage(trainer, name, row, model, config)
+    if decide(trainer.run, stage, force=force) != "skip" and not in_time:
+        return None
+
+    def work(folder: Path) -> StageOutput:
+        player = folder / PLAYER_FILE
+        model.write_player(player, trainer.model(model))
+        loaded = model.read_by(trainer, player)
+        evaluation = evaluate_models(
+            {row.title: WithoutCode(loaded) if row.null_code else loaded},
+            trainer.sequence(CLOTHED),
+            config,
+            files={row.title: player},
+            progress=progress,
+        )
+        evaluation.report.save(folder / REPORT_FILE)
+        _keep_pictures(folder / PICTURES, evaluation)
+        return StageOutput()
+
+    with own_run_folder(trainer.run / ROWS_FOLDER, (name,)):
+        record = run_stage(trainer.run, stage, work, force=force)
+    return _result(trainer, row, model, record)
+
+
+def _result(trainer: Trainer, row: Row, model: ModelStage, record: StageRecord) -> RowResult:
+    numbers = []
+    for stage in closure(model):
+        found = trainer.found(stage)
+        assert found is not None
+        numbers.append(found.manifest["numbers"])
+    seconds = sum(one.get(name, 0.0) for one in numbers for name in TIMED)
+    iterations = sum(one.get("iterations", 0) + one.get("iterations_before", 0) for one in numbers)
+    report = EvalReport.load(record.folder / REPORT_FILE)
+    return RowResult(row, report, record.folder / PICTURES, seconds, iterations)
+
+
+def _keep_pictures(folder: Path, evaluation: Evaluation) -> None:
+    """Write photograph and rendering of every shown view side by side, for the rows' strips."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for view in evaluation.views:
+        (rendered,) = view.rendered.values()
+        path = folder / f"{view.set}_{view_key(view.camera, view.frame)}.png"
+        atomic_write_bytes(path, encode_png(np.concatenate([view.truth, rendered], axis=1)))

@@ -1,0 +1,126 @@
+"""Stages that only an ablation has: students without most of their blend shapes, and avatars of other kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load, save
+from torch import Tensor
+
+from avatar.baselines.avatar_base import Baseline
+from avatar.baselines.build import BaselineConfig, make_baseline
+from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
+from avatar.models.model_file import save_avatar
+from avatar.training.engine.random_state import fixed_seed
+from avatar.training.student.prune import coefficient_std, pruned_to
+from avatar.training.train import Session
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.models import ModelStage, Trainer
+from pipelines.stages.train_results import training_output
+from smplxpp.core.atomic import atomic_write_bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrunedStage(ModelStage):
+    """A student whose least important Gaussians lost their blend shapes.
+
+    Attributes:
+        student: the stage that trains it.
+        keep: share of the Gaussians that keep theirs, or less: the compact file has at most `max_bytes`.
+    """
+
+    file = "student.safetensors"
+    resumable = False
+    alone = True
+    seed = 0
+    iterations = 1
+
+    student: ModelStage
+    keep: float
+    max_bytes: float
+
+    @property
+    def needs(self) -> Mapping[str, ModelStage]:
+        return {"student": self.student}
+
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        return {"keep": self.keep, "max_bytes": self.max_bytes}
+
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        student, sequence = trainer.model(self.student), trainer.sequence(self.ground)
+        shapes = student.blend_shapes.pruned(coefficient_std(student, sequence), keep=self.keep)
+        small, kept = pruned_to(student.with_blend_shapes(shapes), sequence, self.max_bytes)
+        size = save_avatar(folder / self.file, small.eval())
+        return StageOutput(numbers={"bytes": {self.file: size}, "kept_blend_shapes": kept, "finished": True})
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineStage(ModelStage):
+    """An avatar of another kind, trained on photographs.
+
+    Attributes:
+        gaussians: the reference fit that it starts from.
+    """
+
+    file = "baseline.safetensors"
+
+    gaussians: ModelStage
+    model: BaselineConfig
+    config: PhotographConfig
+
+    @property
+    def needs(self) -> Mapping[str, ModelStage]:
+        return {"gaussians": self.gaussians}
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def iterations(self) -> int:
+        return self.config.iterations
+
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        return {
+            "model": {"kind": type(self.model).__name__, **asdict(self.model)},
+            "training": self.config,
+            "perceptual": trainer.perceptual_name(self.config),
+        }
+
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        sequence = trainer.sequence(self.ground)
+        with fixed_seed(self.config.seed):
+            model = self._untrained(trainer)
+        done = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
+
+        def write() -> Mapping[str, Any]:
+            write_baseline(folder / self.file, model)
+            return {"bytes": {self.file: (folder / self.file).stat().st_size}}
+
+        return training_output(trainer, session, folder, model.eval(), done, write)
+
+    def read_by(self, trainer: Trainer, path: Path) -> Baseline:
+        model = self._untrained(trainer)
+        model.load_state_dict(load(path.read_bytes()))  # casts what is in half precision
+        return model.eval()
+
+    def write_player(self, path: Path, model: Any) -> None:
+        write_baseline(path, model, compact=True)
+
+    def _untrained(self, trainer: Trainer) -> Baseline:
+        sequence = trainer.sequence(self.ground)
+        return make_baseline(self.model, sequence.rig, trainer.model(self.gaussians), sequence.train_frames)
+
+
+def write_baseline(path: Path, model: Baseline, *, compact: bool = False) -> None:
+    """Write the state of a baseline; `compact`: in half precision, as a player needs it."""
+    tensors = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    atomic_write_bytes(path, save({name: _halved(v) for name, v in tensors.items()} if compact else tensors))
+
+
+def _halved(value: Tensor) -> Tensor:
+    """The value as a player's file has it."""
+    return value.half() if value.is_floating_point() else value.int()

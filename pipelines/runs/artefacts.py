@@ -1,0 +1,52 @@
+"""What the stages of a build leave for each other, read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.runs.arrays import load_arrays
+from pipelines.runs.layout import PARAMS, PARTS, POSED_BODY, SCAN, SCAN_LABELS, WEIGHTS
+from smplxpp.body import BodyModel, load_params
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.skin_weights import SkinWeights
+
+
+def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
+    """The repaired scan of a run: mesh, (N, 3) colours, (N,) index of each vertex in the user's file."""
+    arrays = load_arrays(run / SCAN)["scan"]
+    return TriangleMesh(arrays["vertices"], arrays["faces"]), arrays["colors"], arrays["source_vertex"]
+
+
+def load_params_of_run(run: Path) -> BodyParams:
+    """The parameters of the reference frame."""
+    return load_params(run / PARAMS)
+
+
+def load_scan_labels(run: Path) -> np.ndarray:
+    """(F,) labels of the scan's faces."""
+    with np.load(run / SCAN_LABELS) as labels:
+        return labels["face_labels"]
+
+
+def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:
+    """The fitted body in the reference frame, and its (J, 4, 4) `posed_from_rest`."""
+    with np.load(run / POSED_BODY) as data:
+        return body.mesh(data["vertices"]), data["posed_from_rest"]
+
+
+def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
+    """The cleaned parts in the reference pose: mesh, and arrays `label`, `source_vertex`, `colors`."""
+    groups = load_arrays(run / PARTS)
+    return {name: (TriangleMesh(a["vertices"], a["faces"]), a) for name, a in groups.items()}
+
+
+def load_weights(run: Path) -> dict[str, SkinWeights]:
+    """The parts' skin weights."""
+    out = {}
+    for name, arrays in load_arrays(run / WEIGHTS).items():
+        scalars = {"joint_count": int(arrays.pop("joint_count")), "policies": tuple(arrays.pop("policies").tolist())}
+        out[name] = SkinWeights(**arrays, **scalars)
+    return out

@@ -1,0 +1,144 @@
+"""The code that a stage runs, as digests: its module and whatever that imports, the kernels it calls among them.
+
+A comment, a docstring or the layout of a file changes no digest; neither does code that the stage never imports.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+PACKAGES = ("smplxpp", "avatar", "pipelines")
+NATIVE = "smplxpp.native"
+_COMMENTS = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_EXPORT = re.compile(r"SMPLXPP_EXPORT[^;{(]*?(\w+)\(")
+
+
+@dataclass(frozen=True)
+class _Module:
+    """What counts of a source file: the digest of its statements, the modules it imports, the names it mentions."""
+
+    digest: str
+    imports: tuple[str, ...]
+    names: frozenset[str]
+
+
+def code_of(*modules: str) -> dict[str, str]:
+    """Hex digests by name of the modules, of all that they import of `PACKAGES`, and of the kernels' folders they call.
+
+    Imports anywhere in a file count, those within functions too, but not those that only type checkers see.
+
+    Raises:
+        ModuleNotFoundError: no such module.
+    """
+    found: dict[str, str] = {}
+    kernels: set[str] = set()
+    waiting = [part for module in modules for part in _with_packages(module)]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        module = _module(name)
+        found[name] = module.digest
+        waiting += module.imports
+        kernels |= {folder for symbol, folder in _exports().items() if symbol in module.names}
+    for folder in sorted(kernels | ({"common"} if kernels else set())):
+        found[f"{NATIVE}/{folder}"] = _native_digest(folder)
+    return dict(sorted(found.items()))
+
+
+@cache
+def _module(name: str) -> _Module:
+    path = _source(name)
+    if path is None:
+        raise ModuleNotFoundError(f"no source of module {name}")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    names = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    imports = dict.fromkeys(part for module in _imported(tree, package) for part in _with_packages(module))
+    text = ast.dump(_Statements().visit(tree), annotate_fields=False)
+    return _Module(hashlib.sha256(text.encode()).hexdigest()[:16], tuple(imports), frozenset(names))
+
+
+class _Statements(ast.NodeTransformer):
+    """Leaves out what does nothing: texts that stand alone, docstrings among them."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else self.generic_visit(node)
+
+
+def _imported(tree: ast.AST, package: str) -> Iterable[str]:
+    """Modules of `PACKAGES` that a file imports."""
+    for node in _executed(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PACKAGES)
+        elif isinstance(node, ast.ImportFrom):
+            parent = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parent, *([node.module] if node.module else [])])
+            if base.split(".")[0] in PACKAGES:
+                yield base
+                yield from (f"{base}.{a.name}" for a in node.names if _source(f"{base}.{a.name}") is not None)
+
+
+def _executed(tree: ast.AST) -> Iterable[ast.AST]:
+    """All nodes but those under `if TYPE_CHECKING`."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            waiting += node.orelse
+        else:
+            waiting += ast.iter_child_nodes(node)
+
+
+def _with_packages(module: str) -> list[str]:
+    """A module after the packages that hold it: importing it runs theirs first."""
+    parts = module.split(".")
+    return [".".join(parts[: k + 1]) for k in range(len(parts))]
+
+
+@cache
+def _source(module: str) -> Path | None:
+    """The file of a module of `PACKAGES`; nothing is imported but the package at its top."""
+    top, *rest = module.split(".")
+    base = _root(top).joinpath(*rest)
+    candidates = (base / "__init__.py", base.with_suffix(".py")) if rest else (base / "__init__.py",)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+@cache
+def _root(package: str) -> Path:
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"no package {package}")
+    return Path(spec.origin).parent
+
+
+@cache
+def _exports() -> dict[str, str]:
+    """Folder of the native sources by the name of each function that they hand out."""
+    root = _root("smplxpp") / "native"
+    return {
+        name: path.parent.name
+        for path in sorted(root.glob("*/*.cpp"))
+        for name in _EXPORT.findall(path.read_text(encoding="utf-8"))
+    }
+
+
+@cache
+def _native_digest(folder: str) -> str:
+    """The digest of a folder of native sources, without comments and white space."""
+    digest = hashlib.sha256()
+    root = _root("smplxpp") / "native" / folder
+    for path in sorted([*root.glob("*.cpp"), *root.glob("*.hpp")]):
+        digest.update(path.name.encode())
+        digest.update("".join(_COMMENTS.sub("", path.read_text(encoding="utf-8")).split()).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,77 @@
+"""Stage 60: body and parts as one template, layers apart; npz, GLB and OBJ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.runs.arrays import load_arrays
+from pipelines.runs.artefacts import (
+    load_params_of_run,
+    load_parts,
+    load_posed_body,
+    load_scan,
+    load_scan_labels,
+    load_weights,
+)
+from pipelines.runs.checks import Check
+from pipelines.runs.layout import CANONICAL, SCAN
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.build_config import BuildContext
+from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template, body_colors_from_scan
+from smplxpp.body import BodyModel, load_body
+from smplxpp.core.labels import SKIN
+from smplxpp.export import write_glb, write_obj
+from smplxpp.metrics.distance import MM
+from smplxpp.template.template import Template
+
+
+def run(folder: Path, build: BuildContext) -> StageOutput:
+    """body and parts as one `Template`, layers apart; npz, GLB and OBJ."""
+    body = load_body(build.inputs.body)
+    canonical, weights, parts = load_arrays(build.run / CANONICAL), load_weights(build.run), {}
+    source_vertex = load_arrays(build.run / SCAN)["scan"]["source_vertex"]
+    for name, (mesh, arrays) in load_parts(build.run).items():
+        parts[name] = CanonicalPart(
+            mesh=mesh.with_vertices(canonical[name]["vertices"]),
+            weights=weights[name],
+            label=int(arrays["label"]),
+            vertex_colors=arrays["colors"],
+            scan_index=source_vertex[arrays["source_vertex"]],
+        )
+    template, report = assemble_template(
+        body, load_params_of_run(build.run), parts, config=AssemblyConfig(clearance=build.config.clearance_mm / MM)
+    )
+    template = _colored_body(template, build.run, body)
+    template.save(folder / "smplxpp.npz")
+    write_glb(folder / "template.glb", template)
+    write_obj(folder / "template.obj", template)
+    checks = [
+        Check(
+            "outer vertices inside an inner layer at rest",
+            report.penetrating_after,
+            "",
+            0,
+            0,
+            explanation="after the repair",
+        ),
+        Check("largest push of the repair", report.max_push * MM, "mm", 15.0, 60.0),
+    ]
+    return StageOutput(checks, report.as_dict())
+
+
+def _colored_body(template: Template, run: Path, body: BodyModel) -> Template:
+    """The template with the scan's colours on the skin that the scan shows."""
+    scan, colors, source_vertex = load_scan(run)
+    skin = load_scan_labels(run) == SKIN.id
+    posed, _ = load_posed_body(run, body)
+    body_colors, body_index = body_colors_from_scan(posed, scan, colors, skin)
+    count = body.vertex_count
+    scan_index = np.where(body_index >= 0, source_vertex[body_index], -1)
+    return replace(
+        template,
+        vertex_colors=np.concatenate([body_colors, template.vertex_colors[count:]]),
+        scan_index=np.concatenate([scan_index, template.scan_index[count:]]),
+    )

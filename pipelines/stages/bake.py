@@ -1,0 +1,58 @@
+"""Stage 85: what the teacher does in maps becomes motion of the student's mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avatar.models.student import StudentConfig
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.student.bake import BakeConfig
+from avatar.training.train import Session, bake
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.models import ModelStage, Trainer
+from pipelines.stages.train_results import training_output, write_model
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeStage(ModelStage):
+    """A student before its blend shapes: field and attributes from a teacher, or from photographs.
+
+    Attributes:
+        source: a teacher, whose Gaussians it starts from too; or a reference fit, to learn from photographs alone.
+    """
+
+    file = "student.safetensors"
+
+    source: ModelStage
+    student: StudentConfig
+    config: BakeConfig
+
+    @property
+    def needs(self) -> Mapping[str, ModelStage]:
+        return {"source": self.source}
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def iterations(self) -> int:
+        return self.config.iterations
+
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        return {
+            "training": self.config,
+            "student": self.student,
+            "perceptual": trainer.perceptual_name(self.config),
+        }
+
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        sequence = trainer.sequence(self.ground)
+        source = self.source.read(trainer.path(self.source), sequence.rig)
+        teacher = source if isinstance(source, TeacherAvatar) else None
+        gaussians = source if teacher is None else teacher.gaussians.snapshot()
+        model, done = bake(sequence, gaussians, self.student, self.config, session, teacher=teacher)
+        return training_output(trainer, session, folder, model, done, lambda: write_model(folder / self.file, model))

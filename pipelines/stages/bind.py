@@ -1,0 +1,199 @@
+"""Stage 70: views of the reference frame turn the template into Gaussians bound to its triangles."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.data.views import View, read_views
+from avatar.export.splats import write_splat_ply
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.metrics.view_quality import CONVENTION, mean_quality
+from avatar.rig.rig import Rig
+from avatar.training.engine.loop import METRICS_FILE
+from avatar.training.reference_fit.config import FitConfig
+from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
+from avatar.training.train import Session
+from pipelines.figures.comparison import write_strip
+from pipelines.runs.checks import Check
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.layout import TEMPLATE
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.models import GROUNDS, ModelStage, Trainer
+from pipelines.stages.scene import silhouette_overlap
+from smplxpp.core.spread import spread
+
+PREVIEWED_TRAINING_VIEWS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class BindStage(ModelStage):
+    """Gaussians fitted to one frame's photographs.
+
+    Attributes:
+        config: of the fit. by_hand: made by `smplxpp fit-reference`; a training takes such a fit as it stands.
+    """
+
+    file = "gaussians.safetensors"
+    alone = True
+
+    config: FitConfig
+    by_hand: bool = False
+
+    @property
+    def needs(self) -> Mapping[str, ModelStage]:
+        return {}
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def iterations(self) -> int:
+        return self.config.iterations
+
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        splits, capture = trainer.scene.capture.splits, trainer.scene.capture
+        return {
+            "fit": self.config,
+            "frame": trainer.scene.frame,
+            "train": splits.train_cameras,
+            "held_out": splits.novel_view_cameras,
+            "background": capture.recording.background or (0.0, 0.0, 0.0),
+        }
+
+    def inputs(self, trainer: Trainer) -> Mapping[str, str]:
+        """Digests of the template and of everything that is read of the capture, contents included."""
+        scene, capture = trainer.scene, trainer.scene.capture
+
+        def of(*arrays: np.ndarray) -> str:
+            digest = hashlib.sha256()
+            for array in arrays:
+                digest.update(np.ascontiguousarray(array).tobytes())
+            return digest.hexdigest()
+
+        out = {TEMPLATE: scene.digests[TEMPLATE], "capture/pose": of(_posed(trainer))}
+        for name in (*capture.splits.train_cameras, *capture.splits.novel_view_cameras):
+            camera = capture.cameras[name]
+            out[f"capture/{name} camera"] = of(camera.K, camera.cam_from_world)
+            for kind in ("image", "mask"):
+                path = capture.file(name, scene.frame, kind)
+                if path is not None:
+                    out[f"capture/{name} {kind}"] = sha256_file(path)
+        return out
+
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        capture, frame = trainer.scene.capture, trainer.scene.frame
+        template = GROUNDS[self.ground](trainer.scene.template)
+        scene = FitScene(
+            template,
+            template.pose(capture.params(frame))[0],
+            read_views(capture, frame, capture.splits.train_cameras),
+            read_views(capture, frame, capture.splits.novel_view_cameras),
+            capture.recording.background or (0.0, 0.0, 0.0),
+        )
+        overlap = silhouette_overlap(template.mesh.with_vertices(scene.vertices), list(scene.train))
+        views = {view.name: view for view in (*scene.held_out, *scene.train)}
+
+        def preview(images: Mapping[str, np.ndarray]) -> None:
+            _write_strips(session.folder, images, views, scene.background)
+
+        result = fit_reference(
+            scene,
+            self.config,
+            session.folder,
+            key=session.key,
+            device=trainer.device,
+            max_seconds=session.max_seconds,
+            report=session.report,
+            preview=preview,
+        )
+        save_bound(result.gaussians, folder / self.file)
+        write_splat_ply(folder / "splats.ply", result.splats)
+        shutil.copyfile(session.folder / METRICS_FILE, folder / METRICS_FILE)
+        held_out = [view.name for view in scene.held_out]
+        train = [view.name for view in scene.train]
+        shown = (*held_out, *spread(train, PREVIEWED_TRAINING_VIEWS))
+        _write_strips(folder, {name: result.images[name] for name in shown}, views, scene.background)
+        output = _output(result, held_out, train, overlap)
+        output.numbers["by_hand"] = self.by_hand
+        return output
+
+    def read(self, path: Path, rig: Rig) -> BoundGaussians:
+        return load_bound(path, faces=rig.template.faces).to(device=rig.device)
+
+
+def _posed(trainer: Trainer) -> np.ndarray:
+    """(V, 3) vertices of the person's template in the frame's pose, metres."""
+    return trainer.scene.template.pose(trainer.scene.capture.params(trainer.scene.frame))[0]
+
+
+def _write_strips(
+    folder: Path, images: Mapping[str, np.ndarray], views: Mapping[str, View], background: tuple[float, float, float]
+) -> None:
+    """Write photograph, rendering and error of each view to `folder/previews/CAM.png`."""
+    for name, image in images.items():
+        write_strip(folder / "previews" / f"{name}.png", views[name].photograph(background), image)
+
+
+def _output(result: FitResult, held_out: list[str], train: list[str], overlap: float) -> StageOutput:
+    done = result.progress
+    shown = held_out or train
+    mean = {
+        name: mean_quality({v: result.quality[v] for v in names})
+        for name, names in (("held_out", held_out), ("train", train))
+        if names
+    }
+    figures = mean["held_out" if held_out else "train"]
+    which = "held-out" if held_out else "training"
+    checks = [
+        Check(
+            "template's silhouette on the masks",
+            overlap,
+            "IoU",
+            0.95,
+            0.8,
+            higher_is_better=True,
+            explanation="mean over the training views, before the fit; low: another pose, or other cameras",
+        ),
+        Check(
+            f"{which} views: PSNR of the person",
+            figures["psnr"],
+            "dB",
+            22.0,
+            16.0,
+            higher_is_better=True,
+            explanation=f"mean over {len(shown)} cameras, over the union of the silhouettes",
+        ),
+        Check(f"{which} views: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
+        Check(
+            "iterations done",
+            done.iteration / done.iterations,
+            "",
+            1.0,
+            0.0,
+            higher_is_better=True,
+            explanation="below 1: the limit of time ended it; the same command goes on",
+        ),
+    ]
+    numbers = {
+        "gaussians": len(result.gaussians),
+        "iterations": done.iterations,
+        "iterations_done": done.iteration,
+        "finished": done.finished,
+        "seconds_of_steps": done.seconds,
+        "iterations_per_second": done.iteration / done.seconds if done.seconds else 0.0,
+        "convention": CONVENTION,
+        "mean": mean,
+        "held_out": {name: asdict(result.quality[name]) for name in held_out},
+        "train": {name: asdict(result.quality[name]) for name in train},
+        "heads": {name: result.heads[name] for name in (*held_out, *train)},
+    }
+    return StageOutput(checks, numbers)

@@ -1,0 +1,63 @@
+"""What models have seen, by the record of the stages that made them, against what is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.runs.stage import read_manifest
+from smplxpp.capture.splits import Splits
+from smplxpp.core.errors import InputError
+
+NAMED = 8
+"""Cameras and frames that a refusal names."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Cameras and frames that models learned from, by themselves or through what they were made from."""
+
+    cameras: frozenset[str]
+    frames: frozenset[int]
+
+
+def seen_by(run: Path, stages: Iterable[str]) -> Seen:
+    """What the models of a run's stages have seen."""
+    found = [((read_manifest(run / name) or {}).get("numbers") or {}).get("seen") or {} for name in stages]
+    return Seen(
+        frozenset(camera for one in found for camera in one.get("cameras", ())),
+        frozenset(frame for one in found for frame in one.get("frames", ())),
+    )
+
+
+def refuse_seen(run: Path, stages: Iterable[str], splits: Splits) -> None:
+    """Refuse models that have seen cameras or frames which count as held out.
+
+    Raises:
+        InputError: names the stages and what they saw.
+    """
+    names = tuple(sorted(stages))
+    seen = seen_by(run, names)
+    cameras = [camera for camera in splits.novel_view_cameras if camera in seen.cameras]
+    frames = [frame for frame in splits.novel_pose_frames if frame in seen.frames]
+    if not cameras and not frames:
+        return
+    known = sorted({*splits.train_cameras, *splits.novel_view_cameras})
+    never = [camera for camera in known if camera not in seen.cameras]
+    remedy = "train anew without them (--force)"
+    if cameras and never:
+        remedy = f"hold out what they did not see (--hold-out {' '.join(never[:NAMED])}), or {remedy}"
+    what = [f"{kind} {_named(values)}" for kind, values in (("cameras", cameras), ("frames", frames)) if values]
+    raise InputError(
+        f"held-out views of run {run}",
+        expected="views that its models have not seen",
+        received=f"{' and '.join(what)}, which {', '.join(names)} learned from",
+        remedy=remedy,
+    )
+
+
+def _named(values: list[Any]) -> str:
+    shown = ", ".join(map(str, values[:NAMED]))
+    return shown if len(values) <= NAMED else f"{shown} and {len(values) - NAMED} more"

@@ -1,0 +1,329 @@
+"""Stages that train a model: what decides each, and how they are made from each other's files."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from avatar.baselines.outer_template import outer_template
+from avatar.data.sequence import AvatarSequence
+from avatar.data.views import read_view
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.rig.rig import Rig
+from avatar.training.engine.loop import Progress
+from avatar.training.engine.photometric_task import PhotometricConfig
+from avatar.training.engine.processes import Distributed
+from avatar.training.engine.resource_errors import explain_resource_errors
+from avatar.training.train import Session
+from pipelines.figures.comparison import write_strip
+from pipelines.runs.digests import TRAINING
+from pipelines.runs.lock import own_run_folder
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, decide, read_manifest, run_stage, standing
+from pipelines.stages.scene import TrainScene
+from smplxpp.capture import Capture
+from smplxpp.core.errors import InputError
+from smplxpp.template.template import Template
+
+CLOTHED, NAKED, OUTER = "clothed", "naked", "outer"
+GROUNDS: Mapping[str, Callable[[Template], Template]] = {
+    CLOTHED: lambda template: template,
+    NAKED: Template.naked,
+    OUTER: outer_template,
+}
+"""Templates that models are trained on, made from the person's."""
+ONE_STEP = 1e-9
+"""Seconds: a training that is begun takes a step."""
+Bar = Callable[[str, int], AbstractContextManager[Callable[[Progress], None]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """How training runs; nothing in it changes what comes out.
+
+    Attributes:
+        max_seconds: stop after as long with a checkpoint and what there is.
+        force: train anew even what stands.
+        tensorboard: log for TensorBoard into the folders of the stages.
+        bar: called with a stage's name and iterations; shows its progress.
+    """
+
+    max_seconds: float = float("inf")
+    force: bool = False
+    tensorboard: bool = False
+    bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelStage(ABC):
+    """A model that is trained once. Its settings and the files that it needs decide what comes out.
+
+    Attributes:
+        name: its folder in the run.
+        ground: among `GROUNDS`, the template that it is trained on.
+        elsewhere: other folders of the run in which the same stage may stand already.
+    """
+
+    file: ClassVar[str]
+    """The model in the stage's folder."""
+    resumable: ClassVar[bool] = True
+    alone: ClassVar[bool] = False
+    """Of several processes the first trains it; the others wait."""
+
+    name: str
+    ground: str = CLOTHED
+    elsewhere: tuple[str, ...] = ()
+
+    @property
+    @abstractmethod
+    def needs(self) -> Mapping[str, ModelStage]:
+        """The stages whose models it is made from, by the part that they play."""
+
+    @property
+    @abstractmethod
+    def seed(self) -> int:
+        """The seed of what is drawn."""
+
+    @property
+    @abstractmethod
+    def iterations(self) -> int:
+        """Steps of the training, for its progress."""
+
+    @abstractmethod
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        """Every choice that decides it, but for those of the stages that it needs."""
+
+    def inputs(self, trainer: Trainer) -> Mapping[str, str]:
+        """Digests by name of what it reads beside the models that it needs."""
+        return trainer.scene.digests
+
+    @abstractmethod
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        """Train, from the session's checkpoint if there is one, and write the model into `folder`.
+
+        Every process calls it; all but the first have no folder to write to, and their answer is not used.
+        """
+
+    def read(self, path: Path, rig: Rig) -> Any:
+        """Read the model in a file of this stage."""
+        return load_avatar(path, rig)
+
+    def read_by(self, trainer: Trainer, path: Path) -> Any:
+        """`read` for a model that is more than its file."""
+        return self.read(path, trainer.sequence(self.ground).rig)
+
+    def write_player(self, path: Path, model: Any) -> None:
+        """Write what a player needs of the model, in half precision."""
+        save_avatar(path, model, compact=True)
+
+
+class Trainer:
+    """Makes the model stages of a run on one scene.
+
+    Args:
+        run: folder of the run. scale: of the images, part of every stage's key.
+        perceptual: for the perceptual term of losses that have one, None leaves it out.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        scene: TrainScene,
+        options: TrainOptions,
+        together: Distributed,
+        *,
+        scale: float = 1.0,
+        perceptual: PerceptualDistance | None = None,
+    ) -> None:
+        self.run, self.scene, self.options, self.together = run, scene, options, together
+        self.scale, self.perceptual = scale, perceptual
+        self._deadline = time.monotonic() + options.max_seconds
+        self._sequences: dict[str, AvatarSequence] = {}
+        self._finished: dict[str, StageRecord] = {}
+
+    @property
+    def device(self) -> str:
+        """ "cpu" or "cuda"."""
+        return self.together.device.split(":")[0]
+
+    def perceptual_name(self, config: PhotometricConfig) -> str | None:
+        """The metric of the perceptual term of a training that has one."""
+        return None if self.perceptual is None or not config.weights.perceptual else self.perceptual.name
+
+    def seconds_left(self) -> float:
+        """What is left of the time, the same on every process; 0 when it is over."""
+        return self.together.run_on_rank0(lambda: max(0.0, self._deadline - time.monotonic()))
+
+    def sequence(self, ground: str) -> AvatarSequence:
+        """The capture seen with one of the templates of `GROUNDS`; they share its images."""
+        if ground not in self._sequences:
+            template = GROUNDS[ground](self.scene.template)
+            self._sequences[ground] = AvatarSequence(self.scene.capture, template, device=self.together.device)
+        return self._sequences[ground]
+
+    def model(self, stage: ModelStage) -> Any:
+        """The finished model of a stage."""
+        return stage.read_by(self, self.path(stage))
+
+    def path(self, stage: ModelStage) -> Path:
+        """The file of a finished stage.
+
+        Raises:
+            InputError: it is missing or unfinished.
+        """
+        found = self.found(stage)
+        if found is None or not found.finished:
+            manifest = read_manifest(self.run / stage.name) if found is None else found.manifest
+            numbers = {} if manifest is None else manifest["numbers"]
+            done = "iterations_done" in numbers and not numbers.get("finished", True)
+            raise InputError(
+                f"run {self.run}",
+                expected=f"a finished {stage.name}",
+                received=f"{numbers['iterations_done']} of {numbers['iterations']} iterations of it"
+                if done
+                else "none",
+                remedy="give the same command without --stage, which trains what is missing",
+            )
+        return found.folder / stage.file
+
+    def found(self, stage: ModelStage) -> StageRecord | None:
+        """The stage where it stands, in its own folder or elsewhere in the run; None where it does not."""
+        if stage.name in self._finished:
+            return self._finished[stage.name]
+        if any((need := self.found(one)) is None or not need.finished for one in stage.needs.values()):
+            return None
+        identity = self.identity(stage)
+        for name in (stage.name, *stage.elsewhere):
+            record = standing(self.run / name, identity)
+            if record is not None and (record.finished or name == stage.name):
+                if record.finished:
+                    self._finished[stage.name] = record
+                return record
+        return None
+
+    def take(self, stage: ModelStage, record: StageRecord) -> None:
+        """Let a record that lies in the run count as a stage, whatever its key."""
+        self._finished[stage.name] = record
+
+    def identity(self, stage: ModelStage) -> Stage:
+        """What decides a stage whose needs are finished."""
+        digests, sources = dict(stage.inputs(self)), {}
+        for part, needed in stage.needs.items():
+            path = self.path(needed)
+            digests[part] = self._finished[needed.name].manifest["files"][needed.file]
+            sources[part] = path.relative_to(self.run).as_posix()
+        ground = {} if stage.ground == CLOTHED else {"ground": stage.ground}
+        return Stage(
+            name=stage.name,
+            config={**stage.settings(self), **ground, "device": self.device, "scale": self.scale},
+            inputs=digests,
+            code=(type(stage).__module__,),
+            libraries=TRAINING,
+            seed=stage.seed,
+            resumable=stage.resumable,
+            sources=sources,
+        )
+
+    def make(self, stage: ModelStage, *, force: bool | None = None) -> StageRecord:
+        """Train a stage unless it stands; what it needs has to stand.
+
+        A training that was interrupted, or that the limit of time ended, goes on where it was. The first process
+        writes, the others train with it.
+
+        Args:
+            force: train anew even if it stands; None: as the options say.
+
+        Raises:
+            InputError: something it needs is missing or unfinished, its state is of another training, memory or disk
+                ran out, or training diverged; checkpoints and finished stages stay.
+        """
+        force = self.options.force if force is None else force
+        if force:
+            self._finished.pop(stage.name, None)
+        if stage.alone:
+            return self.together.run_on_rank0(lambda: self._make(stage, force=force))
+        return self._make(stage, force=force)
+
+    def _make(self, stage: ModelStage, *, force: bool) -> StageRecord:
+        together, shared = self.together, not stage.alone
+        if not together.first:
+            identity, runs = together.run_on_rank0(_nothing)
+            if runs:
+                stage.work(self, self._session(stage, identity), self.run / stage.name)
+            record = together.run_on_rank0(_nothing)
+        else:
+            with own_run_folder((self.run / stage.name).parent, (Path(stage.name).name, "report")):
+                record = self._first(stage, shared=shared, force=force)
+            record = together.run_on_rank0(lambda: record) if shared else record
+        if record.finished:
+            self._finished[stage.name] = record
+        return record
+
+    def _first(self, stage: ModelStage, *, shared: bool, force: bool) -> StageRecord:
+        """What the first process does: decide, tell the others, train and write."""
+        together = self.together
+
+        def decided() -> tuple[Stage, bool]:
+            identity = self.identity(stage)
+            return identity, decide(self.run, identity, force=force) != "skip"
+
+        identity, _ = together.run_on_rank0(decided) if shared else decided()
+
+        def work(folder: Path) -> StageOutput:
+            with explain_resource_errors(self.run), self.options.bar(stage.name, stage.iterations) as report:
+                output = stage.work(self, replace(self._session(stage, identity), report=report), folder)
+            output.numbers["seen"] = self._seen(stage)
+            return output
+
+        return run_stage(self.run, identity, work, force=force)
+
+    def _session(self, stage: ModelStage, identity: Stage) -> Session:
+        folder = self.run / identity.work_name
+        left = self._deadline - time.monotonic() if stage.alone else self.seconds_left()
+        return Session(
+            folder,
+            identity.key,
+            self.perceptual,
+            self.together,
+            max(left, ONE_STEP),
+            tensorboard=self.options.tensorboard,
+            preview=preview_writer(self.scene.capture, folder),
+        )
+
+    def _seen(self, stage: ModelStage) -> dict[str, list[Any]]:
+        """Cameras and frames that the model learned from, by itself or through what it was made from."""
+        splits, scene = self.scene.capture.splits, self.scene
+        frames = {scene.frame} if stage.alone else set(splits.train_frames)
+        cameras = set(splits.train_cameras)
+        for needed in stage.needs.values():
+            seen = self._finished[needed.name].manifest["numbers"].get("seen", {})
+            cameras |= set(seen.get("cameras", ()))
+            frames |= set(seen.get("frames", ()))
+        if scene.template_frame is not None:
+            frames.add(scene.template_frame)
+        return {"cameras": sorted(cameras), "frames": sorted(frames)}
+
+
+def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
+    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
+    background = capture.recording.background or (0.0, 0.0, 0.0)
+
+    def write(images: Mapping[str, np.ndarray]) -> None:
+        for name, image in images.items():
+            camera, frame = name.rsplit(" ", 1)
+            real = read_view(capture, camera, int(frame)).photograph(background)
+            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
+
+    return write
+
+
+def _nothing() -> Any:
+    """For the processes that only hear what the first one says."""
+    raise AssertionError

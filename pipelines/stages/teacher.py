@@ -1,0 +1,63 @@
+"""Stage 80: the surface is followed, the networks are pretrained on it, the teacher learns from the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from avatar.models.networks.teacher import TeacherConfig
+from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.train import Session, fit_teacher
+from pipelines.runs.stage import StageOutput
+from pipelines.stages.models import ModelStage, Trainer
+from pipelines.stages.train_results import training_output, write_model
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeacherStage(ModelStage):
+    """A teacher on fitted Gaussians.
+
+    Attributes:
+        gaussians: the stage that fits them.
+    """
+
+    file = "teacher.safetensors"
+
+    gaussians: ModelStage
+    networks: TeacherConfig
+    config: FitTeacherConfig
+
+    @property
+    def needs(self) -> Mapping[str, ModelStage]:
+        return {"gaussians": self.gaussians}
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def iterations(self) -> int:
+        return self.config.iterations
+
+    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
+        return {
+            "training": self._training(trainer),
+            "networks": self.networks,
+            "perceptual": trainer.perceptual_name(self.config),
+        }
+
+    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        sequence = trainer.sequence(self.ground)
+        gaussians = self.gaussians.read(trainer.path(self.gaussians), sequence.rig)
+        model, done = fit_teacher(sequence, gaussians, self.networks, self._training(trainer), session)
+        return training_output(trainer, session, folder, model, done, lambda: write_model(folder / self.file, model))
+
+    def _training(self, trainer: Trainer) -> FitTeacherConfig:
+        """The configuration with what the tracking has to know of the scene."""
+        track = self.config.track
+        if track is None:
+            return self.config
+        own = replace(track, reference=trainer.scene.built_frame, seed=self.config.seed)
+        return replace(self.config, track=own)
