@@ -82,6 +82,12 @@ class Stage:
         return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
 
     @property
+    def recorded(self) -> dict[str, Any]:
+        """`identity` with the names of files in the place of those of inputs, as manifests have it."""
+        inputs = {self.sources.get(name, name): digest for name, digest in self.inputs.items()}
+        return {**self.identity, "inputs": inputs}
+
+    @property
     def work_name(self) -> str:
         """The folder of the state of a stage under way."""
         return f"{self.name}_work"
@@ -146,7 +152,7 @@ def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
         raise InputError(
             f"state of {stage.name} in {work}",
             expected="these options, inputs and code",
-            received=f"another one's: {differences(record, stage.identity)}",
+            received=f"another one's: {differences(record, stage)}",
             remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
             "(--force does)",
         )
@@ -175,7 +181,7 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
         shutil.rmtree(state, ignore_errors=True)
     if stage.resumable:
         state.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(state / STATE_RECORD, json.dumps({"key": stage.key, **stage.identity}, indent=1))
+        atomic_write_text(state / STATE_RECORD, json.dumps({"key": stage.key, **stage.recorded}, indent=1))
     begin = time.perf_counter()
     with atomic_folder(folder) as temporary:
         output = work(temporary)
@@ -205,11 +211,11 @@ def require_stage(run: Path, name: str) -> StageRecord:
     return StageRecord(folder, manifest, ran=False)
 
 
-def differences(record: Mapping[str, Any], identity: Mapping[str, Any]) -> str:
-    """What two stages differ in, in words: options with both values, inputs, modules and libraries by name."""
+def differences(record: Mapping[str, Any], stage: Stage) -> str:
+    """What a record differs in from a stage, in words: options with both values, inputs, modules, libraries by name."""
     words = []
     for part in ("config", "inputs", "code", "versions"):
-        old, new = (_leaves(one.get(part, {})) for one in (record, identity))
+        old, new = (_leaves(one.get(part, {})) for one in (record, stage.recorded))
         changed = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
         for name in changed[:DIFFERENCES_SHOWN]:
             values = f" was {old.get(name)}, is {new.get(name)}" if part in ("config", "versions") else ""
@@ -228,15 +234,10 @@ def _leaves(value: Any, name: str = "") -> dict[str, Any]:
 
 def _manifest(stage: Stage, output: StageOutput, folder: Path, seconds: float) -> dict[str, Any]:
     files = {p.relative_to(folder).as_posix(): sha256_file(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    identity = stage.identity
     return {
-        "schema": SCHEMA,
         "stage": stage.name,
         "key": stage.key,
-        "config": identity["config"],
-        "inputs": {stage.sources.get(name, name): digest for name, digest in stage.inputs.items()},
-        "code": identity["code"],
-        "versions": identity["versions"],
+        **stage.recorded,
         "seed": stage.seed,
         "seconds": round(seconds, 4),
         "checks": [jsonable(check.as_dict()) for check in output.checks],

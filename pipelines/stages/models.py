@@ -26,7 +26,16 @@ from avatar.training.train import Session
 from pipelines.figures.comparison import write_strip
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.lock import own_run_folder
-from pipelines.runs.stage import Stage, StageOutput, StageRecord, decide, read_manifest, run_stage, standing
+from pipelines.runs.stage import (
+    Stage,
+    StageOutput,
+    StageRecord,
+    decide,
+    differences,
+    read_manifest,
+    run_stage,
+    standing,
+)
 from pipelines.stages.scene import TrainScene
 from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
@@ -180,18 +189,24 @@ class Trainer:
         """
         found = self.found(stage)
         if found is None or not found.finished:
-            manifest = read_manifest(self.run / stage.name) if found is None else found.manifest
-            numbers = {} if manifest is None else manifest["numbers"]
-            done = "iterations_done" in numbers and not numbers.get("finished", True)
             raise InputError(
                 f"run {self.run}",
                 expected=f"a finished {stage.name}",
-                received=f"{numbers['iterations_done']} of {numbers['iterations']} iterations of it"
-                if done
-                else "none",
+                received=self._instead(stage, found),
                 remedy="give the same command without --stage, which trains what is missing",
             )
         return found.folder / stage.file
+
+    def _instead(self, stage: ModelStage, found: StageRecord | None) -> str:
+        """What there is of a stage that is not finished, in words."""
+        if found is not None:
+            numbers = found.manifest["numbers"]
+            return f"{numbers['iterations_done']} of {numbers['iterations']} iterations of it"
+        manifest = read_manifest(self.run / stage.name)
+        needs = (self.found(one) for one in stage.needs.values())
+        if manifest is None or any(need is None or not need.finished for need in needs):
+            return "none"
+        return f"one that was made otherwise: {differences(manifest, self.identity(stage))}"
 
     def found(self, stage: ModelStage) -> StageRecord | None:
         """The stage where it stands, in its own folder or elsewhere in the run; None where it does not."""
@@ -253,6 +268,8 @@ class Trainer:
 
     def _make(self, stage: ModelStage, *, force: bool) -> StageRecord:
         together, shared = self.together, not stage.alone
+        if shared:  # what is missing is said before the folder is touched
+            together.run_on_rank0(lambda: [str(self.path(needed)) for needed in stage.needs.values()])
         if not together.first:
             identity, runs = together.run_on_rank0(_nothing)
             if runs:

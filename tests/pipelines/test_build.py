@@ -263,7 +263,7 @@ def test_a_broken_scan_is_repaired_and_said_so(small):
         (lambda s: {"labels": np.ones_like(s.labels)}, "at least one of hair"),
         (lambda s: {"labels": s.labels + 0.5}, "integers"),
         (lambda s: {"label_set": "nonsense"}, "label set"),
-        (lambda s: {"frame": 99}, "below 16"),
+        (lambda s: {"params_row": 99}, "below 16"),
         (lambda s: {"label_maps": {"Cam1": s.folder / "a.png"}}, "camera file"),
     ],
 )

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from pipelines.cli import COMMANDS, main
-from pipelines.runs.stage import StageOutput, run_stage
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
+from tests.runs.stages import add_stage
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 SCAN, PARAMS = FIXTURE / "scans" / "scan_000000.ply", FIXTURE / "params" / "params.npz"
@@ -145,7 +145,7 @@ def test_an_error_is_json_when_json_was_asked_for(capsys):
 
 
 def test_json_is_all_that_stdout_gets(capsys, tmp_path, cube):
-    run_stage(tmp_path / "run", "00_capture", lambda folder: StageOutput(), config={}, inputs={})
+    add_stage(tmp_path / "run", "00_capture")
     for args in (
         ["inspect", tmp_path / "run"],
         ["metrics", cube, cube, "--samples", "100"],

@@ -19,7 +19,7 @@ from pipelines.commands import extras, inspect
 from pipelines.commands.inspect import summarise_run
 from pipelines.commands.progress import training_progress
 from pipelines.figures.comparison import read_strip
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import SCHEMA, read_manifest
 from smplxpp.core.params import BodyParams
 from tests.training.doll import HELD_OUT, TRAIN, doll, write_capture, write_run
 
@@ -88,7 +88,7 @@ def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
     assert stage["state"] == "done" and stage["files"] == 8
     assert {c.name for c in checks if c.stage == "70_bind"} >= {"held-out views: PSNR of the person"}
     (own / "60_assemble" / "manifest.json").write_text(
-        json.dumps({"schema": 1, "stage": "60_assemble", "seconds": 1.0, "files": {"smplxpp.npz": "other"}})
+        json.dumps({"schema": SCHEMA, "stage": "60_assemble", "seconds": 1.0, "files": {"smplxpp.npz": "other"}})
     )
     summary, _ = summarise_run(own)
     assert next(s for s in summary["stages"] if s["stage"] == "70_bind")["state"] == "outdated"

@@ -10,6 +10,7 @@ from pipelines.runs.checks import Check
 from pipelines.runs.layout import BUILD_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
 from smplxpp.core.errors import InputError
+from tests.runs.stages import stage_of
 
 
 def add_stage(run, name, checks=()):
@@ -17,7 +18,7 @@ def add_stage(run, name, checks=()):
         (folder / "data.bin").write_bytes(bytes(1000))
         return StageOutput(checks=list(checks))
 
-    return run_stage(run, name, work, config={}, inputs={})
+    return run_stage(run, stage_of(name), work)
 
 
 @pytest.fixture

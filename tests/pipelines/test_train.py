@@ -54,7 +54,6 @@ def fitted(trained, tmp_path):
     """A run with the reference fit alone."""
     run = write_dance_run(tmp_path / "run")
     shutil.copytree(trained / "70_bind", run / "70_bind")
-    shutil.copy(trained / "train.json", run)
     return run
 
 
@@ -92,9 +91,10 @@ def test_inputs_are_the_files_of_earlier_stages(trained):
     assert "70_bind/gaussians.safetensors" in inputs["80_teacher"]
     assert "80_teacher/teacher.safetensors" in inputs["85_bake"]
     assert "85_bake/student.safetensors" in inputs["90_compensate"]
-    assert all(
-        {"60_assemble/smplxpp.npz", "capture/parameters", "capture/cameras", "code"} <= i for i in inputs.values()
-    )
+    assert all({"60_assemble/smplxpp.npz", "capture/parameters", "capture/cameras"} <= i for i in inputs.values())
+    code = {stage: set(read_manifest(trained / stage)["code"]) for stage in STAGES}
+    assert all("avatar.training.engine.loop" in modules for modules in code.values())
+    assert "pipelines.stages.compensate" not in code["80_teacher"] | code["85_bake"]
 
 
 def test_the_models_load_and_the_students_blend_shapes_fit_the_template(trained):
@@ -168,21 +168,40 @@ def test_checkpoints_of_other_options_are_not_overwritten(fitted, capture, capsy
     capsys.readouterr()
     state_file = fitted / "80_teacher_work" / "track" / "state.safetensors"
     state = state_file.read_bytes()
-    assert train(fitted, capture, "--stage", "teacher", "--seed", "5") == 2
-    assert "--force" in json.loads(capsys.readouterr().out)["error"]["message"]
+    other = ("--stage", "teacher", "--teacher-iterations", "2")
+    assert train(fitted, capture, *other) == 2
+    message = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "--force" in message and "config training.iterations was 3, is 2" in message
     assert state_file.read_bytes() == state
-    assert train(fitted, capture, "--stage", "teacher", "--seed", "5", "--force") == 0
+    assert train(fitted, capture, *other, "--force") == 0
+
+
+def test_a_later_stage_is_not_trained_on_one_that_was_made_otherwise(fitted, capture, capsys):
+    assert train(fitted, capture, "--stage", "teacher", "--seed", "5") == 2
+    message = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "a finished 70_bind" in message and "seed was 0, is 5" in message
 
 
 def test_a_reference_fit_of_the_users_own_is_taken(tmp_path, capture, caplog):
     run = write_dance_run(tmp_path / "run")
-    options = ("--gaussians", "123", "--iterations", "1", "--hold-out", "Ring3", "--json", "--no-report")
+    options = ("--gaussians", "123", "--iterations", "1", "--json", "--no-report")
     assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
     made = (run / "70_bind" / "manifest.json").read_bytes()
     with caplog.at_level("INFO"):
         assert train(run, capture, "--until", "teacher", "--force") == 0
     assert (run / "70_bind" / "manifest.json").read_bytes() == made and "taken as it stands" in caplog.text
     assert read_manifest(run / "80_teacher")["numbers"]["gaussians"] == 123
+
+
+def test_a_reference_fit_that_saw_what_is_held_out_is_refused(tmp_path, capture, capsys):
+    run = write_dance_run(tmp_path / "run")
+    options = ("--gaussians", "123", "--iterations", "1", "--hold-out", "Ring3", "--json", "--no-report")
+    assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
+    capsys.readouterr()
+    assert train(run, capture, "--until", "teacher") == 2
+    message = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert all(camera in message for camera in HELD_OUT) and "70_bind" in message and "--hold-out Ring3" in message
+    assert not (run / "80_teacher").exists()
 
 
 def test_a_students_bake_without_a_teacher(fitted, capture, capsys):
@@ -193,7 +212,7 @@ def test_a_students_bake_without_a_teacher(fitted, capture, capsys):
 
 
 def test_held_out_cameras_and_scale_are_the_users_choice(fitted, capture):
-    options = ("--stage", "teacher", "--hold-out", "Ring1", "--scale", "0.5", "--teacher-iterations", "1")
+    options = ("--until", "teacher", "--hold-out", "Ring1", "--scale", "0.5", "--teacher-iterations", "1")
     assert train(fitted, capture, *options) == 0
     assert read_strip(fitted / "80_teacher" / "previews" / "Ring1_000001.png")[0].shape == (32, 24, 3)
     assert read_manifest(fitted / "80_teacher")["numbers"]["training_cameras"] == 3 + len(HELD_OUT)
@@ -238,7 +257,7 @@ def test_torchrun_trains_with_two_processes(fitted, capture):
 def test_the_option_for_tensorboard_reaches_the_training(fitted, capture, monkeypatch):
     asked = []
 
-    def stop(run, inputs, scene, config, options, together):
+    def stop(run, inputs, scene, config, options, together, *, steps):
         asked.append(options.tensorboard)
         raise InputError("training", expected="none", received="one")
 
