@@ -58,11 +58,11 @@ def test_table_figures_and_pictures(finished, capsys, capture):
     with Image.open(capture / "rgbs" / "Held" / "Held_rgb000004.png") as photograph:
         assert np.array_equal(shown, np.asarray(photograph))
     # The same again trains nothing, and prints the same table.
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("piece.json")}
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("manifest.json")}
     capsys.readouterr()
     assert ablate(finished, capture) == 0
     assert "w/o Gau Non." in capsys.readouterr().out
-    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("piece.json")}
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("manifest.json")}
 
 
 def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, capture, capsys):
