@@ -134,7 +134,7 @@ def train(
         InputError: an earlier stage is missing or unfinished, a checkpoint is of another training, memory or disk ran
             out, or training diverged; checkpoints and finished stages stay.
     """
-    if "compensate" in options.stages and not scene.template.expression_basis.shape[2]:
+    if "compensate" in options.stages and not scene.template.body.num_expressions:
         raise InputError(
             "template",
             expected="a body with expressions, which drive the head's blend shapes",
@@ -241,7 +241,7 @@ def _bake(training: Training) -> StageRecord:
 
 def _compensate(training: Training) -> StageRecord:
     config, preset = training.config, training.config.preset
-    shapes = config.shapes(training.scene.template.expression_basis.shape[2])
+    shapes = config.shapes(training.scene.template.body.num_expressions)
     needs = (BAKED, TEACHER) if config.teacher and preset.compensate.init_from_track else (BAKED,)
     path, *teachers = (_require(training, file) for file in needs)
     max_bytes = 1e6 * config.max_megabytes if config.blend_shapes == "pruned" else None

@@ -99,6 +99,41 @@ class BodyModel:
         if len(self.expression_names) != self.num_expressions:
             numbered = tuple(f"expression_{k:02d}" for k in range(self.num_expressions))
             object.__setattr__(self, "expression_names", numbered)
+        self._check()
+
+    def _check(self) -> None:
+        V, J = self.joint_regressor.shape[-1], len(self.parents)
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "v_template": (V, 3),
+            "faces": (None, 3),
+            "shapedirs": (V, 3, None),
+            "exprdirs": (V, 3, None),
+            "posedirs": (V, 3, 9 * (J - 1)),
+            "joint_regressor": (J, V),
+            "parents": (J,),
+            "weights": (V, J),
+            "left_hand_components": (None, HAND_WIDTH),
+            "right_hand_components": (None, HAND_WIDTH),
+            "left_hand_mean": (HAND_WIDTH,),
+            "right_hand_mean": (HAND_WIDTH,),
+            "part_labels": (V,),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if len(value.shape) != len(shape) or any(
+                b not in (None, a) for a, b in zip(value.shape, shape, strict=True)
+            ):
+                raise self._unfit(name, f"shape {shape}", f"shape {value.shape}")
+        if len(self.joint_names) != J:
+            raise self._unfit("joint_names", f"{J} names", f"{len(self.joint_names)}")
+        labels, names = self.part_labels, len(self.part_label_names)
+        if labels.size and (labels.min() < 0 or labels.max() >= names):
+            raise self._unfit("part_labels", f"indices in [0, {names})", "others")
+
+    def _unfit(self, name: str, expected: str, received: str) -> InputError:
+        return InputError(f"body model {self.name!r}: {name}", expected=expected, received=received)
 
     @property
     def vertex_count(self) -> int:

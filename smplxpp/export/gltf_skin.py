@@ -55,13 +55,13 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
     Returns:
         (J,) indices of the joints' nodes. The skeleton's root node is the one before the first.
     """
-    joints, parents = template.joints, template.parents
+    joints, parents = template.joints, template.body.parents
     root = len(gltf.nodes)
     nodes = root + 1 + np.arange(len(parents))
     offsets = rest_offsets(template)
     children = [nodes[parents == j].tolist() for j in range(-1, len(parents))]
     gltf.nodes.append(pygltflib.Node(name="skeleton", children=children[0]))
-    for name, offset, below in zip(template.joint_names, offsets, children[1:], strict=True):
+    for name, offset, below in zip(template.body.joint_names, offsets, children[1:], strict=True):
         gltf.nodes.append(pygltflib.Node(name=name, translation=offset.tolist(), children=below))
     inverse_binds = np.tile(np.eye(4, dtype=np.float32), (len(parents), 1, 1))
     inverse_binds[:, :3, 3] = -joints
@@ -75,5 +75,5 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
 
 def rest_offsets(template: Template) -> np.ndarray:
     """(J, 3) of each rest joint from its parent, of a root from the origin; metres."""
-    joints, parents = template.joints, template.parents
+    joints, parents = template.joints, template.body.parents
     return joints - np.where(parents[:, None] >= 0, joints[parents], 0.0)
