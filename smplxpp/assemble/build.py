@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 
 import numpy as np
+from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
 from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
@@ -36,8 +37,8 @@ class CanonicalPart:
     mesh: TriangleMesh
     weights: SkinWeights
     label: int
-    vertex_colors: np.ndarray
-    scan_index: np.ndarray
+    vertex_colors: UInt8[np.ndarray, "N 3"]
+    scan_index: Int[np.ndarray, " N"]
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from smplxpp.assemble.layers import Obstacle, face_centers
@@ -52,7 +53,9 @@ _CENTER_SHARE = 0.5
 _TOLERANCE = 1e-5
 
 
-def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None) -> np.ndarray:
+def push_out(
+    mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None
+) -> Float64[np.ndarray, "N 3"]:
     """New vertex positions of an outer layer, out of all obstacles.
 
     Solves an obstacle problem by projected Jacobi steps: the displacement d of each vertex goes to
@@ -97,7 +100,7 @@ def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_
     return best
 
 
-def turned_faces(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
+def turned_faces(mesh: TriangleMesh, vertices: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " M"]:
     """(M,) bool, faces whose normal has turned by more than 90 degrees on the new (N, 3) vertices."""
     return np.einsum("ij,ij->i", mesh.face_cross, mesh.with_vertices(vertices).face_cross) < 0
 

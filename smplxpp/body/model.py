@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float64, Int64
 
 from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
 from smplxpp.core.errors import InputError
@@ -76,20 +77,20 @@ class BodyModel:
     """
 
     name: str
-    v_template: np.ndarray
-    faces: np.ndarray
-    shapedirs: np.ndarray
-    exprdirs: np.ndarray
-    posedirs: np.ndarray | None
-    joint_regressor: np.ndarray
-    parents: np.ndarray
+    v_template: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    shapedirs: Float64[np.ndarray, "V 3 B"]
+    exprdirs: Float64[np.ndarray, "V 3 E"]
+    posedirs: Float64[np.ndarray, "V 3 P"] | None
+    joint_regressor: Float64[np.ndarray, "J V"]
+    parents: Int64[np.ndarray, " J"]
     joint_names: tuple[str, ...]
-    weights: np.ndarray
-    left_hand_components: np.ndarray | None
-    right_hand_components: np.ndarray | None
-    left_hand_mean: np.ndarray | None
-    right_hand_mean: np.ndarray | None
-    part_labels: np.ndarray
+    weights: Float64[np.ndarray, "V J"]
+    left_hand_components: Float64[np.ndarray, "K 45"] | None
+    right_hand_components: Float64[np.ndarray, "L 45"] | None
+    left_hand_mean: Float64[np.ndarray, " 45"] | None
+    right_hand_mean: Float64[np.ndarray, " 45"] | None
+    part_labels: Int64[np.ndarray, " V"]
     part_label_names: tuple[str, ...]
     expression_names: tuple[str, ...] = ()
     # Tensors of the arrays above, by (name, dtype, device).
@@ -151,7 +152,7 @@ class BodyModel:
     def num_expressions(self) -> int:
         return self.exprdirs.shape[2]
 
-    def mesh(self, vertices: np.ndarray | None = None) -> TriangleMesh:
+    def mesh(self, vertices: Float[np.ndarray, "V 3"] | None = None) -> TriangleMesh:
         """The body's faces on the given (V, 3) vertices, or on the mean shape."""
         return TriangleMesh(self.v_template if vertices is None else vertices, self.faces)
 

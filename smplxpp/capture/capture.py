@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float32, UInt8
 
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.recording import KINDS, Problem, Recording
@@ -92,7 +93,7 @@ class Capture:
         series = self.recording.series(kind, camera)
         return None if series is None else series.path(frame)
 
-    def presence(self, kind: str = "image") -> np.ndarray:
+    def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
         """(C, F) bool: which cameras have a file of which frame, known without opening any."""
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
         numbers = np.array(self.frames, dtype=np.int64)
@@ -118,7 +119,7 @@ class Capture:
         rows = [k for k, name in enumerate(names) if name in wanted_cameras]
         return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
 
-    def image(self, camera: str, frame: int) -> np.ndarray:
+    def image(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 sRGB as recorded, read-only.
 
         Raises:
@@ -127,7 +128,7 @@ class Capture:
         path = self._required(camera, frame)
         return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
-    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+    def mask(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
         """(H, W) uint8 opacity of the person, 255 inside; None where there is no mask. Read-only.
 
         Raises:
@@ -138,21 +139,23 @@ class Capture:
             return None
         return self._cached("mask", camera, frame, lambda reader: (reader.alpha(path),))[0]
 
-    def labels(self, camera: str, frame: int) -> np.ndarray | None:
+    def labels(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
         """(H, W) uint8 numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
         path = self.file(camera, frame, "label")
         if path is None:
             return None
         return self._cached("label", camera, frame, lambda reader: (reader.labels(path),))[0]
 
-    def normals(self, camera: str, frame: int) -> np.ndarray | None:
+    def normals(self, camera: str, frame: int) -> Float32[np.ndarray, "H W 3"] | None:
         """(H, W, 3) float32 unit normals in the world, 0 on the background; None where there is no map."""
         path = self.file(camera, frame, "normal")
         if path is None:
             return None
         return self._cached("normal", camera, frame, lambda reader: (reader.normals(path),))[0]
 
-    def composited(self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    def composited(
+        self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Float32[np.ndarray, "H W 3"]:
         """The person on a plain background: (H, W, 3) float32 sRGB in [0, 1].
 
         `C = F + (1 - a) B` with a the mask and F the image times a, mixed in sRGB. For photographs F is formed before
@@ -172,7 +175,7 @@ class Capture:
             np.minimum(out, 1.0, out=out)
         return out
 
-    def foreground(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def foreground(self, camera: str, frame: int) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
         """The person alone: (H, W, 3) uint8 colour times opacity, and (H, W) uint8 opacity; both read-only.
 
         Raises:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Int, Int64, Shaped
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -25,8 +26,8 @@ class FileSeries:
     """
 
     folder: Path
-    numbers: np.ndarray
-    names: np.ndarray
+    numbers: Int64[np.ndarray, " F"]
+    names: Shaped[np.ndarray, " F"]
 
     @staticmethod
     def from_names(folder: Path, names: Mapping[int, str]) -> FileSeries:
@@ -59,11 +60,11 @@ class FileSeries:
             return None
         return self.folder / os.fsdecode(bytes(self.names[index]))
 
-    def has(self, frames: np.ndarray) -> np.ndarray:
+    def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
         """(N,) bool: which of the frames have a file."""
         return np.isin(frames, self.numbers)
 
-    def only(self, keep: np.ndarray) -> FileSeries:
+    def only(self, keep: Bool[np.ndarray, " F"]) -> FileSeries:
         """The files selected by a (F,) bool array."""
         return FileSeries(self.folder, self.numbers[keep], self.names[keep])
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from smplxpp.capture.capture import Capture
 from smplxpp.core.atomic import atomic_path
@@ -70,7 +71,7 @@ class MattingModel:
         height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in entry.shape[2:])
         self._size = (width, height)
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
+    def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
         """(H, W, 3) uint8 sRGB -> (H, W) uint8 opacity."""
         from PIL import Image
         from PIL.Image import Resampling

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
 from smplxpp.body import BodyModel, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
@@ -49,7 +50,7 @@ class StackedParams:
         params = params_from_content(kept, source=f"file {self.path}", layout=self.layout, body=self.body)
         return params, np.where(good, np.cumsum(good) - 1, -1)
 
-    def frames(self) -> np.ndarray:
+    def frames(self) -> Int64[np.ndarray, " F"]:
         """(F,) rows of the file."""
         return np.arange(len(self._rows[1]))
 
@@ -73,7 +74,7 @@ class ParamFiles:
     layout: str = "auto"
     body: BodyModel | None = None
 
-    def frames(self) -> np.ndarray:
+    def frames(self) -> Int64[np.ndarray, " F"]:
         """(F,) frames with a file."""
         return self.files.numbers
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float32, UInt8
 
 from smplxpp.capture.distortion import Distortion, undistort
 from smplxpp.capture.images import check_size, read_alpha, read_color, read_labels, read_normals
@@ -38,19 +39,19 @@ class ViewReader:
     distortion: Distortion | None = None
     background: tuple[float, float, float] | None = None
 
-    def color(self, path: Path) -> np.ndarray:
+    def color(self, path: Path) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8."""
         return self._shown(self._sized(read_color(path), path))
 
-    def alpha(self, path: Path) -> np.ndarray:
+    def alpha(self, path: Path) -> UInt8[np.ndarray, "H W"]:
         """(H, W) uint8."""
         return self._shown(self._sized(read_alpha(path), path))
 
-    def labels(self, path: Path) -> np.ndarray:
+    def labels(self, path: Path) -> UInt8[np.ndarray, "H W"]:
         """(H, W) uint8."""
         return self._shown(self._sized(read_labels(path), path), labels=True)
 
-    def normals(self, path: Path) -> np.ndarray:
+    def normals(self, path: Path) -> Float32[np.ndarray, "H W 3"]:
         """(H, W, 3) float32. Resampled to the nearest pixel, as labels: an average over an edge is no normal."""
         image, deep = read_normals(path)
         value = self._shown(self._sized(image, path), labels=True).astype(np.float32)
@@ -60,7 +61,9 @@ class ViewReader:
         seen = value.any(axis=-1, keepdims=True)
         return np.where(seen, normal / np.maximum(length, 1e-6), 0.0).astype(np.float32)
 
-    def foreground(self, image_path: Path, mask_path: Path) -> tuple[np.ndarray, np.ndarray]:
+    def foreground(
+        self, image_path: Path, mask_path: Path
+    ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
         """Colour times opacity (H, W, 3) uint8 and opacity (H, W) uint8.
 
         The product is formed on the full image: resampled apart, a photograph's background would bleed into the edges.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import fast_simplification
 import igl
 import numpy as np
+from jaxtyping import Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -30,8 +31,8 @@ class Simplified:
     """
 
     mesh: TriangleMesh
-    new_from_old: np.ndarray
-    source_vertex: np.ndarray
+    new_from_old: Int64[np.ndarray, " N"]
+    source_vertex: Int64[np.ndarray, " n"]
     restored_faces: int
     flipped_faces: int
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float, Float64, Num
 
 from smplxpp.core.errors import InputError
 
@@ -20,7 +21,7 @@ _Y_FROM_UP = {
 _HEIGHT = (0.7, 2.6)
 
 
-def convert_points(points: np.ndarray, *, units: str = "m", up: str = "y") -> np.ndarray:
+def convert_points(points: Num[np.ndarray, "N 3"], *, units: str = "m", up: str = "y") -> Float64[np.ndarray, "N 3"]:
     """(N, 3) points in the stated units and axes -> metres, +Y up.
 
     Args:
@@ -35,7 +36,7 @@ def convert_points(points: np.ndarray, *, units: str = "m", up: str = "y") -> np
     return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * METRES_PER_UNIT[units]
 
 
-def check_human_scale(vertices: np.ndarray, *, subject: str = "scan") -> None:
+def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "scan") -> None:
     """Refuse a person that is not in metres or does not stand along Y.
 
     The largest extent tells the unit, the axis of an extent more than 1.3 times the vertical one tells swapped axes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64, Num
 
 from smplxpp.core.errors import InputError
 
@@ -21,8 +22,8 @@ class Camera:
         name: for messages and files.
     """
 
-    K: np.ndarray
-    cam_from_world: np.ndarray
+    K: Float64[np.ndarray, "3 3"]
+    cam_from_world: Float64[np.ndarray, "4 4"]
     width: int
     height: int
     orthographic: bool = False
@@ -45,16 +46,16 @@ class Camera:
             )
 
     @property
-    def position(self) -> np.ndarray:
+    def position(self) -> Float64[np.ndarray, " 3"]:
         """(3,) centre of projection in the world (meaningless for an orthographic camera)."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @property
-    def forward(self) -> np.ndarray:
+    def forward(self) -> Float64[np.ndarray, " 3"]:
         """(3,) unit viewing direction in the world."""
         return self.cam_from_world[2, :3]
 
-    def screen_from_world(self, points: np.ndarray) -> np.ndarray:
+    def screen_from_world(self, points: Num[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
         """(N, 3) world points -> (N, 4): x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
         # Coordinates as rows: every step then runs along memory.
         cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
@@ -43,16 +44,16 @@ class BodyParams:
         InputError: wrong widths, unequal numbers of frames (one frame stands for all), NaN or infinity.
     """
 
-    global_orient: np.ndarray
-    body_pose: np.ndarray
-    jaw_pose: np.ndarray
-    leye_pose: np.ndarray
-    reye_pose: np.ndarray
-    left_hand_pose: np.ndarray
-    right_hand_pose: np.ndarray
-    betas: np.ndarray
-    expression: np.ndarray
-    transl: np.ndarray
+    global_orient: Float64[np.ndarray, "T 3"]
+    body_pose: Float64[np.ndarray, "T 63"]
+    jaw_pose: Float64[np.ndarray, "T 3"]
+    leye_pose: Float64[np.ndarray, "T 3"]
+    reye_pose: Float64[np.ndarray, "T 3"]
+    left_hand_pose: Float64[np.ndarray, "T L"]
+    right_hand_pose: Float64[np.ndarray, "T R"]
+    betas: Float64[np.ndarray, "T B"]
+    expression: Float64[np.ndarray, "T E"]
+    transl: Float64[np.ndarray, "T 3"]
     fps: float | None = None
     flat_hand_mean: bool = False
 
@@ -89,7 +90,7 @@ class BodyParams:
         return len(self.global_orient)
 
     @property
-    def full_pose(self) -> np.ndarray:
+    def full_pose(self) -> Float64[np.ndarray, "T 55 3"]:
         """(T, 55, 3) axis-angle in SMPL-X joint order.
 
         Raises:
@@ -136,14 +137,14 @@ class BodyParams:
         return replace(parts[0], **joined)
 
     @staticmethod
-    def rest(*, betas: np.ndarray | int = 10, expressions: int = 10) -> BodyParams:
+    def rest(*, betas: Float[np.ndarray, " B"] | int = 10, expressions: int = 10) -> BodyParams:
         """The zero pose (T-pose) of one frame; `betas` as values (B,) or as their number."""
         values = np.zeros(betas) if isinstance(betas, int) else np.asarray(betas)
         zero = {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS}
         return BodyParams(**zero, betas=values, expression=np.zeros(expressions), transl=np.zeros(3))
 
     @staticmethod
-    def from_full_pose(full_pose: np.ndarray, **others) -> BodyParams:
+    def from_full_pose(full_pose: Float[np.ndarray, "T 55 3"], **others) -> BodyParams:
         """(T, 55, 3) axis-angle plus betas, expression, transl (and fps)."""
         flat = np.asarray(full_pose, dtype=np.float64).reshape(len(full_pose), -1)
         split = np.cumsum([3 * joints for _, joints in POSE_BLOCKS])[:-1]

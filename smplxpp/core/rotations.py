@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
 # Below this squared angle the series of sin(x)/x is exact to float64's last bit (next term: angle^6 / 5040 < 2e-16).
@@ -44,7 +45,7 @@ def matrix_from_rotvec(rotvec: Any) -> Any:
     return xp.stack([xp.stack(row, -1) for row in rows], -2)
 
 
-def rotvec_from_matrix(matrix: np.ndarray) -> np.ndarray:
+def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarray, "*N 3"]:
     """Axis-angle vectors of rotation matrices, accurate near 0 and near pi (through quaternions).
 
     Args:

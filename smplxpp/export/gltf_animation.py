@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pygltflib
+from jaxtyping import Float64, Int
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body.layout import JOINT_NAMES
@@ -22,7 +23,9 @@ DEFAULT_FPS = 30.0
 _STILL = 1e-6
 
 
-def joint_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np.ndarray]:
+def joint_motion(
+    template: Template, params: BodyParams
+) -> tuple[Float64[np.ndarray, "T J 3 3"], Float64[np.ndarray, "T J 3"]]:
     """Each joint's rotation and translation in its parent's frame, so that glTF's skinning gives the template's pose.
 
     The inverse bind matrices stand for the neutral joints `J`. An expression moves joints (the jaw's, the eyes') by
@@ -64,7 +67,7 @@ def add_animation(
     template: Template,
     params: BodyParams,
     *,
-    joint_nodes: np.ndarray,
+    joint_nodes: Int[np.ndarray, " J"],
     morph_node: int | None,
 ) -> None:
     """Add the frames as the animation "motion".

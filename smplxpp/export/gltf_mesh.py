@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pygltflib
+from jaxtyping import UInt8, UInt16
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from smplxpp.core.labels import LABELS
@@ -58,7 +59,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     return nodes
 
 
-def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
+def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
     """(N, 3) uint8 sRGB -> (N, 4) uint16 linear RGB and full alpha.
 
     Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge (IEC 61966-2-1).

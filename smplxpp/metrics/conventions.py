@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.errors import InputError
 
@@ -50,7 +51,7 @@ class Convention:
     definition: str
     source: str
 
-    def directed(self, distance: np.ndarray) -> float:
+    def directed(self, distance: Float[np.ndarray, " P"]) -> float:
         """Mean of one direction's distances (P,) in metres, in this convention's unit."""
         return float(self.scale * np.mean(distance**self.power))
 

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 
 import igl
 import numpy as np
+from jaxtyping import Float64, Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
@@ -56,11 +57,11 @@ class DirectedDistances:
     """
 
     samples: SurfaceSamples
-    distance: np.ndarray
-    closest: np.ndarray
-    face: np.ndarray
-    angle: np.ndarray
-    label: np.ndarray | None = None
+    distance: Float64[np.ndarray, " P"]
+    closest: Float64[np.ndarray, "P 3"]
+    face: Int64[np.ndarray, " P"]
+    angle: Float64[np.ndarray, " P"]
+    label: Int64[np.ndarray, " P"] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,9 @@ class MeshComparison:
         return asdict(self)
 
 
-def point_to_surface(points: np.ndarray, mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def point_to_surface(
+    points: Num[np.ndarray, "P 3"], mesh: TriangleMesh
+) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Closest points of `mesh` to (P, 3) points: distance (P,) metres, closest (P, 3), face (P,).
 
     Exact, in float64, by an axis-aligned box tree (libigl). Faces without area are not hit: they add no surface.
@@ -136,8 +139,8 @@ def directed_distances(
     samples: int = 100_000,
     seed: int = 0,
     preset: str = DEFAULT,
-    source_labels: np.ndarray | None = None,
-    target_labels: np.ndarray | None = None,
+    source_labels: Shaped[np.ndarray, " S"] | None = None,
+    target_labels: Shaped[np.ndarray, " T"] | None = None,
     config: CompareConfig | None = None,
 ) -> DirectedDistances:
     """Distances from points of `source` to `target`, one by one (for histograms and heat maps); see `compare`.
@@ -182,8 +185,8 @@ def compare(
     samples: int = 100_000,
     seed: int = 0,
     preset: str = DEFAULT,
-    pred_labels: np.ndarray | None = None,
-    gt_labels: np.ndarray | None = None,
+    pred_labels: Shaped[np.ndarray, " S"] | None = None,
+    gt_labels: Shaped[np.ndarray, " T"] | None = None,
     config: CompareConfig | None = None,
 ) -> MeshComparison:
     """Compare a predicted surface with the true one.

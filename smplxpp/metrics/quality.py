@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Float64, Integer
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels
@@ -111,7 +112,7 @@ def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> Mesh
     )
 
 
-def aspect_ratios(mesh: TriangleMesh) -> np.ndarray:
+def aspect_ratios(mesh: TriangleMesh) -> Float64[np.ndarray, " M"]:
     """(M,) circumradius / (2 inradius) = abc (a + b + c) / (16 A^2): 1 for an equilateral face, inf without area."""
     t = mesh.triangles
     a, b, c = (np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3))
@@ -120,7 +121,7 @@ def aspect_ratios(mesh: TriangleMesh) -> np.ndarray:
     )
 
 
-def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
+def border_loop_lengths(mesh: TriangleMesh) -> Float64[np.ndarray, " L"]:
     """(L,) metres: length of each connected piece of border (a loop, where the mesh is manifold)."""
     border = mesh.border_edges
     if not len(border):
@@ -132,7 +133,7 @@ def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
     return np.bincount(piece, length)
 
 
-def fan_counts(mesh: TriangleMesh) -> np.ndarray:
+def fan_counts(mesh: TriangleMesh) -> Integer[np.ndarray, " N"]:
     """(N,) number of fans at each vertex: groups of its faces that hang together by edges at the vertex."""
     f, m = mesh.faces, mesh.face_count
     # Half-edge k of a face runs from corner k to corner k + 1; corner k of face i is node k * m + i.
@@ -149,7 +150,7 @@ def fan_counts(mesh: TriangleMesh) -> np.ndarray:
     return np.bincount(vertex[first], minlength=mesh.vertex_count)
 
 
-def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:
+def inconsistent_edges(mesh: TriangleMesh) -> Bool[np.ndarray, " E"]:
     """(E,) bool, in the order of `mesh.edges`: two faces run along the edge in the same direction."""
     edges, counts = mesh.edges_with_counts
     f, n = mesh.faces, mesh.vertex_count
@@ -159,7 +160,7 @@ def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:
     return (counts == 2) & (np.bincount(index, direction, minlength=len(edges)) != 0)
 
 
-def flipped_against_majority(mesh: TriangleMesh) -> np.ndarray:
+def flipped_against_majority(mesh: TriangleMesh) -> Bool[np.ndarray, " M"]:
     """(M,) bool: faces wound against the majority of their orientable patch (libigl's `bfs_orient`)."""
     oriented, patch = igl.bfs_orient(mesh.faces)
     # The same cyclic order means that the face was kept; faces with a repeated corner have no orientation.

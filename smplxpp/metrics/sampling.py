@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
@@ -20,14 +21,14 @@ class SurfaceSamples:
         normals: (P, 3) float64 unit normals, see `interpolated_normals`.
     """
 
-    points: np.ndarray
-    face: np.ndarray
-    normals: np.ndarray
+    points: Float64[np.ndarray, "P 3"]
+    face: Int64[np.ndarray, " P"]
+    normals: Float64[np.ndarray, "P 3"]
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, mask: np.ndarray) -> SurfaceSamples:
+    def select(self, mask: Bool[np.ndarray, " P"] | Integer[np.ndarray, " p"]) -> SurfaceSamples:
         """The points selected by a mask or index array."""
         return SurfaceSamples(self.points[mask], self.face[mask], self.normals[mask])
 
@@ -65,7 +66,9 @@ def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
     return SurfaceSamples(mesh.vertices[vertex], first // 3, mesh.vertex_normals[vertex])
 
 
-def interpolated_normals(mesh: TriangleMesh, face: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+def interpolated_normals(
+    mesh: TriangleMesh, face: Integer[np.ndarray, " P"], barycentric: Float[np.ndarray, "P 3"]
+) -> Float64[np.ndarray, "P 3"]:
     """(P, 3) unit normals at barycentric coordinates (P, 3) of faces (P,), from the angle-weighted vertex normals.
 
     Not the faces' own normals: the closest point of a convex surface often lies on an edge or a vertex, where the
@@ -74,7 +77,7 @@ def interpolated_normals(mesh: TriangleMesh, face: np.ndarray, barycentric: np.n
     return normalize_rows(np.einsum("pk,pkd->pd", barycentric, mesh.vertex_normals[mesh.faces[face]]))
 
 
-def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarray:
+def check_labels(mesh: TriangleMesh, labels: Shaped[np.ndarray, " N"], name: str) -> Int64[np.ndarray, " N"]:
     """Labels of faces (M,) or vertices (N,) as int64.
 
     Raises:
@@ -92,7 +95,12 @@ def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarra
     return labels.astype(np.int64)
 
 
-def labels_at(mesh: TriangleMesh, labels: np.ndarray, face: np.ndarray, points: np.ndarray) -> np.ndarray:
+def labels_at(
+    mesh: TriangleMesh,
+    labels: Integer[np.ndarray, " N"],
+    face: Integer[np.ndarray, " P"],
+    points: Float[np.ndarray, "P 3"],
+) -> Int64[np.ndarray, " P"]:
     """(P,) labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
     if len(labels) == mesh.face_count:
         return labels[face]

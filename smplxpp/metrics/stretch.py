@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
@@ -37,7 +38,7 @@ class StretchReport:
         return asdict(self)
 
 
-def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
+def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> Float64[np.ndarray, " E"]:
     """(E,) length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
 
     Raises:
@@ -49,7 +50,7 @@ def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
     return np.divide(after, before, out=np.full(len(before), np.nan), where=before > 0)
 
 
-def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
+def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, " M"]:
     """(M,) bool: faces that agree with their edge neighbours at rest and oppose them in the pose.
 
     A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float64, Int64, Num
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
@@ -51,9 +52,9 @@ class SegmentedScan:
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
     """
 
-    face_labels: np.ndarray
-    confidence: np.ndarray
-    seen: np.ndarray
+    face_labels: Int64[np.ndarray, " M"]
+    confidence: Float64[np.ndarray, " M"]
+    seen: Bool[np.ndarray, " M"]
     island_faces: int
     energy_before: float
     energy_after: float
@@ -62,9 +63,9 @@ class SegmentedScan:
 def segment_scan(
     mesh: TriangleMesh,
     *,
-    votes: np.ndarray | None = None,
-    vertex_labels: np.ndarray | None = None,
-    face_labels: np.ndarray | None = None,
+    votes: Num[np.ndarray, "M L"] | None = None,
+    vertex_labels: Num[np.ndarray, " N"] | None = None,
+    face_labels: Num[np.ndarray, " M"] | None = None,
     config: SegmentConfig | None = None,
 ) -> SegmentedScan:
     """Label every face of a scan from one of: votes, labels of its vertices, labels of its faces.

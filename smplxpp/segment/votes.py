@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64, Integer
 from scipy.ndimage import distance_transform_edt
 
 from smplxpp.core.camera import Camera
@@ -18,7 +19,9 @@ _SILHOUETTE_PX = 4.0
 _LEAST_WEIGHT = 0.1
 
 
-def vote_on_faces(mesh: TriangleMesh, views: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
+def vote_on_faces(
+    mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
+) -> Float64[np.ndarray, "M L"]:
     """(M, L) sum over the views' pixels that show a face of `cos(view, normal) clip(d / 4, 0.1, 1)`.
 
     d is the pixel's distance to the silhouette of the labelled foreground, in pixels. Background pixels do not vote;

@@ -9,12 +9,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from jaxtyping import Integer
 
 from smplxpp.core.rotations import array_namespace
 
 
 def forward_kinematics(
-    rest_joints: Any, parents: np.ndarray, rotations: Any, *, transl: Any | None = None
+    rest_joints: Any, parents: Integer[np.ndarray, " J"], rotations: Any, *, transl: Any | None = None
 ) -> tuple[Any, Any]:
     """Transforms of a skeleton whose joints turn about themselves.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
@@ -116,7 +117,7 @@ class TransferConfig:
             )
         return index
 
-    def allowed_mask(self, joint_count: int) -> np.ndarray | None:
+    def allowed_mask(self, joint_count: int) -> Bool[np.ndarray, " J"] | None:
         """(J,) bool, or None where all joints are allowed."""
         if self.allowed_joints is None:
             return None

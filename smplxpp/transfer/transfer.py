@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
@@ -17,7 +18,7 @@ from smplxpp.transfer.repair import check_placement, check_source, check_target,
 
 def transfer_weights(
     source: TriangleMesh,
-    source_weights: np.ndarray,
+    source_weights: Float[np.ndarray, "V J"],
     target: TriangleMesh,
     *,
     config: TransferConfig | None = None,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.core.errors import InputError
@@ -32,7 +33,7 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
-    def intrinsics(self, *, source: str) -> tuple[np.ndarray, list[float]]:
+    def intrinsics(self, *, source: str) -> tuple[Float64[np.ndarray, "3 3"], list[float]]:
         """K (3, 3), and the distortion in OpenCV's order.
 
         Raises:
@@ -61,8 +62,8 @@ class ColmapCamera:
 class ColmapImage:
     """A registered image: `x_cam = R x_world + t`, its camera's id, its path below the image folder."""
 
-    R: np.ndarray
-    t: np.ndarray
+    R: Float64[np.ndarray, "3 3"]
+    t: Float64[np.ndarray, " 3"]
     camera: int
     name: str
 

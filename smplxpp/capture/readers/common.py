@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.params import find_params
@@ -69,7 +70,7 @@ def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSourc
     return None if path is None else find_params(path, body=options.body)
 
 
-def inverted(world_from_cam: Any) -> tuple[np.ndarray, np.ndarray]:
+def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
     """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix."""
     matrix = np.asarray(world_from_cam, dtype=np.float64)
     rotation = matrix[:3, :3].T
