@@ -31,14 +31,14 @@ class CanonicalPart:
         weights: of the N vertices.
         label: id of `smplxpp.core.labels`.
         vertex_colors: (N, 3) uint8 sRGB.
-        scan_index: (N,) vertex of the scan that each vertex comes from, -1 for none.
+        scan_index: the vertex of the scan that each vertex comes from, -1 for none; S = N, as `assemble_template` checks.
     """
 
     mesh: TriangleMesh
     weights: SkinWeights
     label: int
     vertex_colors: UInt8[np.ndarray, "N 3"]
-    scan_index: Int[np.ndarray, " N"]
+    scan_index: Int[np.ndarray, " S"]
 
 
 @dataclass(frozen=True)

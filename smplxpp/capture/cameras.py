@@ -69,7 +69,7 @@ def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
 
 
 def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
-    lenses = []
+    lenses: list[tuple[Camera, Distortion | None]] = []
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
             width, height = int(row["w"]), int(row["h"])

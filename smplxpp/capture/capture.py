@@ -93,6 +93,21 @@ class Capture:
         series = self.recording.series(kind, camera)
         return None if series is None else series.path(frame)
 
+    def required_file(self, camera: str, frame: int) -> Path:
+        """The image of a view.
+
+        Raises:
+            InputError: no such camera, or no image.
+        """
+        path = self.file(camera, frame)
+        if path is None:
+            raise InputError(
+                f"image of camera {camera}, frame {frame}",
+                expected="an image that was there on opening (see `presence`)",
+                received="none",
+            )
+        return path
+
     def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
         """(C, F) bool: which cameras have a file of which frame, known without opening any."""
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
@@ -102,9 +117,9 @@ class Capture:
             if series is not None and (camera, None) not in self.excluded:
                 table[row] = series.has(numbers)
         rows, columns = {c: i for i, c in enumerate(self.recording.cameras)}, {f: i for i, f in enumerate(self.frames)}
-        for camera, frame in self.excluded:
-            if camera in rows and frame in columns:
-                table[rows[camera], columns[frame]] = False
+        for without, when in self.excluded:
+            if without in rows and when in columns:
+                table[rows[without], columns[when]] = False
         return table
 
     def views(self, cameras: Iterable[str] | None = None, frames: Iterable[int] | None = None) -> list[tuple[str, int]]:
@@ -125,7 +140,7 @@ class Capture:
         Raises:
             InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
         """
-        path = self._required(camera, frame)
+        path = self.required_file(camera, frame)
         return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
     def mask(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
@@ -181,7 +196,7 @@ class Capture:
         Raises:
             InputError: as `composited`.
         """
-        image = self._required(camera, frame)
+        image = self.required_file(camera, frame)
         mask = self.file(camera, frame, "mask")
         if mask is None:
             raise InputError(
@@ -190,7 +205,8 @@ class Capture:
                 received="none",
                 remedy="give a folder of masks (open_capture(..., masks=DIR)), or make them with your matting model",
             )
-        return self._cached("foreground", camera, frame, lambda reader: reader.foreground(image, mask))
+        colour, opacity = self._cached("foreground", camera, frame, lambda reader: reader.foreground(image, mask))
+        return colour, opacity
 
     def params(self, frame: int) -> BodyParams | None:
         """Body parameters of one frame, None where there are none.
@@ -245,16 +261,6 @@ class Capture:
                 received=str(name),
             )
         return self.recording.cameras[name]
-
-    def _required(self, camera: str, frame: int) -> Path:
-        path = self.file(camera, frame)
-        if path is None:
-            raise InputError(
-                f"image of camera {camera}, frame {frame}",
-                expected="an image that was there on opening (see `presence`)",
-                received="none",
-            )
-        return path
 
     def _cached(
         self, kind: str, camera: str, frame: int, make: Callable[[ViewReader], tuple[np.ndarray, ...]]

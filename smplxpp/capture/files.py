@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int, Int64, Shaped
 
+from smplxpp.core.errors import InputError
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 
 
@@ -42,7 +44,8 @@ class FileSeries:
 
         Of two files with one number the first in alphabetical order counts.
         """
-        compiled, found = re.compile(pattern), {}
+        compiled = re.compile(pattern)
+        found: dict[int, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
                 for name in sorted(entry.name for entry in entries):
@@ -59,6 +62,17 @@ class FileSeries:
         if index == len(self.numbers) or self.numbers[index] != frame:
             return None
         return self.folder / os.fsdecode(bytes(self.names[index]))
+
+    def required(self, frame: int) -> Path:
+        """The file of a frame that is among `numbers`.
+
+        Raises:
+            InputError: there is none.
+        """
+        path = self.path(frame)
+        if path is None:
+            raise InputError(f"frame {frame}", expected=f"a file in {self.folder}", received="none")
+        return path
 
     def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
         """(N,) bool: which of the frames have a file."""

@@ -77,7 +77,9 @@ class MattingModel:
         from PIL.Image import Resampling
 
         small = np.asarray(Image.fromarray(image).resize(self._size, Resampling.BILINEAR), dtype=np.float32) / 255.0
-        tensor = ((small - np.float32(self.config.mean)) / np.float32(self.config.std)).transpose(2, 0, 1)[None]
+        tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
+            2, 0, 1
+        )[None]
         outputs = self._session.run(None, {self._name: tensor.astype(self._dtype)})
         matte = self._opacity(outputs)
         back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
@@ -123,7 +125,7 @@ def write_mattes(
     for camera, frame in capture.views() if views is None else views:
         target = Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
         if not target.is_file():
-            image = np.asarray(read_color(capture.file(camera, frame)))
+            image = np.asarray(read_color(capture.required_file(camera, frame)))
             with atomic_path(target) as temporary:
                 Image.fromarray(model(image)).save(temporary, format="PNG")
         yield target

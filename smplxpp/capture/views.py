@@ -83,8 +83,8 @@ class ViewReader:
             if any(self.background):
                 share = 1.0 - np.asarray(opacity, dtype=np.float32)[..., None] / 255.0
                 colour = np.asarray(self.background, dtype=np.float32) * 255.0
-                product = np.asarray(image) - share * colour + 0.5
-                image = PIL.Image.fromarray(np.clip(product, 0, 255).astype(np.uint8))
+                person = np.asarray(image) - share * colour + 0.5
+                image = PIL.Image.fromarray(np.clip(person, 0, 255).astype(np.uint8))
         return self._shown(image), self._shown(opacity)
 
     def _sized(self, image: Image, path: Path) -> Image:
@@ -116,7 +116,7 @@ class ViewReader:
         # A median needs few pixels: the nearest of a coarse grid.
         from PIL.Image import Resampling
 
-        grid = tuple(min(side, _BACKGROUND_GRID) for side in image.size)
+        grid = (min(image.width, _BACKGROUND_GRID), min(image.height, _BACKGROUND_GRID))
         coarse, share = (np.asarray(i.resize(grid, Resampling.NEAREST)) for i in (image, opacity))
         outside = coarse[share == 0]
         if not len(outside):

@@ -120,11 +120,10 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         raise InputError(f"mesh file {path}", expected="a triangle mesh", received=type(loaded).__name__)
     colors = None
     visual = loaded.visual
-    if visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
-    elif (
-        visual.kind == "texture" and getattr(visual, "uv", None) is not None and len(visual.uv) == len(loaded.vertices)
-    ):
+    if isinstance(visual, trimesh.visual.ColorVisuals):
+        if visual.kind == "vertex":
+            colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
+    elif visual is not None and visual.uv is not None and len(visual.uv) == len(loaded.vertices):
         colors = np.asarray(visual.to_color().vertex_colors)[:, :3].astype(np.uint8)
     vertex_properties, face_properties = _ply_properties(loaded)
     return RawMesh(

@@ -92,6 +92,7 @@ class SignedDistanceField:
         return outer
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
+        assert self._winding is not None, "asked of solids alone"
         return self._winding.winding_number(points) > 0.5
 
     def _index_edges(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import partial
 
 import igl
 import numpy as np
@@ -217,9 +218,9 @@ def compare(
             expected="threshold_mm > 0 and visible_tolerance >= 0",
             received=f"{config.threshold_mm} and {config.visible_tolerance}",
         )
-    common = {"samples": samples, "seed": seed, "preset": preset, "config": config}
-    forth = directed_distances(pred, gt, source_labels=pred_labels, target_labels=gt_labels, **common)
-    back = directed_distances(gt, pred, source_labels=gt_labels, target_labels=pred_labels, **common)
+    measure = partial(directed_distances, samples=samples, seed=seed, preset=preset, config=config)
+    forth = measure(pred, gt, source_labels=pred_labels, target_labels=gt_labels)
+    back = measure(gt, pred, source_labels=gt_labels, target_labels=pred_labels)
     return summarize(forth, back, convention=convention, threshold_mm=config.threshold_mm)
 
 
@@ -245,24 +246,30 @@ def _summary(
     threshold_mm: float,
     labels: dict[str, MeshComparison],
 ) -> MeshComparison:
-    stats = [_stats(d, mask) for d, mask in zip((forth, back), masks, strict=True)]
+    there, back_again = _stats(forth, masks[0]), _stats(back, masks[1])
     distances = [d.distance[mask] for d, mask in zip((forth, back), masks, strict=True)]
     directed = [convention.directed(d) if len(d) else None for d in distances]
-    shares = [float(np.mean(d * MM <= threshold_mm)) if len(d) else None for d in distances]
-    both = None not in directed
-    total = sum(shares) if both else 0.0
+    precision, recall = (float(np.mean(d * MM <= threshold_mm)) if len(d) else None for d in distances)
+    chamfer = hausdorff = fscore = None
+    if directed[0] is not None and directed[1] is not None:
+        chamfer = convention.chamfer(directed[0], directed[1])
+    if there is not None and back_again is not None:
+        hausdorff = max(there.max, back_again.max)
+    if precision is not None and recall is not None:
+        # Nothing within the threshold on either side is a score of 0, not an undefined one.
+        total = precision + recall
+        fscore = 2.0 * precision * recall / total if total else 0.0
     return MeshComparison(
         convention=convention.name,
         unit=convention.unit,
         p2s=directed[0 if convention.p2s_direction == "pred_to_gt" else 1],
-        chamfer=convention.chamfer(*directed) if both else None,
-        pred_to_gt=stats[0],
-        gt_to_pred=stats[1],
-        hausdorff=max(s.max for s in stats) if both else None,
-        precision=shares[0],
-        recall=shares[1],
-        # Nothing within the threshold on either side is a score of 0, not an undefined one.
-        fscore=(2.0 * shares[0] * shares[1] / total if total else 0.0) if both else None,
+        chamfer=chamfer,
+        pred_to_gt=there,
+        gt_to_pred=back_again,
+        hausdorff=hausdorff,
+        precision=precision,
+        recall=recall,
+        fscore=fscore,
         threshold_mm=threshold_mm,
         labels=labels,
     )

@@ -50,6 +50,8 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
     """
     points = np.ascontiguousarray(target.vertices)
     squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces)
+    # The tree counts in C's `long long`, another type to numpy even where it is as wide.
+    face = face.astype(np.int64)
     corners = source.faces[face]
     barycentric = _barycentric(closest, *(source.vertices[corners[:, k]] for k in range(3)))
     found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))

@@ -120,7 +120,7 @@ def _smooth(
     else:
         doubt = 1.0 + config.normal_doubt * (1.0 - np.cos(np.nan_to_num(found.angle)))
         width = np.where(settled, 0.0, config.smoothing * doubt * found.distance)
-    mesh, used = target.submesh(slice(None))
+    mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))
     fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)

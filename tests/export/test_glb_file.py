@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -93,7 +95,8 @@ def test_parts_of_few_influences_take_one_set(tmp_path):
 
 
 def test_a_joint_named_twice_becomes_one_influence():
-    twice = SkinWeights(np.array([[4, 4, 1]]), np.array([[0.25, 0.5, 0.25]]), 300, *(np.zeros(1) for _ in range(4)))
+    one = SkinWeights.from_dense(np.ones((1, 300)), max_influences=3)
+    twice = replace(one, joint_indices=np.array([[4, 4, 1]], np.int32), joint_weights=np.array([[0.25, 0.5, 0.25]]))
     joints, weights = quantized_influences(twice)
     np.testing.assert_array_equal(joints, [[4, 1]])
     np.testing.assert_array_equal(weights, [[0.75, 0.25]])

@@ -112,7 +112,7 @@ def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int
             remedy="remove the camera from the calibration, or add its images",
         )
     series = files[name]
-    return image_size(series.path(int(series.numbers[0])))
+    return image_size(series.required(int(series.numbers[0])))
 
 
 def first_folder(root: Path, names: Iterable[str]) -> Path | None:
