@@ -31,7 +31,7 @@ class CanonicalPart:
         weights: of the N vertices.
         label: id of `smplxpp.core.labels`.
         vertex_colors: (N, 3) uint8 sRGB.
-        scan_index: the vertex of the scan that each vertex comes from, -1 for none; S = N, as `assemble_template` checks.
+        scan_index: the scan's vertex that each comes from, -1 for none; `assemble_template` checks that S = N.
     """
 
     mesh: TriangleMesh

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from smplxpp.assemble.layers import Obstacle, face_centers
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_at_least, require_between
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,10 @@ class PushConfig:
     max_depth: float = 0.015
 
     def __post_init__(self) -> None:
-        good = 1e-4 <= self.clearance <= self.max_depth < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0
-        if not good:
-            raise InputError(
-                "push configuration",
-                expected="1e-4 <= clearance <= max_depth, damping in [0, 1], iterations >= 0",
-                received=str(self),
-            )
+        require_at_least("push configuration: max_depth in metres", self.max_depth, 1e-4)
+        require_between("push configuration: clearance in metres", self.clearance, 1e-4, self.max_depth)
+        require_between("push configuration: damping", self.damping, 0.0, 1.0)
+        require_at_least("push configuration: iterations", self.iterations, 0)
 
 
 # Projections alone, after the smoothing, until nothing is left inside.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64, Int64
@@ -14,7 +13,7 @@ from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import array_namespace, matrix_from_rotvec
+from smplxpp.core.rotations import Array, array_namespace, matrix_from_rotvec
 from smplxpp.skinning.linear_blend import forward_kinematics, skin
 
 _WIDTHS = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
@@ -28,20 +27,20 @@ class PosedBody:
     pose correctives are in the rest vertices.
 
     Attributes:
-        vertices: (T, V, 3) metres.
-        joints: (T, J, 3) posed joints.
-        rest_vertices: (T, V, 3) with shape, expression and pose correctives.
-        rest_joints: (T, J, 3) joints of the shaped body, before posing.
-        posed_from_rest: (T, J, 4, 4).
-        pose_offsets: (T, V, 3) the pose correctives within `rest_vertices`; None where the model has none.
+        vertices: posed, metres.
+        joints: posed joints.
+        rest_vertices: with shape, expression and pose correctives.
+        rest_joints: joints of the shaped body, before posing.
+        posed_from_rest: transforms of the joints.
+        pose_offsets: the pose correctives within `rest_vertices`; None where the model has none.
     """
 
-    vertices: Any
-    joints: Any
-    rest_vertices: Any
-    rest_joints: Any
-    posed_from_rest: Any
-    pose_offsets: Any | None
+    vertices: Float[Array, "*T V 3"]
+    joints: Float[Array, "*T J 3"]
+    rest_vertices: Float[Array, "*T V 3"]
+    rest_joints: Float[Array, "*T J 3"]
+    posed_from_rest: Float[Array, "*T J 4 4"]
+    pose_offsets: Float[Array, "*T V 3"] | None
 
     def __len__(self) -> int:
         return self.vertices.shape[0]
@@ -60,18 +59,18 @@ class BodyModel:
 
     Attributes:
         name: of the file.
-        v_template: (V, 3) mean shape in the rest pose.
-        faces: (F, 3) int64.
-        shapedirs: (V, 3, B) metres a unit of beta.
-        exprdirs: (V, 3, E) metres a unit of expression; E = 0 where the model has none.
-        posedirs: (V, 3, P) pose correctives, P = 9 (J - 1); None where absent or zero.
-        joint_regressor: (J, V).
-        parents: (J,) int64, -1 at the root.
+        v_template: mean shape in the rest pose.
+        faces: corners of the triangles.
+        shapedirs: metres a unit of beta.
+        exprdirs: metres a unit of expression; E = 0 where the model has none.
+        posedirs: pose correctives, P = 9 (J - 1); None where absent or zero.
+        joint_regressor: rest joints of the vertices.
+        parents: -1 at the root.
         joint_names: J names.
-        weights: (V, J), rows sum to 1.
-        left_hand_components, right_hand_components: (K, 45) rows are principal components; None where absent.
-        left_hand_mean, right_hand_mean: (45,) axis-angle; None where absent.
-        part_labels: (V,) int64 indices into `part_label_names`: the file's own labels, else the joint of most weight.
+        weights: rows sum to 1.
+        left_hand_components, right_hand_components: rows are principal components; None where absent.
+        left_hand_mean, right_hand_mean: axis-angle; None where absent.
+        part_labels: indices into `part_label_names`: the file's own labels, else the joint of most weight.
         part_label_names: names of the parts.
         expression_names: E names; numbered where the file gives none.
     """
@@ -156,7 +155,7 @@ class BodyModel:
         """The body's faces on the given (V, 3) vertices, or on the mean shape."""
         return TriangleMesh(self.v_template if vertices is None else vertices, self.faces)
 
-    def forward(self, params: BodyParams | Mapping[str, Any], *, flat_hand_mean: bool | None = None) -> PosedBody:
+    def forward(self, params: BodyParams | Mapping[str, Array], *, flat_hand_mean: bool | None = None) -> PosedBody:
         """Pose the body.
 
         `v = v_template + shapedirs betas + exprdirs expression`, `J = joint_regressor v`,
@@ -189,18 +188,18 @@ class BodyModel:
         vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
         return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
 
-    def rest_joints(self, params: BodyParams | Mapping[str, Any]) -> Any:
-        """(T, J, 3) joints of the shaped body before posing."""
+    def rest_joints(self, params: BodyParams | Mapping[str, Array]) -> Float[Array, "T J 3"]:
+        """The joints of the shaped body before posing, metres."""
         return self._shaped(_checked_arrays(params))[1]
 
-    def _shaped(self, arrays: Mapping[str, Any]) -> tuple[Any, Any]:
+    def _shaped(self, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
         betas, expression = arrays["betas"], arrays["expression"]
         vertices = self._constant("v_template", betas) + self._blend("shapedirs", betas, "betas")
         if self.num_expressions:
             vertices = vertices + self._blend("exprdirs", expression, "expression")
         return vertices, self._constant("joint_regressor", vertices) @ vertices
 
-    def _blend(self, basis_name: str, coefficients: Any, subject: str) -> Any:
+    def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
         """(T, n) coefficients of the first n directions -> (T, V, 3) offsets."""
         basis = self._constant(basis_name, coefficients)
         used, known = coefficients.shape[-1], basis.shape[-1]
@@ -214,14 +213,14 @@ class BodyModel:
         flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
         return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
 
-    def _pose_offsets(self, rotations: Any) -> Any | None:
+    def _pose_offsets(self, rotations: Array) -> Array | None:
         if self.posedirs is None:
             return None
         identity = matrix_from_rotvec(_zeros(rotations, (3,)))  # of the rotations' kind, type and device
         feature = rotations[:, 1:] - identity
         return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
 
-    def _axis_angles(self, arrays: Mapping[str, Any], flat_hand_mean: bool) -> Any:
+    def _axis_angles(self, arrays: Mapping[str, Array], flat_hand_mean: bool) -> Array:
         """(T, J, 3) axis-angle vectors of all joints."""
         blocks = []
         for name in POSE_NAMES[self.joint_count]:
@@ -233,7 +232,7 @@ class BodyModel:
             full = array_namespace(full).concatenate([full, _zeros(full, (len(full), missing, 3))], 1)
         return full
 
-    def _full_hand(self, name: str, value: Any, flat_hand_mean: bool) -> Any:
+    def _full_hand(self, name: str, value: Array, flat_hand_mean: bool) -> Array:
         side = name.removesuffix("_pose")
         width = value.shape[-1]
         if width < HAND_WIDTH:
@@ -250,7 +249,7 @@ class BodyModel:
         mean = None if flat_hand_mean else self._constant(f"{side}_mean", value)
         return value if mean is None else value + mean
 
-    def _constant(self, name: str, like: Any) -> Any:
+    def _constant(self, name: str, like: Array) -> Array:
         """A field as an array of the kind, type and device of `like`."""
         value = getattr(self, name)
         if value is None or isinstance(like, np.ndarray):
@@ -264,7 +263,7 @@ class BodyModel:
         return self._tensors[key]
 
 
-def _checked_arrays(params: BodyParams | Mapping[str, Any]) -> dict[str, Any]:
+def _checked_arrays(params: BodyParams | Mapping[str, Array]) -> dict[str, Array]:
     """Every array by name with T rows, missing ones zero."""
     if isinstance(params, BodyParams):
         return {name: getattr(params, name) for name in ARRAY_NAMES}
@@ -291,5 +290,5 @@ def _checked_arrays(params: BodyParams | Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _zeros(like: Any, shape: tuple[int, ...]) -> Any:
+def _zeros(like: Array, shape: tuple[int, ...]) -> Array:
     return np.zeros(shape) if isinstance(like, np.ndarray) else like.new_zeros(shape)

@@ -19,6 +19,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,7 @@ class Capture:
 
     def file(self, camera: str, frame: int, kind: str = "image") -> Path | None:
         """The file that a view is read from, None where there is none. Kinds: image, mask, label, normal."""
-        if kind not in KINDS:
-            raise InputError("kind", expected=f"one of {', '.join(KINDS)}", received=str(kind))
+        require_choice("kind", kind, KINDS)
         self._full_camera(camera)
         if {(camera, frame), (None, frame), (camera, None)} & self.excluded:
             return None

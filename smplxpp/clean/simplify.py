@@ -9,9 +9,9 @@ import igl
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import edge_groups, manifold_corners
+from smplxpp.core.validation import require_at_least
 
 # Collapses per pass: 3 keeps the quadric order well; higher is no faster at these sizes and breaks manifoldness.
 _AGGRESSIVENESS = 3
@@ -50,8 +50,7 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     Raises:
         InputError: a budget below 4.
     """
-    if face_budget < 4:
-        raise InputError("face budget", expected="at least 4", received=str(face_budget))
+    require_at_least("face budget", face_budget, 4)
     if mesh.face_count <= face_budget:
         used = np.bincount(mesh.faces.ravel(), minlength=mesh.vertex_count) > 0
         identity = np.where(used, np.cumsum(used) - 1, -1)

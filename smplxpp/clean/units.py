@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Num
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Rotations that bring the named axis to +Y and keep the frame right-handed.
@@ -31,8 +32,7 @@ def convert_points(points: Num[np.ndarray, "N 3"], *, units: str = "m", up: str 
         InputError: an unknown name.
     """
     for name, value, known in (("units", units, METRES_PER_UNIT), ("up", up, _Y_FROM_UP)):
-        if value not in known:
-            raise InputError(f"option {name}", expected=f"one of {', '.join(known)}", received=repr(value))
+        require_choice(f"option {name}", value, tuple(known))
     return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * METRES_PER_UNIT[units]
 
 

@@ -14,6 +14,7 @@ from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.template.template import Template
@@ -150,8 +151,7 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
 def _times(params: BodyParams) -> np.ndarray:
     """(T,) float32 seconds."""
     fps = DEFAULT_FPS if params.fps is None else params.fps
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("animation: fps", expected="a positive number of frames a second", received=str(fps))
+    require_positive("animation: fps, frames a second", fps)
     if not len(params):
         raise InputError("animation", expected="at least one frame", received="none")
     return (np.arange(len(params)) / fps).astype(np.float32)

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,5 @@ def convention_named(name: str) -> Convention:
         InputError: no such preset.
     """
     known = presets()
-    if name not in known:
-        raise InputError("preset", expected=f"one of {', '.join(known)}", received=repr(name))
+    require_choice("preset", name, tuple(known))
     return known[name]

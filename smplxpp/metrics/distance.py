@@ -14,6 +14,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
+from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.metrics.conventions import DEFAULT, Convention, convention_named
 from smplxpp.metrics.sampling import (
     SurfaceSamples,
@@ -212,12 +213,8 @@ def compare(
         >>> result.p2s, result.gt_to_pred.p95, result.labels["upper"].chamfer
     """
     convention, config = convention_named(preset), config or CompareConfig()
-    if not 0 < config.threshold_mm < np.inf or not 0 <= config.visible_tolerance < np.inf:
-        raise InputError(
-            "comparison config",
-            expected="threshold_mm > 0 and visible_tolerance >= 0",
-            received=f"{config.threshold_mm} and {config.visible_tolerance}",
-        )
+    require_positive("comparison config threshold_mm", config.threshold_mm)
+    require_at_least("comparison config visible_tolerance", config.visible_tolerance, 0.0)
     measure = partial(directed_distances, samples=samples, seed=seed, preset=preset, config=config)
     forth = measure(pred, gt, source_labels=pred_labels, target_labels=gt_labels)
     back = measure(gt, pred, source_labels=gt_labels, target_labels=pred_labels)

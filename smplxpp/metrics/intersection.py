@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.validation import require_at_least
 from smplxpp.metrics.distance import MM
 
 # Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
@@ -69,8 +70,7 @@ def penetration(
     points = outer.vertices if isinstance(outer, TriangleMesh) else np.asarray(outer, dtype=np.float64)
     if not len(points):
         raise InputError("outer layer", expected="points", received="none")
-    if not 0 <= clearance < np.inf:
-        raise InputError("clearance", expected="0 or more metres", received=str(clearance))
+    require_at_least("clearance in metres", clearance, 0.0)
     signed, _, _ = signed_distance(points, inner)
     penetrating = signed < clearance - SIGN_RESOLUTION * inner.bbox_diagonal
     depth = (clearance - signed[penetrating]) * MM

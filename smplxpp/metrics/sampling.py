@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +45,7 @@ def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...
     Raises:
         InputError: `count` below 1, or a mesh without area.
     """
-    if count < 1:
-        raise InputError("sample count", expected="at least 1", received=str(count))
+    require_at_least("sample count", count, 1)
     require_surface(mesh, "mesh to sample")
     rng = np.random.Generator(np.random.PCG64(seed))
     cumulative = np.cumsum(mesh.face_areas)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.validation import require_positive
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,7 @@ def stretch_report(rest: TriangleMesh, posed: TriangleMesh, *, limit: float = 3.
     Raises:
         InputError: as `edge_stretch`, a limit that is not positive, or no edge with a length.
     """
-    if not 0 < limit < np.inf:
-        raise InputError("stretch limit", expected="above 0", received=str(limit))
+    require_positive("stretch limit", limit)
     ratio = edge_stretch(rest, posed)
     known = ratio[np.isfinite(ratio)]
     if not len(known):

@@ -18,6 +18,7 @@ from smplxpp.core.labels import CLOTH_LABELS, LABELS, semantic_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core.validation import require_choice
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
 
@@ -167,8 +168,7 @@ class Template:
         Raises:
             InputError: no such part.
         """
-        if name not in self.part_names:
-            raise InputError("part", expected=f"one of {', '.join(self.part_names)}", received=repr(name))
+        require_choice("part", name, self.part_names)
         return self.vertex_part[self.faces[:, 0]] == self.part_names.index(name)
 
     def part_mesh(self, name: str) -> TriangleMesh:

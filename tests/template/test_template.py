@@ -140,7 +140,7 @@ def test_masks_colours_and_parts(template):
     assert (template.semantic_colors[~of_part] == SKIN.semantic_rgb).all()
     assert template.part_mesh("shirt").vertex_count == of_part.sum()
     assert template.part_mesh("shirt").face_count + template.body.faces.shape[0] == len(template.faces)
-    with pytest.raises(InputError, match="one of body, shirt"):
+    with pytest.raises(InputError, match="'body' or 'shirt'"):
         template.part_mesh("hat")
 
 
