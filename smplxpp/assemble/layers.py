@@ -58,7 +58,7 @@ class Obstacle:
         return distance, gradient
 
     def lower_bound(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-        """(N,) metres: a point that moves less than this above zero cannot come inside; infinite far behind a garment.
+        """The way, in metres, that each point above zero can go without coming inside; infinite far behind a garment.
 
         Unlike `distance` it answers beside borders too, where a small move may give the question an answer.
         """
@@ -68,7 +68,7 @@ class Obstacle:
         return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
     def _box_distance(self, points: np.ndarray) -> np.ndarray:
-        """(N,) metres to the bounding box, 0 inside: far points need no search."""
+        """Metres to the bounding box, 0 inside: far points need no search."""
         squared = np.zeros(len(points))
         for axis in range(3):
             x = points[:, axis]
@@ -78,7 +78,7 @@ class Obstacle:
     def clearance(
         self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"], wanted: float
     ) -> Float64[np.ndarray, " N"]:
-        """(N,) metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
+        """The metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
 
         Parts cut from one scan share a seam; a gap there would have to tear the cloth.
         """
@@ -121,6 +121,6 @@ def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
 
 
 def face_centers(mesh: TriangleMesh, values: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
-    """(M, 3) mean over each face's corners of (N, 3) values at the vertices."""
+    """The mean over each face's corners of values at the vertices."""
     a, b, c = mesh.faces.T
     return (values[a] + values[b] + values[c]) / 3.0

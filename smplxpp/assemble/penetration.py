@@ -98,7 +98,7 @@ def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_
 
 
 def turned_faces(mesh: TriangleMesh, vertices: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " M"]:
-    """(M,) bool, faces whose normal has turned by more than 90 degrees on the new (N, 3) vertices."""
+    """The faces whose normal has turned by more than 90 degrees on the new vertices."""
     return np.einsum("ij,ij->i", mesh.face_cross, mesh.with_vertices(vertices).face_cross) < 0
 
 

@@ -46,7 +46,7 @@ class PosedBody:
         return self.vertices.shape[0]
 
     def frame(self, index: int) -> PosedBody:
-        """One frame, its arrays without the leading axis."""
+        """Return one frame, its arrays without the leading axis."""
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -200,7 +200,7 @@ class BodyModel:
         return vertices, self._constant("joint_regressor", vertices) @ vertices
 
     def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
-        """(T, n) coefficients of the first n directions -> (T, V, 3) offsets."""
+        """Offsets (T, V, 3) of the first n directions by (T, n) coefficients."""
         basis = self._constant(basis_name, coefficients)
         used, known = coefficients.shape[-1], basis.shape[-1]
         if used > known:
@@ -221,7 +221,7 @@ class BodyModel:
         return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
 
     def _axis_angles(self, arrays: Mapping[str, Array], flat_hand_mean: bool) -> Array:
-        """(T, J, 3) axis-angle vectors of all joints."""
+        """The axis-angle vectors (T, J, 3) of all joints."""
         blocks = []
         for name in POSE_NAMES[self.joint_count]:
             value = arrays[name]

@@ -38,7 +38,7 @@ def read_cameras(path: str | Path) -> list[Camera]:
 
 
 def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
-    """As `read_cameras`, with the distortion of each camera (`dist` in OpenCV's order); None: a pinhole."""
+    """Read what `read_cameras` reads, with each camera's distortion (`dist` in OpenCV's order); None: a pinhole."""
     path = Path(path)
     if not path.is_file():
         raise InputError("camera file", expected="an existing file", received=str(path))

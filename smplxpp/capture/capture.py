@@ -109,7 +109,7 @@ class Capture:
         return path
 
     def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
-        """(C, F) bool: which cameras have a file of which frame, known without opening any."""
+        """Tell which cameras have a file of which frame, without opening any."""
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
         numbers = np.array(self.frames, dtype=np.int64)
         for row, camera in enumerate(self.recording.cameras):
@@ -123,7 +123,7 @@ class Capture:
         return table
 
     def views(self, cameras: Iterable[str] | None = None, frames: Iterable[int] | None = None) -> list[tuple[str, int]]:
-        """(camera, frame) of every image there is, among the given cameras and frames (None: all), frame by frame."""
+        """The (camera, frame) of every image, among the given cameras and frames (None: all), frame by frame."""
         names = list(self.recording.cameras)
         table = self.presence()
         wanted_cameras = set(names if cameras is None else cameras)
@@ -135,7 +135,7 @@ class Capture:
         return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
 
     def image(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
-        """(H, W, 3) uint8 sRGB as recorded, read-only.
+        """The image of a view, sRGB as recorded, read-only.
 
         Raises:
             InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
@@ -144,7 +144,7 @@ class Capture:
         return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
     def mask(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
-        """(H, W) uint8 opacity of the person, 255 inside; None where there is no mask. Read-only.
+        """The opacity of the person, 255 inside; None where there is no mask. Read-only.
 
         Raises:
             InputError: no such camera, a damaged file, or one of another size.
@@ -155,14 +155,14 @@ class Capture:
         return self._cached("mask", camera, frame, lambda reader: (reader.alpha(path),))[0]
 
     def labels(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
-        """(H, W) uint8 numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
+        """Numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
         path = self.file(camera, frame, "label")
         if path is None:
             return None
         return self._cached("label", camera, frame, lambda reader: (reader.labels(path),))[0]
 
     def normals(self, camera: str, frame: int) -> Float32[np.ndarray, "H W 3"] | None:
-        """(H, W, 3) float32 unit normals in the world, 0 on the background; None where there is no map."""
+        """Unit normals in the world, 0 on the background; None where there is no map."""
         path = self.file(camera, frame, "normal")
         if path is None:
             return None
@@ -235,7 +235,7 @@ class Capture:
         return replace(self, windows={**self.windows, **cut})
 
     def without(self, problems: Iterable[Problem]) -> Capture:
-        """Without the views, frames and cameras that the problems name."""
+        """Return the capture without the views, frames and cameras that the problems name."""
         excluded = self.excluded | {(p.camera, p.frame) for p in problems if (p.camera, p.frame) != (None, None)}
         dropped_cameras = {camera for camera, frame in excluded if frame is None}
         dropped_frames = {frame for camera, frame in excluded if camera is None}

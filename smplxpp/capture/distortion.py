@@ -30,7 +30,7 @@ class Distortion:
 
     @staticmethod
     def from_opencv(coefficients: Sequence[float], *, subject: str) -> Distortion | None:
-        """From OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero.
+        """Read OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero.
 
         Raises:
             InputError: another number of coefficients (thin prism and tilt: any beyond the eighth that is not zero).
@@ -51,7 +51,7 @@ class Distortion:
         return Distortion((k1, k2, k3, k4, k5, k6), (p1, p2))
 
     def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """(N, 2) points on the plane z = 1 of the pinhole camera -> (N, 2) where the lens puts them."""
+        """Where the lens puts points on the plane z = 1 of the pinhole camera."""
         x, y = np.asarray(xy, dtype=np.float64).T
         (k1, k2, k3, k4, k5, k6), (p1, p2) = self.radial, self.tangential
         r2 = x * x + y * y

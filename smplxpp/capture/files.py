@@ -33,7 +33,7 @@ class FileSeries:
 
     @staticmethod
     def from_names(folder: Path, names: Mapping[int, str]) -> FileSeries:
-        """From the file name of each frame."""
+        """Make a series of the file name of each frame."""
         numbers = np.array(sorted(names), dtype=np.int64)
         encoded = np.array([os.fsencode(names[int(n)]) for n in numbers], dtype=bytes)
         return FileSeries(folder, numbers, encoded)
@@ -75,7 +75,7 @@ class FileSeries:
         return path
 
     def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
-        """(N,) bool: which of the frames have a file."""
+        """Tell which of the frames have a file."""
         return np.isin(frames, self.numbers)
 
     def only(self, keep: Bool[np.ndarray, " F"]) -> FileSeries:

@@ -72,7 +72,7 @@ class MattingModel:
         self._size = (width, height)
 
     def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
-        """(H, W, 3) uint8 sRGB -> (H, W) uint8 opacity."""
+        """Return the opacity of the person in an sRGB image."""
         from PIL import Image
         from PIL.Image import Resampling
 

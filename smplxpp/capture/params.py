@@ -51,11 +51,11 @@ class StackedParams:
         return params, np.where(good, np.cumsum(good) - 1, -1)
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """(F,) rows of the file."""
+        """The frames that there are, ascending."""
         return np.arange(len(self._rows[1]))
 
     def read(self, frame: int) -> BodyParams:
-        """One row.
+        """Read the parameters of one frame.
 
         Raises:
             InputError: NaN or infinity in it.
@@ -68,18 +68,18 @@ class StackedParams:
 
 @dataclass(frozen=True, eq=False)
 class ParamFiles:
-    """One file a frame; see `StackedParams`."""
+    """A file of parameters for each frame; see `StackedParams`."""
 
     files: FileSeries
     layout: LayoutName = "auto"
     body: BodyModel | None = None
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """(F,) frames with a file."""
+        """The frames that there are, ascending."""
         return self.files.numbers
 
     def read(self, frame: int) -> BodyParams:
-        """One file."""
+        """Read the parameters of one frame."""
         return load_params(self.files.required(frame), layout=self.layout, body=self.body)
 
 

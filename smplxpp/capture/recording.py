@@ -38,10 +38,10 @@ class ParamSource(Protocol):
     """Body parameters by frame."""
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """(F,) int64 frames that have parameters, ascending."""
+        """The frames that have parameters, ascending."""
 
     def read(self, frame: int) -> BodyParams:
-        """One frame that is among `frames()`."""
+        """Read one frame that is among `frames()`."""
 
 
 class MeshSource(Protocol):

@@ -59,7 +59,7 @@ class Splits:
         return Splits(train, self.novel_view_cameras + held_out, self.train_frames, self.novel_pose_frames)
 
     def restricted(self, cameras: Sequence[str], frames: Sequence[int]) -> Splits:
-        """Without cameras and frames that are not among the given ones."""
+        """Return the split without cameras and frames that are not among the given ones."""
         names, numbers = set(cameras), set(frames)
         return Splits(
             tuple(c for c in self.train_cameras if c in names),

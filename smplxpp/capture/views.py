@@ -40,19 +40,19 @@ class ViewReader:
     background: tuple[float, float, float] | None = None
 
     def color(self, path: Path) -> UInt8[np.ndarray, "H W 3"]:
-        """(H, W, 3) uint8."""
+        """Read an image's colours."""
         return self._shown(self._sized(read_color(path), path))
 
     def alpha(self, path: Path) -> UInt8[np.ndarray, "H W"]:
-        """(H, W) uint8."""
+        """Read a mask's opacity."""
         return self._shown(self._sized(read_alpha(path), path))
 
     def labels(self, path: Path) -> UInt8[np.ndarray, "H W"]:
-        """(H, W) uint8."""
+        """Read a label map."""
         return self._shown(self._sized(read_labels(path), path), labels=True)
 
     def normals(self, path: Path) -> Float32[np.ndarray, "H W 3"]:
-        """(H, W, 3) float32. Resampled to the nearest pixel, as labels: an average over an edge is no normal."""
+        """Read a normal map, resampled to the nearest pixel, as labels: an average over an edge is no normal."""
         image, deep = read_normals(path)
         value = self._shown(self._sized(image, path), labels=True).astype(np.float32)
         # Of 16-bit files Pillow gives the upper byte: the middle of its range is 0.2 degrees off at most.

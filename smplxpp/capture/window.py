@@ -39,7 +39,7 @@ class Window:
         return self.width / (x1 - x0), self.height / (y1 - y0)
 
     def resized(self, scale: float) -> Window:
-        """At `scale` times the resolution; the size is rounded, and the intrinsics follow the rounded size."""
+        """Return the window at `scale` times the resolution; its size is rounded, and the intrinsics follow that."""
         size = (round(self.width * scale), round(self.height * scale))
         if not scale > 0 or min(size) < 1:
             raise InputError("scale", expected="a factor that leaves at least 1 x 1 pixels", received=str(scale))

@@ -10,7 +10,7 @@ from smplxpp.core.topology import border_loops, face_components
 
 
 def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
-    """(M,) bool: faces of components with at least `area_fraction` of the mesh's area (the largest always)."""
+    """The faces of components with at least `area_fraction` of the mesh's area (the largest always)."""
     component = face_components(mesh.faces)
     area = np.bincount(component, mesh.face_areas)
     kept = area >= area_fraction * area.sum()
@@ -19,7 +19,7 @@ def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.n
 
 
 def loop_lengths(mesh: TriangleMesh, loops: list[Int[np.ndarray, " _"]]) -> Float64[np.ndarray, " L"]:
-    """(L,) perimeter of each closed loop of vertex indices, metres."""
+    """The perimeter of each closed loop of vertex indices, metres."""
     positions = [mesh.vertices[loop] for loop in loops]
     return np.array([np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1).sum() for p in positions])
 

@@ -155,7 +155,7 @@ def _first_of_each(faces: np.ndarray) -> np.ndarray:
 
 
 def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(M,) bool: faces to turn over, for consistent winding in each component and then outward.
+    """The faces to turn over, for consistent winding in each component and then outward.
 
     Consistency is connectivity in the double cover: every face is two nodes, as given and turned over, and each edge
     with two faces joins the nodes that agree. A component whose two sheets join (a Moebius strip) is left as it is.

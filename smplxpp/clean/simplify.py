@@ -108,14 +108,14 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
 
 
 def _opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
-    """(m,) bool: faces whose normal opposes the source face nearest to their middle, or that have no area."""
+    """The faces whose normal opposes the source face nearest to their middle, or that have no area."""
     _, nearest, _ = tree.squared_distance(source.vertices, source.faces, result.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", result.face_normals, source.face_normals[nearest])
     return (cosine < 0) | (result.face_areas <= 0)
 
 
 def _non_manifold(faces: np.ndarray) -> np.ndarray:
-    """(m,) bool: faces at an edge with more than two faces."""
+    """The faces at an edge with more than two faces."""
     order, _, count = edge_groups(faces)
     bad = np.zeros(len(faces), dtype=bool)
     bad[order[np.repeat(count > 2, count)] // 3] = True
@@ -125,7 +125,7 @@ def _non_manifold(faces: np.ndarray) -> np.ndarray:
 def _nearest_source(
     mesh: TriangleMesh, result: TriangleMesh, new_from_old: np.ndarray, source_of_cut: np.ndarray
 ) -> np.ndarray:
-    """(n,) source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
+    """The source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
     old = np.flatnonzero(new_from_old >= 0)
     new = new_from_old[old]
     position = np.empty((int(source_of_cut.max()) + 1, 3))

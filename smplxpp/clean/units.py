@@ -23,7 +23,7 @@ _HEIGHT = (0.7, 2.6)
 
 
 def convert_points(points: Num[np.ndarray, "N 3"], *, units: str = "m", up: str = "y") -> Float64[np.ndarray, "N 3"]:
-    """(N, 3) points in the stated units and axes -> metres, +Y up.
+    """Convert points in the stated units and axes to metres, +Y up.
 
     Args:
         units: "m", "cm", "mm" or "inch". up: the source's upward axis: "y", "z", "x", "-y", "-z" or "-x".

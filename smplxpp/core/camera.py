@@ -47,16 +47,16 @@ class Camera:
 
     @property
     def position(self) -> Float64[np.ndarray, " 3"]:
-        """(3,) centre of projection in the world (meaningless for an orthographic camera)."""
+        """The centre of projection in the world (meaningless for an orthographic camera)."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @property
     def forward(self) -> Float64[np.ndarray, " 3"]:
-        """(3,) unit viewing direction in the world."""
+        """The unit viewing direction in the world."""
         return self.cam_from_world[2, :3]
 
     def screen_from_world(self, points: Num[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
-        """(N, 3) world points -> (N, 4): x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
+        """Project world points: x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
         # Coordinates as rows: every step then runs along memory.
         cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]
         screen = np.empty((4, cam.shape[1]))

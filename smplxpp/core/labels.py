@@ -41,12 +41,12 @@ LABEL_BY_NAME: dict[str, Label] = {label.name: label for label in LABELS}
 
 
 def display_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
-    """(N,) label ids -> (N, 3) uint8 display colours; background black."""
+    """The display colours of label ids; background black."""
     table = np.array([label.display_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]
 
 
 def semantic_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
-    """(N,) label ids -> (N, 3) uint8 semantic colours; background black."""
+    """The semantic colours of label ids; background black."""
     table = np.array([label.semantic_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]

@@ -72,34 +72,34 @@ class TriangleMesh:
 
     @cached_property
     def triangles(self) -> Float64[np.ndarray, "M 3 3"]:
-        """(M, 3, 3) corner positions."""
+        """The positions of each face's corners."""
         return self.vertices[self.faces]
 
     @cached_property
     def face_centers(self) -> Float64[np.ndarray, "M 3"]:
-        """(M, 3) means of the corners."""
+        """The means of the corners."""
         t = self.triangles
         return (t[:, 0] + t[:, 1] + t[:, 2]) / 3.0
 
     @cached_property
     def face_cross(self) -> Float64[np.ndarray, "M 3"]:
-        """(M, 3) normals of length twice the area."""
+        """The faces' normals, of length twice the area."""
         t = self.triangles
         return np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
 
     @cached_property
     def face_areas(self) -> Float64[np.ndarray, " M"]:
-        """(M,) square metres."""
+        """The faces' areas, square metres."""
         return 0.5 * row_lengths(self.face_cross)
 
     @cached_property
     def face_normals(self) -> Float64[np.ndarray, "M 3"]:
-        """(M, 3) unit normals; zero for a face without area."""
+        """The faces' unit normals; zero for a face without area."""
         return normalize_rows(self.face_cross)
 
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "N 3"]:
-        """(N, 3) unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
+        """The unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
         t, normals = self.triangles, self.face_normals
         out = np.zeros_like(self.vertices)
         for k in range(3):
@@ -112,7 +112,7 @@ class TriangleMesh:
 
     @cached_property
     def referenced(self) -> Int64[np.ndarray, " n"]:
-        """(n,) vertices that a face uses, in increasing order."""
+        """The vertices that a face uses, in increasing order."""
         return _occurring(self.faces, self.vertex_count)
 
     @cached_property
@@ -125,12 +125,12 @@ class TriangleMesh:
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "E 2"]:
-        """(E, 2) undirected edges, each once, lower index first, sorted."""
+        """The undirected edges, each once, lower index first, sorted."""
         return self.edges_with_counts[0]
 
     @cached_property
     def edges_with_counts(self) -> tuple[Int64[np.ndarray, "E 2"], Int64[np.ndarray, " E"]]:
-        """(E, 2) undirected edges and (E,) the number of faces at each."""
+        """The undirected edges, and the number of faces at each."""
         f = self.faces
         directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
         key = directed[:, 0] * max(self.vertex_count, 1) + directed[:, 1]
@@ -140,13 +140,13 @@ class TriangleMesh:
 
     @cached_property
     def border_edges(self) -> Int64[np.ndarray, "B 2"]:
-        """(B, 2) edges with one face."""
+        """The edges with one face."""
         edges, counts = self.edges_with_counts
         return edges[counts == 1]
 
     @cached_property
     def face_pairs(self) -> Int64[np.ndarray, "P 2"]:
-        """(P, 2) pairs of faces at an edge that has exactly two."""
+        """The pairs of faces at an edge that has exactly two."""
         order, first, count = edge_groups(self.faces)
         start = first[count == 2]
         return np.stack([order[start], order[start + 1]], axis=1) // 3
@@ -177,7 +177,7 @@ def _occurring(indices: np.ndarray, count: int) -> np.ndarray:
 
 
 def row_lengths(x: Float[np.ndarray, "N D"]) -> Float[np.ndarray, " N"]:
-    """(N,) lengths of the rows of (N, D); several times as fast as `np.linalg.norm` where D is small."""
+    """The lengths of the rows; several times as fast as `np.linalg.norm` where D is small."""
     return np.sqrt(np.einsum("ij,ij->i", x, x))
 
 

@@ -91,7 +91,7 @@ class BodyParams:
 
     @property
     def full_pose(self) -> Float64[np.ndarray, "T 55 3"]:
-        """(T, 55, 3) axis-angle in SMPL-X joint order.
+        """The axis-angle vectors of all joints in SMPL-X order.
 
         Raises:
             InputError: hands given as PCA coefficients, which only a body model can expand.
@@ -106,7 +106,7 @@ class BodyParams:
         return np.concatenate([getattr(self, name) for name, _ in POSE_BLOCKS], axis=1).reshape(len(self), -1, 3)
 
     def frame(self, index: int) -> BodyParams:
-        """One frame as a BodyParams of length 1 (negative indices count from the end)."""
+        """Return one frame as a BodyParams of length 1 (negative indices count from the end)."""
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
         return self.select([index % len(self)])
@@ -172,7 +172,7 @@ class BodyParams:
 
     @staticmethod
     def from_mapping(values: Mapping[str, np.ndarray], *, source: str = "parameters") -> BodyParams:
-        """From arrays by SMPL-X name; face, hands and expression may be missing (zero)."""
+        """Read arrays by SMPL-X name; face, hands and expression may be missing (zero)."""
         required = ("global_orient", "body_pose", "betas", "transl")
         missing = [name for name in required if name not in values]
         if missing:

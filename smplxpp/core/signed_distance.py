@@ -22,7 +22,7 @@ _BURIED_PROBE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SignedDistance:
-    """Where N points lie with respect to a surface.
+    """The place of N points with respect to a surface.
 
     Attributes:
         distance: (N,) metres, negative inside.
@@ -148,7 +148,7 @@ class SignedDistanceField:
 def barycentric_coordinates(
     points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "N 3 3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """(N, 3) barycentric coordinates of points in the planes of (N, 3, 3) triangles with an area; rows sum to 1."""
+    """The barycentric coordinates of points in the planes of triangles with an area; rows sum to 1."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = points - triangles[:, 0]
     normal = np.cross(a, b)

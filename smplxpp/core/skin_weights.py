@@ -38,7 +38,7 @@ class SkinWeights:
         return len(self.joint_indices)
 
     def dense(self) -> Float64[np.ndarray, "N J"]:
-        """(N, J) float64; every row sums to 1."""
+        """The weights of every joint; every row sums to 1."""
         out = np.zeros((len(self), self.joint_count))
         np.add.at(out, (np.arange(len(self))[:, None], self.joint_indices), self.joint_weights)
         return out

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 
 def half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "H 2"]:
-    """(3M, 2) start and end vertex of every half-edge."""
+    """The start and end vertex of every half-edge, H = 3 M."""
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
@@ -33,14 +33,14 @@ def edge_groups(
 
 
 def paired_half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "P 2"]:
-    """(P, 2) the two half-edges of every edge that has exactly two faces, lower index first."""
+    """The two half-edges of every edge that has exactly two faces, lower index first."""
     order, first, count = edge_groups(faces)
     start = first[count == 2]
     return np.stack([order[start], order[start + 1]], axis=1)
 
 
 def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"], Int[np.ndarray, "P 2"]]:
-    """(P, 2) pairs of faces that share an edge, each pair once an edge, and (P, 2) that edge's vertices.
+    """The pairs of faces that share an edge, each pair once an edge, and that edge's vertices.
 
     At an edge with more than two faces, faces that follow each other in index order are paired.
     """
@@ -53,7 +53,7 @@ def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"
 
 
 def component_labels(pairs: Int[np.ndarray, "P 2"], count: int) -> Int[np.ndarray, " count"]:
-    """(count,) component of every node of the graph with edges `pairs`, numbered by lowest node."""
+    """The component of every node of the graph with edges `pairs`, numbered by lowest node."""
     graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels = connected_components(graph, directed=False)[1]
     first = np.full(int(labels.max(initial=-1)) + 1, count)
@@ -64,7 +64,7 @@ def component_labels(pairs: Int[np.ndarray, "P 2"], count: int) -> Int[np.ndarra
 
 
 def face_components(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
-    """(M,) edge-connected component of every face."""
+    """The edge-connected component of every face."""
     return component_labels(face_adjacency(faces)[0], len(faces))
 
 

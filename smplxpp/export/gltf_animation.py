@@ -149,7 +149,7 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def _times(params: BodyParams) -> np.ndarray:
-    """(T,) float32 seconds."""
+    """The frames' times (T,), float32 seconds."""
     fps = DEFAULT_FPS if params.fps is None else params.fps
     require_positive("animation: fps, frames a second", fps)
     if not len(params):

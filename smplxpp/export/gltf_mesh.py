@@ -60,7 +60,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
 
 
 def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
-    """(N, 3) uint8 sRGB -> (N, 4) uint16 linear RGB and full alpha.
+    """Convert sRGB to linear RGB with full alpha.
 
     Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge (IEC 61966-2-1).
     """

@@ -27,7 +27,7 @@ from smplxpp.core.validation import require_choice
 
 @dataclass(frozen=True)
 class Convention:
-    """One definition of P2S and Chamfer; see the module's equations.
+    """A definition of P2S and Chamfer; see the module's equations.
 
     Attributes:
         name: of the preset.

@@ -69,7 +69,7 @@ def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
 def interpolated_normals(
     mesh: TriangleMesh, face: Integer[np.ndarray, " P"], barycentric: Float[np.ndarray, "P 3"]
 ) -> Float64[np.ndarray, "P 3"]:
-    """(P, 3) unit normals at barycentric coordinates (P, 3) of faces (P,), from the angle-weighted vertex normals.
+    """The unit normals at barycentric coordinates of faces, from the angle-weighted vertex normals.
 
     Not the faces' own normals: the closest point of a convex surface often lies on an edge or a vertex, where the
     choice of the face, and so the angle, would be left to rounding.
@@ -101,7 +101,7 @@ def labels_at(
     face: Integer[np.ndarray, " P"],
     points: Float[np.ndarray, "P 3"],
 ) -> Int64[np.ndarray, " P"]:
-    """(P,) labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
+    """The labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
     if len(labels) == mesh.face_count:
         return labels[face]
     corner = np.linalg.norm(mesh.triangles[face] - points[:, None], axis=2).argmin(axis=1)

@@ -35,12 +35,12 @@ class StretchReport:
     flipped_faces: int
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain numbers, for JSON."""
         return asdict(self)
 
 
 def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> Float64[np.ndarray, " E"]:
-    """(E,) length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
+    """The length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
 
     Raises:
         InputError: the meshes differ in faces or number of vertices, or have no faces.
@@ -52,7 +52,7 @@ def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> Float64[np.ndarray,
 
 
 def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, " M"]:
-    """(M,) bool: faces that agree with their edge neighbours at rest and oppose them in the pose.
+    """The faces that agree with their edge neighbours at rest and oppose them in the pose.
 
     A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors.
     Relative to the neighbours, so that the pose's own rotation does not count.

@@ -51,12 +51,12 @@ class WeightReport:
         return self.row_sum_error <= 1e-9 and not self.negative and not self.zero_rows
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain numbers, for JSON."""
         return {**asdict(self), "valid": self.valid}
 
 
 def total_variation(a: Float[np.ndarray, "N J"], b: Float[np.ndarray, "N J"]) -> Float64[np.ndarray, " N"]:
-    """(N,) half the L1 distance of two rows of weights (N, J): the share of a vertex that follows other joints."""
+    """Half the L1 distance of two rows of weights: the share of a vertex that follows other joints."""
     return 0.5 * np.abs(a - b).sum(axis=1)
 
 

@@ -29,7 +29,7 @@ def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
 
 
 def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> Bool[np.ndarray, " M"]:
-    """(M,) bool: faces that own a pixel in some of `views` orthographic views from outside."""
+    """The faces that own a pixel in some of `views` orthographic views from outside."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     for camera in _cameras(mesh, views, resolution):
         ids = rasterize_mesh(mesh, camera).face_id
@@ -40,7 +40,7 @@ def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int 
 def outer_visible_points(
     mesh: TriangleMesh, points: Float[np.ndarray, "P 3"], *, tolerance: float, views: int = 32, resolution: int = 640
 ) -> Bool[np.ndarray, " P"]:
-    """(P,) bool: points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
+    """The points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
     for camera in _cameras(mesh, views, resolution):

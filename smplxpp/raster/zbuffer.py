@@ -30,7 +30,7 @@ class MeshMaps:
 
     @property
     def mask(self) -> Bool[np.ndarray, "H W"]:
-        """(H, W) bool: pixels covered by the mesh."""
+        """The pixels covered by the mesh."""
         return self.face_id >= 0
 
     def interpolate(

@@ -110,7 +110,7 @@ def expand(
 
 
 def _may_switch(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray) -> np.ndarray:
-    """(n,) bool: a set outside which no node takes alpha in some minimal cut.
+    """A set of nodes outside which none takes alpha in some minimal cut.
 
     It starts as the nodes that gain by switching alone (cost < 0) and takes in, until nothing changes, every node i
     with cost_i < sum of the capacities to nodes inside. Then for any set S of nodes outside, switching S back to its

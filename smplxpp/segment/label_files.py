@@ -150,7 +150,7 @@ def _read_from_mesh(
 
 
 def labels_from_colors(colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.0) -> Int64[np.ndarray, " N"]:
-    """(N, 3) uint8 display colours -> (N,) label ids; -1 farther than `tolerance` from every colour of the table."""
+    """The label ids of display colours; -1 farther than `tolerance` from every colour of the table."""
     table = cKDTree(np.array([label.display_rgb for label in LABELS], dtype=np.float64))
     distance, nearest = table.query(np.asarray(colors, dtype=np.float64), distance_upper_bound=tolerance + 1e-9)
     ids = np.array([label.id for label in LABELS] + [BACKGROUND])

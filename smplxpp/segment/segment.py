@@ -122,7 +122,7 @@ def segment_scan(
 def _votes_of_labels(
     mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None
 ) -> np.ndarray:
-    """(M, L) three votes a face, fewer where corners are unlabelled."""
+    """Three votes (M, L) a face, fewer where corners are unlabelled."""
     name, labels, count = (
         ("vertex labels", vertex_labels, mesh.vertex_count)
         if face_labels is None
@@ -146,7 +146,7 @@ def _votes_of_labels(
 
 
 def _fold_weights(mesh: TriangleMesh, pairs: np.ndarray, ends: np.ndarray, config: SegmentConfig) -> np.ndarray:
-    """(P,) pairwise cost of a label change across each edge."""
+    """The cost (P,) of a label change across each edge."""
     length = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
     normal = mesh.face_normals
     n0, n1 = normal[pairs[:, 0]], normal[pairs[:, 1]]

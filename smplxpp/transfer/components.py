@@ -14,7 +14,7 @@ from smplxpp.transfer.config import TransferConfig
 
 
 def vertex_components(mesh: TriangleMesh) -> Int32[np.ndarray, " N"]:
-    """(N,) int32 component of every vertex, numbered from 0."""
+    """The component of every vertex, numbered from 0."""
     return component_labels(mesh.edges, mesh.vertex_count).astype(np.int32)
 
 

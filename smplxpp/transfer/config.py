@@ -117,7 +117,7 @@ class TransferConfig:
         return index
 
     def allowed_mask(self, joint_count: int) -> Bool[np.ndarray, " J"] | None:
-        """(J,) bool, or None where all joints are allowed."""
+        """The joints that a part may follow, or None where all are allowed."""
         if self.allowed_joints is None:
             return None
         mask = np.zeros(joint_count, dtype=bool)

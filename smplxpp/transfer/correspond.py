@@ -31,14 +31,14 @@ class Correspondence:
     angle: Float64[np.ndarray, " N"]
 
     def interpolate(self, source: TriangleMesh, values: Float[np.ndarray, "V D"]) -> Float64[np.ndarray, "N D"]:
-        """(V, D) values at the source's vertices -> (N, D) at the closest points."""
+        """The values at the closest points, from those at the source's vertices."""
         rows = np.repeat(np.arange(len(self.face)), 3)
         corners = source.faces[self.face].ravel()
         matrix = sp.csr_matrix((self.barycentric.ravel(), (rows, corners)), (len(self.face), source.vertex_count))
         return matrix @ values
 
     def matched(self, *, max_distance: float, max_angle: float) -> Bool[np.ndarray, " N"]:
-        """(N,) bool: near enough (metres) and facing the same way (radians)."""
+        """The points near enough (metres) and facing the same way (radians)."""
         return (self.distance <= max_distance) & (self.angle <= max_angle)
 
 

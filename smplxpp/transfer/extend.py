@@ -32,7 +32,7 @@ class SurfaceSamples:
 
 
 def sample_surface(mesh: TriangleMesh, weights: Float[np.ndarray, "V J"], *, count: int = _SAMPLES) -> SurfaceSamples:
-    """One face's centre from each of `count` equal shares of the area, in the order of the faces (deterministic)."""
+    """Take a face's centre from each of `count` equal shares of the area, in the order of the faces (deterministic)."""
     cumulative = np.cumsum(mesh.face_areas)
     at = (np.arange(count) + 0.5) / count * cumulative[-1]
     face = np.minimum(np.searchsorted(cumulative, at), mesh.face_count - 1)

@@ -14,7 +14,7 @@ _SMALL_ANGLE = np.radians(0.1)
 
 
 def edge_lengths(mesh: TriangleMesh) -> Float64[np.ndarray, "M 3"]:
-    """(M, 3) lengths of the edges opposite to each corner."""
+    """The lengths of the edges opposite to each corner."""
     t = mesh.triangles
     return np.stack([row_lengths(t[:, (k + 1) % 3] - t[:, (k + 2) % 3]) for k in range(3)], axis=1)
 

@@ -94,7 +94,7 @@ def _values(
     normals: np.ndarray,
     config: TransferConfig,
 ) -> np.ndarray:
-    """(N, J) what each vertex would take by itself: the closest point's weights, or their extension."""
+    """The weights (N, J) each vertex would take by itself: the closest point's, or their extension."""
     used = np.flatnonzero(weights.any(axis=0))
     values = found.interpolate(source, weights[:, used])
     if config.falloff is not None:
@@ -114,7 +114,7 @@ def _smooth(
     length: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """(N, J) the values fitted smoothly over the surface; vertices without a face keep theirs."""
+    """The values (N, J) fitted smoothly over the surface; vertices without a face keep theirs."""
     if config.smoothing is None:
         width = np.where(matched | settled, 0.0, np.inf)
     else:

@@ -73,7 +73,7 @@ class ColmapImage:
 
 
 def model_folder(root: Path) -> Path | None:
-    """Where the model lies: `sparse/0`, `sparse` or the folder itself."""
+    """The folder of the model: `sparse/0`, `sparse` or the folder itself."""
     for folder in (root / "sparse" / "0", root / "sparse", root):
         if any((folder / f"cameras.{s}").is_file() and (folder / f"images.{s}").is_file() for s in ("bin", "txt")):
             return folder

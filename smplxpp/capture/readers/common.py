@@ -78,7 +78,7 @@ def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[n
 
 
 def numbered_images(folders: Mapping[str, Path]) -> dict[str, FileSeries]:
-    """For each camera the images of its folder whose names are numbers; cameras without any are left out."""
+    """Find each camera's images in its folder whose names are numbers; cameras without any are left out."""
     found = {name: FileSeries.find(folder, image_name()) for name, folder in folders.items()}
     return {name: series for name, series in found.items() if len(series)}
 
@@ -99,7 +99,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int, int]:
-    """For calibrations without the images' size.
+    """Read the images' size from the first one, for calibrations that do not say it.
 
     Raises:
         InputError: the camera has no image.

@@ -31,7 +31,7 @@ _PARAMS = ("output/smplx/smpl", "output/smplx", "output/smpl/smpl", "output/smpl
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds both camera files."""
+    """Tell whether a folder holds both camera files."""
     return (root / "intri.yml").is_file() and (root / "extri.yml").is_file()
 
 

@@ -23,7 +23,7 @@ _PARAM_KEYS = {"body_pose", "betas", "Rh", "Th"}
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds such a calibration."""
+    """Tell whether a folder holds such a calibration."""
     return _calibration(root) is not None
 
 
