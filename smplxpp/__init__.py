@@ -6,20 +6,23 @@ The names below are loaded when they are first used, so that importing the packa
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
 
 _EXPORTS: dict[str, str] = {
     "BodyModel": "smplxpp.body",
-    "BodyParams": "smplxpp.core.params",
-    "InputError": "smplxpp.core.errors",
-    "SkinWeights": "smplxpp.core.skin_weights",
-    "Template": "smplxpp.template.template",
+    "BodyParams": "smplxpp.core",
+    "Camera": "smplxpp.core",
+    "Capture": "smplxpp.capture",
+    "GeometryWarning": "smplxpp.core",
+    "InputError": "smplxpp.core",
+    "SkinWeights": "smplxpp.core",
+    "Template": "smplxpp.template",
     "TransferConfig": "smplxpp.transfer",
-    "TriangleMesh": "smplxpp.core.mesh",
+    "TriangleMesh": "smplxpp.core",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",
+    "open_capture": "smplxpp.capture",
     "pose": "smplxpp.skinning",
-    "read_mesh": "smplxpp.core.mesh_io",
+    "read_mesh": "smplxpp.core",
     "transfer_weights": "smplxpp.transfer",
     "unpose": "smplxpp.skinning",
     "write_glb": "smplxpp.export",
@@ -29,7 +32,7 @@ _MODULES = ("metrics",)
 __all__ = [*_EXPORTS, *_MODULES]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _EXPORTS:
         return getattr(import_module(_EXPORTS[name]), name)
     if name in _MODULES:

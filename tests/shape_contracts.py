@@ -160,6 +160,8 @@ class _Loader(importlib.abc.Loader):
     @staticmethod
     def _check_class(cls: type) -> None:
         for name, value in list(vars(cls).items()):
+            if name == "__init__" and dataclasses.is_dataclass(cls):
+                continue  # what is given may be converted; the fields are looked at instead
             if inspect.isfunction(value):
                 setattr(cls, name, checked(value))
             elif isinstance(value, staticmethod | classmethod):

@@ -64,9 +64,9 @@ def _charts(template: Template) -> np.ndarray:
     """(V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
     joint = np.argmax(template.weights.dense(), axis=1)
     while (beyond := joint >= BODY_JOINTS).any():
-        joint = np.where(beyond, template.parents[joint], joint)
-    label = template.body_labels[template.body_index]
-    return (template.vertex_part * len(template.body_label_names) + label) * BODY_JOINTS + joint
+        joint = np.where(beyond, template.body.parents[joint], joint)
+    label = template.body.part_labels[template.body_index]
+    return (template.vertex_part * len(template.body.part_label_names) + label) * BODY_JOINTS + joint
 
 
 def _unrolled(points: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -72,9 +72,7 @@ class View:
             return self
         top, bottom = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + margin + 1, self.camera.height)
         left, right = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + margin + 1, self.camera.width)
-        K = self.camera.K.copy()
-        K[:2, 2] -= (left, top)
-        camera = replace(self.camera, K=K, width=right - left, height=bottom - top)
+        camera = self.camera.cropped((left, top, right, bottom))
         part = (slice(top, bottom), slice(left, right))
         normals = None if self.normals is None else self.normals[part].contiguous()
         return View(camera, self.foreground[part].contiguous(), self.alpha[part].contiguous(), normals)
@@ -82,9 +80,7 @@ class View:
     def halved(self) -> View:
         """Every 2 x 2 pixels averaged to one; a last odd row or column is left out. Normals are sampled."""
         height, width = self.camera.height // 2, self.camera.width // 2
-        K = self.camera.K.copy()
-        K[:2] *= 0.5
-        camera = replace(self.camera, K=K, width=width, height=height)
+        camera = self.camera.cropped((0, 0, 2 * width, 2 * height), size=(width, height))
         stacked = torch.cat([self.foreground, self.alpha[..., None]], dim=-1)[: 2 * height, : 2 * width]
         small = stacked.view(height, 2, width, 2, 4).float().mean(dim=(1, 3)).round().to(torch.uint8)
         normals = None if self.normals is None else self.normals[: 2 * height : 2, : 2 * width : 2].contiguous()

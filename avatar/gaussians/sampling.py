@@ -103,18 +103,18 @@ def head_faces(template: Template) -> np.ndarray:
     Raises:
         InputError: no joint of that name.
     """
-    if "head" not in template.joint_names:
+    if "head" not in template.body.joint_names:
         raise InputError(
             "template joints",
             expected="one named 'head', to give the head its share",
-            received=f"{len(template.joint_names)} other names",
+            received=f"{len(template.body.joint_names)} other names",
             remedy="set head_share to None",
         )
-    head = template.joint_names.index("head")
-    subtree = np.zeros(template.joint_count, dtype=bool)
+    head = template.body.joint_names.index("head")
+    subtree = np.zeros(template.body.joint_count, dtype=bool)
     subtree[head] = True
-    for _ in range(template.joint_count):
-        subtree |= np.where(template.parents >= 0, subtree[template.parents], False)
+    for _ in range(template.body.joint_count):
+        subtree |= np.where(template.body.parents >= 0, subtree[template.body.parents], False)
     weight = template.weights.dense()[:, subtree].sum(1)
     return weight[template.faces].mean(1) > 0.5
 

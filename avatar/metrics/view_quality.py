@@ -114,7 +114,7 @@ def mean_quality(views: Mapping[str, ViewQuality]) -> dict[str, float]:
 
 def head_vertices(template: Template) -> np.ndarray:
     """(n,) vertices of the head's faces; all that faces use on a body without a joint "head"."""
-    faces = template.faces[head_faces(template)] if "head" in template.joint_names else template.faces
+    faces = template.faces[head_faces(template)] if "head" in template.body.joint_names else template.faces
     return np.unique(faces)
 
 

@@ -64,7 +64,7 @@ class Rig:
 
     @property
     def expression_size(self) -> int:
-        return self.template.expression_basis.shape[2]
+        return self.template.body.num_expressions
 
     def motion(self, params: BodyParams, *, frame: int | None = None) -> Motion:
         """What one pose does to the template.
@@ -83,7 +83,7 @@ class Rig:
             transforms = posed.posed_from_rest[0]
             blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
         rest = self.template.vertices.astype(np.float32)
-        rest[: self.template.body_vertex_count] = posed.rest_vertices[0]
+        rest[: self.template.body.vertex_count] = posed.rest_vertices[0]
         expression = np.zeros(self.expression_size)
         expression[: params.expression.shape[1]] = params.expression[0]
         return Motion(

@@ -121,7 +121,7 @@ class Animate:
 
         # Layouts that turn the body about the origin need its root joint. The identity is in the template already:
         # without shape directions the betas of the file do not move that joint a second time.
-        body = template.body_model
+        body = template.body
         params = load_params(self.params, body=replace(body, shapedirs=np.zeros_like(body.shapedirs)))
         count = len(params)
         chosen = range(count)[self.start : self.stop : self.step]

@@ -71,4 +71,4 @@ class CompensateStage(ModelStage):
 
     def _fitting(self, trainer: Trainer) -> BlendShapeConfig:
         """The blend shapes of the template's body."""
-        return replace(self.shapes, expression_size=trainer.scene.template.expression_basis.shape[2])
+        return replace(self.shapes, expression_size=trainer.scene.template.body.num_expressions)

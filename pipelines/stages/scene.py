@@ -278,9 +278,9 @@ def _with_masks(capture: Capture) -> Capture:
 
 def _compare_shapes(template: Template, params: Sequence[BodyParams]) -> None:
     """Refuse parameters of another person: their shape coefficients against those that the template is made of."""
-    size = template.shape_basis.shape[2]
+    size = template.body.num_betas
     betas = np.mean([_padded(p.betas[0], size) for p in params], axis=0)
-    moved = template.shape_basis @ (betas - _padded(template.betas, size))
+    moved = template.body.shapedirs @ (betas - _padded(template.betas, size))
     distance = float(np.linalg.norm(moved, axis=-1).mean())
     if distance > OTHER_PERSON:
         raise InputError(

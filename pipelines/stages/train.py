@@ -105,7 +105,7 @@ def train(
         InputError: an earlier stage is missing or unfinished or saw what is held out, a checkpoint is of another
             training, memory or disk ran out, or training diverged; checkpoints and finished stages stay.
     """
-    if "compensate" in steps and not scene.template.expression_basis.shape[2]:
+    if "compensate" in steps and not scene.template.body.num_expressions:
         raise InputError(
             "template",
             expected="a body with expressions, which drive the head's blend shapes",

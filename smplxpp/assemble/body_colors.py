@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -12,11 +13,11 @@ from smplxpp.core.mesh import TriangleMesh
 def body_colors_from_scan(
     posed_body: TriangleMesh,
     scan: TriangleMesh,
-    scan_colors: np.ndarray,
-    skin_faces: np.ndarray,
+    scan_colors: UInt8[np.ndarray, "N 3"],
+    skin_faces: Bool[np.ndarray, " M"],
     *,
     max_distance: float = 0.015,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[UInt8[np.ndarray, "V 3"], Int64[np.ndarray, " V"]]:
     """Colour every body vertex that the scan shows bare; the others take the median of the skin seen.
 
     A vertex is shown where its closest point on the scan's skin is near and faces the same way.

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 
 import numpy as np
+from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
 from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
@@ -30,14 +31,14 @@ class CanonicalPart:
         weights: of the N vertices.
         label: id of `smplxpp.core.labels`.
         vertex_colors: (N, 3) uint8 sRGB.
-        scan_index: (N,) vertex of the scan that each vertex comes from, -1 for none.
+        scan_index: the scan's vertex that each comes from, -1 for none; `assemble_template` checks that S = N.
     """
 
     mesh: TriangleMesh
     weights: SkinWeights
     label: int
-    vertex_colors: np.ndarray
-    scan_index: np.ndarray
+    vertex_colors: UInt8[np.ndarray, "N 3"]
+    scan_index: Int[np.ndarray, " S"]
 
 
 @dataclass(frozen=True)
@@ -218,6 +219,7 @@ def _template(
     scan_index = [np.full(count, -1), *(part.scan_index for part in parts.values())]
     nearest = cKDTree(whole.vertices[:count]).query(whole.vertices[count:])[1]
     return Template(
+        body=body,
         vertices=whole.vertices,
         faces=whole.faces,
         vertex_labels=np.repeat(labels, sizes),
@@ -225,20 +227,7 @@ def _template(
         part_names=(BODY_PART, *parts),
         vertex_colors=np.concatenate(colors),
         weights=_stack([SkinWeights.from_dense(body.weights), *(part.weights for part in parts.values())]),
-        joint_regressor=body.joint_regressor,
-        parents=body.parents,
-        joint_names=body.joint_names,
         betas=betas,
-        shape_basis=body.shapedirs,
-        expression_basis=body.exprdirs,
-        pose_basis=body.posedirs,
-        left_hand_components=body.left_hand_components,
-        right_hand_components=body.right_hand_components,
-        left_hand_mean=body.left_hand_mean,
-        right_hand_mean=body.right_hand_mean,
-        body_labels=body.part_labels,
-        body_label_names=body.part_label_names,
-        expression_names=body.expression_names,
         body_index=np.concatenate([np.arange(count), nearest]),
         scan_index=np.concatenate(scan_index),
         metadata={"body": body.name, "smplxpp": metadata.version("smplxpp")},

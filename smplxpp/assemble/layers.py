@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 from smplxpp.core.labels import HAIR, LOWER, OUTER, SHOE, UPPER
 from smplxpp.core.mesh import TriangleMesh
@@ -38,7 +39,9 @@ class Obstacle:
         used = mesh.vertices[np.unique(mesh.faces)]
         self._low, self._high = used.min(axis=0), used.max(axis=0)
 
-    def distance(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distance(
+        self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
         """Signed distance (N,) of (N, 3) points with (N, 3) outward unit normals, and its (N, 3) gradient.
 
         The answer is infinite further than `max_depth` from the bounding box, and where the question has none: beside
@@ -54,8 +57,8 @@ class Obstacle:
         distance[near], gradient[near] = found.distance, found.gradient
         return distance, gradient
 
-    def lower_bound(self, points: np.ndarray) -> np.ndarray:
-        """(N,) metres: a point that moves less than this above zero cannot come inside; infinite far behind a garment.
+    def lower_bound(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """The way, in metres, that each point above zero can go without coming inside; infinite far behind a garment.
 
         Unlike `distance` it answers beside borders too, where a small move may give the question an answer.
         """
@@ -65,15 +68,17 @@ class Obstacle:
         return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
     def _box_distance(self, points: np.ndarray) -> np.ndarray:
-        """(N,) metres to the bounding box, 0 inside: far points need no search."""
+        """Metres to the bounding box, 0 inside: far points need no search."""
         squared = np.zeros(len(points))
         for axis in range(3):
             x = points[:, axis]
             squared += np.maximum(np.maximum(self._low[axis] - x, x - self._high[axis]), 0.0) ** 2
         return np.sqrt(squared)
 
-    def clearance(self, points: np.ndarray, normals: np.ndarray, wanted: float) -> np.ndarray:
-        """(N,) metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
+    def clearance(
+        self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"], wanted: float
+    ) -> Float64[np.ndarray, " N"]:
+        """The metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
 
         Parts cut from one scan share a seam; a gap there would have to tear the cloth.
         """
@@ -115,7 +120,7 @@ def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
     )
 
 
-def face_centers(mesh: TriangleMesh, values: np.ndarray) -> np.ndarray:
-    """(M, 3) mean over each face's corners of (N, 3) values at the vertices."""
+def face_centers(mesh: TriangleMesh, values: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
+    """The mean over each face's corners of values at the vertices."""
     a, b, c = mesh.faces.T
     return (values[a] + values[b] + values[c]) / 3.0

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from smplxpp.assemble.layers import Obstacle, face_centers
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_at_least, require_between
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,10 @@ class PushConfig:
     max_depth: float = 0.015
 
     def __post_init__(self) -> None:
-        good = 1e-4 <= self.clearance <= self.max_depth < np.inf and 0 <= self.damping <= 1 and self.iterations >= 0
-        if not good:
-            raise InputError(
-                "push configuration",
-                expected="1e-4 <= clearance <= max_depth, damping in [0, 1], iterations >= 0",
-                received=str(self),
-            )
+        require_at_least("push configuration: max_depth in metres", self.max_depth, 1e-4)
+        require_between("push configuration: clearance in metres", self.clearance, 1e-4, self.max_depth)
+        require_between("push configuration: damping", self.damping, 0.0, 1.0)
+        require_at_least("push configuration: iterations", self.iterations, 0)
 
 
 # Projections alone, after the smoothing, until nothing is left inside.
@@ -52,7 +50,9 @@ _CENTER_SHARE = 0.5
 _TOLERANCE = 1e-5
 
 
-def push_out(mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None) -> np.ndarray:
+def push_out(
+    mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None
+) -> Float64[np.ndarray, "N 3"]:
     """New vertex positions of an outer layer, out of all obstacles.
 
     Solves an obstacle problem by projected Jacobi steps: the displacement d of each vertex goes to
@@ -97,8 +97,8 @@ def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_
     return best
 
 
-def turned_faces(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
-    """(M,) bool, faces whose normal has turned by more than 90 degrees on the new (N, 3) vertices."""
+def turned_faces(mesh: TriangleMesh, vertices: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " M"]:
+    """The faces whose normal has turned by more than 90 degrees on the new vertices."""
     return np.einsum("ij,ij->i", mesh.face_cross, mesh.with_vertices(vertices).face_cross) < 0
 
 

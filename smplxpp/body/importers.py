@@ -66,8 +66,10 @@ def load_params(
     absent: list[str] = []
     for file in files:
         frames = _read_content(_content(file), name, person, f"file {file}")
-        parts += [frames] if frames else []
-        absent += [] if frames else [file.name]
+        if frames:
+            parts.append(frames)
+        else:
+            absent.append(file.name)
     if not parts:
         raise InputError(f"{path}", expected=f"frames of person {person}", received="none")
     if absent:
@@ -93,14 +95,18 @@ def params_from_content(
         InputError: as `load_params`; more than one person.
     """
     name = recognise(content, source=source) if layout == "auto" else layout
-    return _joined([_read_content(content, name, None, source)], body, "y")
+    frames = _read_content(content, name, None, source)
+    if frames is None:
+        raise InputError(source, expected="frames of a person", received="none")
+    return _joined([frames], body, "y")
 
 
 def _joined(parts: list[Frames], body: BodyModel | None, up: str) -> BodyParams:
     params = BodyParams.concatenate([part.params for part in parts])
     outer = [part.outer for part in parts if part.outer]
-    if outer or up == "z":
-        body = body or load_body()
+    if not outer and up != "z":
+        return params
+    body = body or load_body()
     if outer:
         params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
     if up == "z":

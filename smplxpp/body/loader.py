@@ -93,26 +93,30 @@ class _Builder:
         names = self._names("joint_names", joint_count) or JOINT_NAMES[joint_count]
         weights = self._normalised(weights)
         labels, label_names = self._part_labels(weights, names)
-        arrays = {
-            "v_template": self._array("v_template", (vertex_count, 3)),
-            "faces": self._faces(vertex_count),
-            "shapedirs": self._first(shapedirs, num_betas, "betas"),
-            "exprdirs": self._first(exprdirs, num_expressions, "expressions"),
-            "posedirs": self._posedirs(vertex_count, joint_count),
-            "joint_regressor": self._array("J_regressor", (joint_count, vertex_count)),
-            "parents": self._parents(joint_count),
-            "weights": weights,
-            "part_labels": labels,
-        }
-        for side in ("left", "right"):
-            arrays[f"{side}_hand_components"] = self._optional(f"hands_components{side[0]}", (None, HAND_WIDTH))
-            arrays[f"{side}_hand_mean"] = self._optional(f"hands_mean{side[0]}", (HAND_WIDTH,))
-        for value in arrays.values():
-            if value is not None:
+        kept_expressions = self._first(exprdirs, num_expressions, "expressions")
+        model = BodyModel(
+            name=self.path.stem,
+            v_template=self._array("v_template", (vertex_count, 3)),
+            faces=self._faces(vertex_count),
+            shapedirs=self._first(shapedirs, num_betas, "betas"),
+            exprdirs=kept_expressions,
+            posedirs=self._posedirs(vertex_count, joint_count),
+            joint_regressor=self._array("J_regressor", (joint_count, vertex_count)),
+            parents=self._parents(joint_count),
+            joint_names=names,
+            weights=weights,
+            left_hand_components=self._optional("hands_componentsl", (None, HAND_WIDTH)),
+            right_hand_components=self._optional("hands_componentsr", (None, HAND_WIDTH)),
+            left_hand_mean=self._optional("hands_meanl", (HAND_WIDTH,)),
+            right_hand_mean=self._optional("hands_meanr", (HAND_WIDTH,)),
+            part_labels=labels,
+            part_label_names=label_names,
+            expression_names=(self._names("expr_names", exprdirs.shape[2]) or ())[: kept_expressions.shape[2]],
+        )
+        for value in vars(model).values():
+            if isinstance(value, np.ndarray):
                 value.setflags(write=False)
-        expressions = (self._names("expr_names", exprdirs.shape[2]) or ())[: arrays["exprdirs"].shape[2]]
-        texts = {"joint_names": names, "part_label_names": label_names, "expression_names": expressions}
-        return BodyModel(name=self.path.stem, **texts, **arrays)
+        return model
 
     def _error(self, key: str, expected: str, received: str, remedy: str = "") -> InputError:
         return InputError(f"body file {self.path}: {key}", expected=expected, received=received, remedy=remedy)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float64, Int64
 
 from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import array_namespace, matrix_from_rotvec
+from smplxpp.core.rotations import Array, array_namespace, matrix_from_rotvec
 from smplxpp.skinning.linear_blend import forward_kinematics, skin
 
 _WIDTHS = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
@@ -27,26 +27,26 @@ class PosedBody:
     pose correctives are in the rest vertices.
 
     Attributes:
-        vertices: (T, V, 3) metres.
-        joints: (T, J, 3) posed joints.
-        rest_vertices: (T, V, 3) with shape, expression and pose correctives.
-        rest_joints: (T, J, 3) joints of the shaped body, before posing.
-        posed_from_rest: (T, J, 4, 4).
-        pose_offsets: (T, V, 3) the pose correctives within `rest_vertices`; None where the model has none.
+        vertices: posed, metres.
+        joints: posed joints.
+        rest_vertices: with shape, expression and pose correctives.
+        rest_joints: joints of the shaped body, before posing.
+        posed_from_rest: transforms of the joints.
+        pose_offsets: the pose correctives within `rest_vertices`; None where the model has none.
     """
 
-    vertices: Any
-    joints: Any
-    rest_vertices: Any
-    rest_joints: Any
-    posed_from_rest: Any
-    pose_offsets: Any | None
+    vertices: Float[Array, "*T V 3"]
+    joints: Float[Array, "*T J 3"]
+    rest_vertices: Float[Array, "*T V 3"]
+    rest_joints: Float[Array, "*T J 3"]
+    posed_from_rest: Float[Array, "*T J 4 4"]
+    pose_offsets: Float[Array, "*T V 3"] | None
 
     def __len__(self) -> int:
         return self.vertices.shape[0]
 
     def frame(self, index: int) -> PosedBody:
-        """One frame, its arrays without the leading axis."""
+        """Return one frame, its arrays without the leading axis."""
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -59,37 +59,37 @@ class BodyModel:
 
     Attributes:
         name: of the file.
-        v_template: (V, 3) mean shape in the rest pose.
-        faces: (F, 3) int64.
-        shapedirs: (V, 3, B) metres a unit of beta.
-        exprdirs: (V, 3, E) metres a unit of expression; E = 0 where the model has none.
-        posedirs: (V, 3, P) pose correctives, P = 9 (J - 1); None where absent or zero.
-        joint_regressor: (J, V).
-        parents: (J,) int64, -1 at the root.
+        v_template: mean shape in the rest pose.
+        faces: corners of the triangles.
+        shapedirs: metres a unit of beta.
+        exprdirs: metres a unit of expression; E = 0 where the model has none.
+        posedirs: pose correctives, P = 9 (J - 1); None where absent or zero.
+        joint_regressor: rest joints of the vertices.
+        parents: -1 at the root.
         joint_names: J names.
-        weights: (V, J), rows sum to 1.
-        left_hand_components, right_hand_components: (K, 45) rows are principal components; None where absent.
-        left_hand_mean, right_hand_mean: (45,) axis-angle; None where absent.
-        part_labels: (V,) int64 indices into `part_label_names`: the file's own labels, else the joint of most weight.
+        weights: rows sum to 1.
+        left_hand_components, right_hand_components: rows are principal components; None where absent.
+        left_hand_mean, right_hand_mean: axis-angle; None where absent.
+        part_labels: indices into `part_label_names`: the file's own labels, else the joint of most weight.
         part_label_names: names of the parts.
         expression_names: E names; numbered where the file gives none.
     """
 
     name: str
-    v_template: np.ndarray
-    faces: np.ndarray
-    shapedirs: np.ndarray
-    exprdirs: np.ndarray
-    posedirs: np.ndarray | None
-    joint_regressor: np.ndarray
-    parents: np.ndarray
+    v_template: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    shapedirs: Float64[np.ndarray, "V 3 B"]
+    exprdirs: Float64[np.ndarray, "V 3 E"]
+    posedirs: Float64[np.ndarray, "V 3 P"] | None
+    joint_regressor: Float64[np.ndarray, "J V"]
+    parents: Int64[np.ndarray, " J"]
     joint_names: tuple[str, ...]
-    weights: np.ndarray
-    left_hand_components: np.ndarray | None
-    right_hand_components: np.ndarray | None
-    left_hand_mean: np.ndarray | None
-    right_hand_mean: np.ndarray | None
-    part_labels: np.ndarray
+    weights: Float64[np.ndarray, "V J"]
+    left_hand_components: Float64[np.ndarray, "K 45"] | None
+    right_hand_components: Float64[np.ndarray, "L 45"] | None
+    left_hand_mean: Float64[np.ndarray, " 45"] | None
+    right_hand_mean: Float64[np.ndarray, " 45"] | None
+    part_labels: Int64[np.ndarray, " V"]
     part_label_names: tuple[str, ...]
     expression_names: tuple[str, ...] = ()
     # Tensors of the arrays above, by (name, dtype, device).
@@ -99,6 +99,41 @@ class BodyModel:
         if len(self.expression_names) != self.num_expressions:
             numbered = tuple(f"expression_{k:02d}" for k in range(self.num_expressions))
             object.__setattr__(self, "expression_names", numbered)
+        self._check()
+
+    def _check(self) -> None:
+        V, J = self.joint_regressor.shape[-1], len(self.parents)
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "v_template": (V, 3),
+            "faces": (None, 3),
+            "shapedirs": (V, 3, None),
+            "exprdirs": (V, 3, None),
+            "posedirs": (V, 3, 9 * (J - 1)),
+            "joint_regressor": (J, V),
+            "parents": (J,),
+            "weights": (V, J),
+            "left_hand_components": (None, HAND_WIDTH),
+            "right_hand_components": (None, HAND_WIDTH),
+            "left_hand_mean": (HAND_WIDTH,),
+            "right_hand_mean": (HAND_WIDTH,),
+            "part_labels": (V,),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if len(value.shape) != len(shape) or any(
+                b not in (None, a) for a, b in zip(value.shape, shape, strict=True)
+            ):
+                raise self._unfit(name, f"shape {shape}", f"shape {value.shape}")
+        if len(self.joint_names) != J:
+            raise self._unfit("joint_names", f"{J} names", f"{len(self.joint_names)}")
+        labels, names = self.part_labels, len(self.part_label_names)
+        if labels.size and (labels.min() < 0 or labels.max() >= names):
+            raise self._unfit("part_labels", f"indices in [0, {names})", "others")
+
+    def _unfit(self, name: str, expected: str, received: str) -> InputError:
+        return InputError(f"body model {self.name!r}: {name}", expected=expected, received=received)
 
     @property
     def vertex_count(self) -> int:
@@ -116,11 +151,11 @@ class BodyModel:
     def num_expressions(self) -> int:
         return self.exprdirs.shape[2]
 
-    def mesh(self, vertices: np.ndarray | None = None) -> TriangleMesh:
+    def mesh(self, vertices: Float[np.ndarray, "V 3"] | None = None) -> TriangleMesh:
         """The body's faces on the given (V, 3) vertices, or on the mean shape."""
         return TriangleMesh(self.v_template if vertices is None else vertices, self.faces)
 
-    def forward(self, params: BodyParams | Mapping[str, Any], *, flat_hand_mean: bool | None = None) -> PosedBody:
+    def forward(self, params: BodyParams | Mapping[str, Array], *, flat_hand_mean: bool | None = None) -> PosedBody:
         """Pose the body.
 
         `v = v_template + shapedirs betas + exprdirs expression`, `J = joint_regressor v`,
@@ -153,19 +188,19 @@ class BodyModel:
         vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
         return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
 
-    def rest_joints(self, params: BodyParams | Mapping[str, Any]) -> Any:
-        """(T, J, 3) joints of the shaped body before posing."""
+    def rest_joints(self, params: BodyParams | Mapping[str, Array]) -> Float[Array, "T J 3"]:
+        """The joints of the shaped body before posing, metres."""
         return self._shaped(_checked_arrays(params))[1]
 
-    def _shaped(self, arrays: Mapping[str, Any]) -> tuple[Any, Any]:
+    def _shaped(self, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
         betas, expression = arrays["betas"], arrays["expression"]
         vertices = self._constant("v_template", betas) + self._blend("shapedirs", betas, "betas")
         if self.num_expressions:
             vertices = vertices + self._blend("exprdirs", expression, "expression")
         return vertices, self._constant("joint_regressor", vertices) @ vertices
 
-    def _blend(self, basis_name: str, coefficients: Any, subject: str) -> Any:
-        """(T, n) coefficients of the first n directions -> (T, V, 3) offsets."""
+    def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
+        """Offsets (T, V, 3) of the first n directions by (T, n) coefficients."""
         basis = self._constant(basis_name, coefficients)
         used, known = coefficients.shape[-1], basis.shape[-1]
         if used > known:
@@ -178,15 +213,15 @@ class BodyModel:
         flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
         return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
 
-    def _pose_offsets(self, rotations: Any) -> Any | None:
+    def _pose_offsets(self, rotations: Array) -> Array | None:
         if self.posedirs is None:
             return None
         identity = matrix_from_rotvec(_zeros(rotations, (3,)))  # of the rotations' kind, type and device
         feature = rotations[:, 1:] - identity
         return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
 
-    def _axis_angles(self, arrays: Mapping[str, Any], flat_hand_mean: bool) -> Any:
-        """(T, J, 3) axis-angle vectors of all joints."""
+    def _axis_angles(self, arrays: Mapping[str, Array], flat_hand_mean: bool) -> Array:
+        """The axis-angle vectors (T, J, 3) of all joints."""
         blocks = []
         for name in POSE_NAMES[self.joint_count]:
             value = arrays[name]
@@ -197,7 +232,7 @@ class BodyModel:
             full = array_namespace(full).concatenate([full, _zeros(full, (len(full), missing, 3))], 1)
         return full
 
-    def _full_hand(self, name: str, value: Any, flat_hand_mean: bool) -> Any:
+    def _full_hand(self, name: str, value: Array, flat_hand_mean: bool) -> Array:
         side = name.removesuffix("_pose")
         width = value.shape[-1]
         if width < HAND_WIDTH:
@@ -214,7 +249,7 @@ class BodyModel:
         mean = None if flat_hand_mean else self._constant(f"{side}_mean", value)
         return value if mean is None else value + mean
 
-    def _constant(self, name: str, like: Any) -> Any:
+    def _constant(self, name: str, like: Array) -> Array:
         """A field as an array of the kind, type and device of `like`."""
         value = getattr(self, name)
         if value is None or isinstance(like, np.ndarray):
@@ -228,7 +263,7 @@ class BodyModel:
         return self._tensors[key]
 
 
-def _checked_arrays(params: BodyParams | Mapping[str, Any]) -> dict[str, Any]:
+def _checked_arrays(params: BodyParams | Mapping[str, Array]) -> dict[str, Array]:
     """Every array by name with T rows, missing ones zero."""
     if isinstance(params, BodyParams):
         return {name: getattr(params, name) for name in ARRAY_NAMES}
@@ -255,5 +290,5 @@ def _checked_arrays(params: BodyParams | Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _zeros(like: Any, shape: tuple[int, ...]) -> Any:
+def _zeros(like: Array, shape: tuple[int, ...]) -> Array:
     return np.zeros(shape) if isinstance(like, np.ndarray) else like.new_zeros(shape)

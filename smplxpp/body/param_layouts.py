@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
@@ -31,7 +32,7 @@ class Frames:
     """
 
     params: BodyParams
-    outer: tuple[np.ndarray, np.ndarray] | None = None
+    outer: tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]] | None = None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.capture import Capture
+from smplxpp.capture.matting import MattingConfig, MattingModel, write_mattes
 from smplxpp.capture.problems import find_problems
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.reference import ReferenceFrame, find_reference
@@ -11,6 +12,8 @@ from smplxpp.capture.splits import Splits
 __all__ = [
     "FORMATS",
     "Capture",
+    "MattingConfig",
+    "MattingModel",
     "Problem",
     "ReferenceFrame",
     "Splits",
@@ -19,4 +22,5 @@ __all__ = [
     "find_reference",
     "open_capture",
     "read_cameras",
+    "write_mattes",
 ]

@@ -59,4 +59,4 @@ class ArrayCache:
         return {"max_bytes": self.max_bytes}
 
     def __setstate__(self, state: dict[str, int]) -> None:
-        self.__init__(state["max_bytes"])
+        vars(self).update(vars(ArrayCache(state["max_bytes"])))

@@ -38,7 +38,7 @@ def read_cameras(path: str | Path) -> list[Camera]:
 
 
 def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
-    """As `read_cameras`, with the distortion of each camera (`dist` in OpenCV's order); None: a pinhole."""
+    """Read what `read_cameras` reads, with each camera's distortion (`dist` in OpenCV's order); None: a pinhole."""
     path = Path(path)
     if not path.is_file():
         raise InputError("camera file", expected="an existing file", received=str(path))
@@ -69,7 +69,7 @@ def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
 
 
 def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
-    lenses = []
+    lenses: list[tuple[Camera, Distortion | None]] = []
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
             width, height = int(row["w"]), int(row["h"])

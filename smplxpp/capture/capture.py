@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float32, UInt8
 
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.recording import KINDS, Problem, Recording
@@ -18,6 +19,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +86,30 @@ class Capture:
 
     def file(self, camera: str, frame: int, kind: str = "image") -> Path | None:
         """The file that a view is read from, None where there is none. Kinds: image, mask, label, normal."""
-        if kind not in KINDS:
-            raise InputError("kind", expected=f"one of {', '.join(KINDS)}", received=str(kind))
+        require_choice("kind", kind, KINDS)
         self._full_camera(camera)
         if {(camera, frame), (None, frame), (camera, None)} & self.excluded:
             return None
         series = self.recording.series(kind, camera)
         return None if series is None else series.path(frame)
 
-    def presence(self, kind: str = "image") -> np.ndarray:
-        """(C, F) bool: which cameras have a file of which frame, known without opening any."""
+    def required_file(self, camera: str, frame: int) -> Path:
+        """The image of a view.
+
+        Raises:
+            InputError: no such camera, or no image.
+        """
+        path = self.file(camera, frame)
+        if path is None:
+            raise InputError(
+                f"image of camera {camera}, frame {frame}",
+                expected="an image that was there on opening (see `presence`)",
+                received="none",
+            )
+        return path
+
+    def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
+        """Tell which cameras have a file of which frame, without opening any."""
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
         numbers = np.array(self.frames, dtype=np.int64)
         for row, camera in enumerate(self.recording.cameras):
@@ -101,13 +117,13 @@ class Capture:
             if series is not None and (camera, None) not in self.excluded:
                 table[row] = series.has(numbers)
         rows, columns = {c: i for i, c in enumerate(self.recording.cameras)}, {f: i for i, f in enumerate(self.frames)}
-        for camera, frame in self.excluded:
-            if camera in rows and frame in columns:
-                table[rows[camera], columns[frame]] = False
+        for without, when in self.excluded:
+            if without in rows and when in columns:
+                table[rows[without], columns[when]] = False
         return table
 
     def views(self, cameras: Iterable[str] | None = None, frames: Iterable[int] | None = None) -> list[tuple[str, int]]:
-        """(camera, frame) of every image there is, among the given cameras and frames (None: all), frame by frame."""
+        """The (camera, frame) of every image, among the given cameras and frames (None: all), frame by frame."""
         names = list(self.recording.cameras)
         table = self.presence()
         wanted_cameras = set(names if cameras is None else cameras)
@@ -118,17 +134,17 @@ class Capture:
         rows = [k for k, name in enumerate(names) if name in wanted_cameras]
         return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
 
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB as recorded, read-only.
+    def image(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
+        """The image of a view, sRGB as recorded, read-only.
 
         Raises:
             InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
         """
-        path = self._required(camera, frame)
+        path = self.required_file(camera, frame)
         return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
-    def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """(H, W) uint8 opacity of the person, 255 inside; None where there is no mask. Read-only.
+    def mask(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
+        """The opacity of the person, 255 inside; None where there is no mask. Read-only.
 
         Raises:
             InputError: no such camera, a damaged file, or one of another size.
@@ -138,21 +154,23 @@ class Capture:
             return None
         return self._cached("mask", camera, frame, lambda reader: (reader.alpha(path),))[0]
 
-    def labels(self, camera: str, frame: int) -> np.ndarray | None:
-        """(H, W) uint8 numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
+    def labels(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
+        """Numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
         path = self.file(camera, frame, "label")
         if path is None:
             return None
         return self._cached("label", camera, frame, lambda reader: (reader.labels(path),))[0]
 
-    def normals(self, camera: str, frame: int) -> np.ndarray | None:
-        """(H, W, 3) float32 unit normals in the world, 0 on the background; None where there is no map."""
+    def normals(self, camera: str, frame: int) -> Float32[np.ndarray, "H W 3"] | None:
+        """Unit normals in the world, 0 on the background; None where there is no map."""
         path = self.file(camera, frame, "normal")
         if path is None:
             return None
         return self._cached("normal", camera, frame, lambda reader: (reader.normals(path),))[0]
 
-    def composited(self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    def composited(
+        self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Float32[np.ndarray, "H W 3"]:
         """The person on a plain background: (H, W, 3) float32 sRGB in [0, 1].
 
         `C = F + (1 - a) B` with a the mask and F the image times a, mixed in sRGB. For photographs F is formed before
@@ -172,13 +190,13 @@ class Capture:
             np.minimum(out, 1.0, out=out)
         return out
 
-    def foreground(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def foreground(self, camera: str, frame: int) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
         """The person alone: (H, W, 3) uint8 colour times opacity, and (H, W) uint8 opacity; both read-only.
 
         Raises:
             InputError: as `composited`.
         """
-        image = self._required(camera, frame)
+        image = self.required_file(camera, frame)
         mask = self.file(camera, frame, "mask")
         if mask is None:
             raise InputError(
@@ -187,7 +205,8 @@ class Capture:
                 received="none",
                 remedy="give a folder of masks (open_capture(..., masks=DIR)), or make them with your matting model",
             )
-        return self._cached("foreground", camera, frame, lambda reader: reader.foreground(image, mask))
+        colour, opacity = self._cached("foreground", camera, frame, lambda reader: reader.foreground(image, mask))
+        return colour, opacity
 
     def params(self, frame: int) -> BodyParams | None:
         """Body parameters of one frame, None where there are none.
@@ -216,7 +235,7 @@ class Capture:
         return replace(self, windows={**self.windows, **cut})
 
     def without(self, problems: Iterable[Problem]) -> Capture:
-        """Without the views, frames and cameras that the problems name."""
+        """Return the capture without the views, frames and cameras that the problems name."""
         excluded = self.excluded | {(p.camera, p.frame) for p in problems if (p.camera, p.frame) != (None, None)}
         dropped_cameras = {camera for camera, frame in excluded if frame is None}
         dropped_frames = {frame for camera, frame in excluded if camera is None}
@@ -242,16 +261,6 @@ class Capture:
                 received=str(name),
             )
         return self.recording.cameras[name]
-
-    def _required(self, camera: str, frame: int) -> Path:
-        path = self.file(camera, frame)
-        if path is None:
-            raise InputError(
-                f"image of camera {camera}, frame {frame}",
-                expected="an image that was there on opening (see `presence`)",
-                received="none",
-            )
-        return path
 
     def _cached(
         self, kind: str, camera: str, frame: int, make: Callable[[ViewReader], tuple[np.ndarray, ...]]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.native import native_library
@@ -29,7 +30,7 @@ class Distortion:
 
     @staticmethod
     def from_opencv(coefficients: Sequence[float], *, subject: str) -> Distortion | None:
-        """From OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero.
+        """Read OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero.
 
         Raises:
             InputError: another number of coefficients (thin prism and tilt: any beyond the eighth that is not zero).
@@ -49,8 +50,8 @@ class Distortion:
         k1, k2, p1, p2, k3, k4, k5, k6 = full.tolist()
         return Distortion((k1, k2, k3, k4, k5, k6), (p1, p2))
 
-    def distort(self, xy: np.ndarray) -> np.ndarray:
-        """(N, 2) points on the plane z = 1 of the pinhole camera -> (N, 2) where the lens puts them."""
+    def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Where the lens puts points on the plane z = 1 of the pinhole camera."""
         x, y = np.asarray(xy, dtype=np.float64).T
         (k1, k2, k3, k4, k5, k6), (p1, p2) = self.radial, self.tangential
         r2 = x * x + y * y
@@ -61,14 +62,14 @@ class Distortion:
 
 
 def undistort(
-    image: np.ndarray,
+    image: UInt8[np.ndarray, "H W *C"],
     distortion: Distortion,
     *,
-    source_K: np.ndarray,
-    target_K: np.ndarray,
+    source_K: Float[np.ndarray, "3 3"],
+    target_K: Float[np.ndarray, "3 3"],
     size: tuple[int, int],
     nearest: bool = False,
-) -> np.ndarray:
+) -> UInt8[np.ndarray, "h w *C"]:
     """The image that a pinhole camera would have taken; bilinear, black where the source does not reach.
 
     Args:

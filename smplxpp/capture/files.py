@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Int, Int64, Shaped
+
+from smplxpp.core.errors import InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -25,12 +28,12 @@ class FileSeries:
     """
 
     folder: Path
-    numbers: np.ndarray
-    names: np.ndarray
+    numbers: Int64[np.ndarray, " F"]
+    names: Shaped[np.ndarray, " F"]
 
     @staticmethod
     def from_names(folder: Path, names: Mapping[int, str]) -> FileSeries:
-        """From the file name of each frame."""
+        """Make a series of the file name of each frame."""
         numbers = np.array(sorted(names), dtype=np.int64)
         encoded = np.array([os.fsencode(names[int(n)]) for n in numbers], dtype=bytes)
         return FileSeries(folder, numbers, encoded)
@@ -41,7 +44,8 @@ class FileSeries:
 
         Of two files with one number the first in alphabetical order counts.
         """
-        compiled, found = re.compile(pattern), {}
+        compiled = re.compile(pattern)
+        found: dict[int, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
                 for name in sorted(entry.name for entry in entries):
@@ -59,11 +63,22 @@ class FileSeries:
             return None
         return self.folder / os.fsdecode(bytes(self.names[index]))
 
-    def has(self, frames: np.ndarray) -> np.ndarray:
-        """(N,) bool: which of the frames have a file."""
+    def required(self, frame: int) -> Path:
+        """The file of a frame that is among `numbers`.
+
+        Raises:
+            InputError: there is none.
+        """
+        path = self.path(frame)
+        if path is None:
+            raise InputError(f"frame {frame}", expected=f"a file in {self.folder}", received="none")
+        return path
+
+    def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+        """Tell which of the frames have a file."""
         return np.isin(frames, self.numbers)
 
-    def only(self, keep: np.ndarray) -> FileSeries:
+    def only(self, keep: Bool[np.ndarray, " F"]) -> FileSeries:
         """The files selected by a (F,) bool array."""
         return FileSeries(self.folder, self.numbers[keep], self.names[keep])
 

@@ -35,7 +35,7 @@ def with_masks(recording: Recording, folder: Path) -> Recording:
             masks[camera] = FileSeries.from_names(place, found)
     if not masks:
         first = next(iter(images.values()), None)
-        example = "none" if first is None else first.path(int(first.numbers[0])).stem
+        example = "none" if first is None else first.required(int(first.numbers[0])).stem
         raise InputError(
             f"folder of masks {folder}",
             expected=f"mattes named as the images, such as {next(iter(images), 'CAM')}/{example}.png",
@@ -45,7 +45,7 @@ def with_masks(recording: Recording, folder: Path) -> Recording:
 
 
 def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> dict[int, str]:
-    by_stem = {images.path(int(number)).stem: int(number) for number in images.numbers}
+    by_stem = {images.required(int(number)).stem: int(number) for number in images.numbers}
     known = set(by_stem.values())
     found: dict[int, str] = {}
     for path in sorted(folder.iterdir()):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from smplxpp.capture.capture import Capture
 from smplxpp.core.atomic import atomic_path
@@ -70,13 +71,15 @@ class MattingModel:
         height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in entry.shape[2:])
         self._size = (width, height)
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB -> (H, W) uint8 opacity."""
+    def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
+        """Return the opacity of the person in an sRGB image."""
         from PIL import Image
         from PIL.Image import Resampling
 
         small = np.asarray(Image.fromarray(image).resize(self._size, Resampling.BILINEAR), dtype=np.float32) / 255.0
-        tensor = ((small - np.float32(self.config.mean)) / np.float32(self.config.std)).transpose(2, 0, 1)[None]
+        tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
+            2, 0, 1
+        )[None]
         outputs = self._session.run(None, {self._name: tensor.astype(self._dtype)})
         matte = self._opacity(outputs)
         back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
@@ -122,7 +125,7 @@ def write_mattes(
     for camera, frame in capture.views() if views is None else views:
         target = Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
         if not target.is_file():
-            image = np.asarray(read_color(capture.file(camera, frame)))
+            image = np.asarray(read_color(capture.required_file(camera, frame)))
             with atomic_path(target) as temporary:
                 Image.fromarray(model(image)).save(temporary, format="PNG")
         yield target

@@ -17,7 +17,7 @@ from smplxpp.core.safe_pickle import safe_npz
 
 @dataclass(frozen=True, eq=False)
 class MeshFiles:
-    """One mesh file a frame."""
+    """A mesh file for each frame."""
 
     files: FileSeries
 

@@ -7,8 +7,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
-from smplxpp.body import BodyModel, load_params, params_from_content
+from smplxpp.body import BodyModel, LayoutName, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
@@ -29,14 +30,14 @@ class StackedParams:
     """
 
     path: Path
-    layout: str = "auto"
+    layout: LayoutName = "auto"
     body: BodyModel | None = None
 
     @cached_property
     def _rows(self) -> tuple[BodyParams, np.ndarray]:
         """The good rows, and for every row its index among them (-1: bad)."""
         arrays = safe_npz(self.path)
-        matrices = {name: arrays[name] for name in _STACKED if np.ndim(arrays.get(name)) == 2}
+        matrices = {name: arrays[name] for name in _STACKED if name in arrays and np.ndim(arrays[name]) == 2}
         rows = max(map(len, matrices.values()), default=1)
         stacked = {name: array for name, array in matrices.items() if len(array) == rows and array.dtype.kind == "f"}
         good = np.ones(rows, dtype=bool)
@@ -49,12 +50,12 @@ class StackedParams:
         params = params_from_content(kept, source=f"file {self.path}", layout=self.layout, body=self.body)
         return params, np.where(good, np.cumsum(good) - 1, -1)
 
-    def frames(self) -> np.ndarray:
-        """(F,) rows of the file."""
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        """The frames that there are, ascending."""
         return np.arange(len(self._rows[1]))
 
     def read(self, frame: int) -> BodyParams:
-        """One row.
+        """Read the parameters of one frame.
 
         Raises:
             InputError: NaN or infinity in it.
@@ -67,22 +68,22 @@ class StackedParams:
 
 @dataclass(frozen=True, eq=False)
 class ParamFiles:
-    """One file a frame; see `StackedParams`."""
+    """A file of parameters for each frame; see `StackedParams`."""
 
     files: FileSeries
-    layout: str = "auto"
+    layout: LayoutName = "auto"
     body: BodyModel | None = None
 
-    def frames(self) -> np.ndarray:
-        """(F,) frames with a file."""
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        """The frames that there are, ascending."""
         return self.files.numbers
 
     def read(self, frame: int) -> BodyParams:
-        """One file."""
-        return load_params(self.files.path(frame), layout=self.layout, body=self.body)
+        """Read the parameters of one frame."""
+        return load_params(self.files.required(frame), layout=self.layout, body=self.body)
 
 
-def find_params(path: Path, *, body: BodyModel | None, layout: str = "auto") -> StackedParams | ParamFiles:
+def find_params(path: Path, *, body: BodyModel | None, layout: LayoutName = "auto") -> StackedParams | ParamFiles:
     """Parameters that the user names: an npz file with a row a frame, or a folder with a numbered file a frame.
 
     Raises:

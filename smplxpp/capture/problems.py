@@ -86,17 +86,19 @@ def _parameters(capture: Capture) -> Iterator[Problem]:
 
 def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:
     reader = capture.reader(camera)
-    path = {kind: capture.file(camera, frame, kind) for kind in ("image", "mask", "label", "normal")}
-    try:
-        if path["mask"] is None:
-            reader.color(path["image"])
-        else:
-            reader.foreground(path["image"], path["mask"])
-    except InputError as error:
-        yield Problem(str(error), camera, frame)
+    image, mask = capture.file(camera, frame), capture.file(camera, frame, "mask")
+    if image is not None:
+        try:
+            if mask is None:
+                reader.color(image)
+            else:
+                reader.foreground(image, mask)
+        except InputError as error:
+            yield Problem(str(error), camera, frame)
     for kind, read in (("label", reader.labels), ("normal", reader.normals)):
-        if path[kind] is not None:
+        path = capture.file(camera, frame, kind)
+        if path is not None:
             try:
-                read(path[kind])
+                read(path)
             except InputError as error:
                 yield Problem(str(error), camera, frame)

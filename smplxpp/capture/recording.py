@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from jaxtyping import Int64
 
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
@@ -36,11 +37,11 @@ class Problem:
 class ParamSource(Protocol):
     """Body parameters by frame."""
 
-    def frames(self) -> np.ndarray:
-        """(F,) int64 frames that have parameters, ascending."""
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        """The frames that have parameters, ascending."""
 
     def read(self, frame: int) -> BodyParams:
-        """One frame that is among `frames()`."""
+        """Read one frame that is among `frames()`."""
 
 
 class MeshSource(Protocol):

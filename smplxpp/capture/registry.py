@@ -23,6 +23,7 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.window import Window
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 _MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap)
 READERS = {reader.NAME: reader for reader in _MODULES}
@@ -57,8 +58,8 @@ def open_capture(
     root = Path(path).absolute()
     if not root.is_dir():
         raise InputError("capture", expected="an existing folder", received=str(path))
-    if format is not None and format not in READERS:
-        raise InputError("format of the capture", expected=f"one of {', '.join(FORMATS)}", received=str(format))
+    if format is not None:
+        require_choice("format of the capture", format, FORMATS)
     reader = READERS[format or detect_format(root)]
     options = ReaderOptions(params=None if params is None else Path(params), body=body)
     recording = reader.read(root, options)

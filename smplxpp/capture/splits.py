@@ -28,11 +28,10 @@ class Splits:
     novel_pose_frames: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        for what, train, held_out in (
-            ("cameras", self.train_cameras, self.novel_view_cameras),
-            ("frames", self.train_frames, self.novel_pose_frames),
+        for what, both in (
+            ("cameras", sorted(set(self.train_cameras) & set(self.novel_view_cameras))),
+            ("frames", sorted(set(self.train_frames) & set(self.novel_pose_frames))),
         ):
-            both = sorted(set(train) & set(held_out))
             if both:
                 raise InputError(
                     f"split of {what}", expected="training and held-out sets apart", received=f"{both[:5]} in both"
@@ -60,7 +59,7 @@ class Splits:
         return Splits(train, self.novel_view_cameras + held_out, self.train_frames, self.novel_pose_frames)
 
     def restricted(self, cameras: Sequence[str], frames: Sequence[int]) -> Splits:
-        """Without cameras and frames that are not among the given ones."""
+        """Return the split without cameras and frames that are not among the given ones."""
         names, numbers = set(cameras), set(frames)
         return Splits(
             tuple(c for c in self.train_cameras if c in names),

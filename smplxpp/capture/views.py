@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float32, UInt8
 
 from smplxpp.capture.distortion import Distortion, undistort
 from smplxpp.capture.images import check_size, read_alpha, read_color, read_labels, read_normals
@@ -38,20 +39,20 @@ class ViewReader:
     distortion: Distortion | None = None
     background: tuple[float, float, float] | None = None
 
-    def color(self, path: Path) -> np.ndarray:
-        """(H, W, 3) uint8."""
+    def color(self, path: Path) -> UInt8[np.ndarray, "H W 3"]:
+        """Read an image's colours."""
         return self._shown(self._sized(read_color(path), path))
 
-    def alpha(self, path: Path) -> np.ndarray:
-        """(H, W) uint8."""
+    def alpha(self, path: Path) -> UInt8[np.ndarray, "H W"]:
+        """Read a mask's opacity."""
         return self._shown(self._sized(read_alpha(path), path))
 
-    def labels(self, path: Path) -> np.ndarray:
-        """(H, W) uint8."""
+    def labels(self, path: Path) -> UInt8[np.ndarray, "H W"]:
+        """Read a label map."""
         return self._shown(self._sized(read_labels(path), path), labels=True)
 
-    def normals(self, path: Path) -> np.ndarray:
-        """(H, W, 3) float32. Resampled to the nearest pixel, as labels: an average over an edge is no normal."""
+    def normals(self, path: Path) -> Float32[np.ndarray, "H W 3"]:
+        """Read a normal map, resampled to the nearest pixel, as labels: an average over an edge is no normal."""
         image, deep = read_normals(path)
         value = self._shown(self._sized(image, path), labels=True).astype(np.float32)
         # Of 16-bit files Pillow gives the upper byte: the middle of its range is 0.2 degrees off at most.
@@ -60,7 +61,9 @@ class ViewReader:
         seen = value.any(axis=-1, keepdims=True)
         return np.where(seen, normal / np.maximum(length, 1e-6), 0.0).astype(np.float32)
 
-    def foreground(self, image_path: Path, mask_path: Path) -> tuple[np.ndarray, np.ndarray]:
+    def foreground(
+        self, image_path: Path, mask_path: Path
+    ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
         """Colour times opacity (H, W, 3) uint8 and opacity (H, W) uint8.
 
         The product is formed on the full image: resampled apart, a photograph's background would bleed into the edges.
@@ -80,8 +83,8 @@ class ViewReader:
             if any(self.background):
                 share = 1.0 - np.asarray(opacity, dtype=np.float32)[..., None] / 255.0
                 colour = np.asarray(self.background, dtype=np.float32) * 255.0
-                product = np.asarray(image) - share * colour + 0.5
-                image = PIL.Image.fromarray(np.clip(product, 0, 255).astype(np.uint8))
+                person = np.asarray(image) - share * colour + 0.5
+                image = PIL.Image.fromarray(np.clip(person, 0, 255).astype(np.uint8))
         return self._shown(image), self._shown(opacity)
 
     def _sized(self, image: Image, path: Path) -> Image:
@@ -113,7 +116,7 @@ class ViewReader:
         # A median needs few pixels: the nearest of a coarse grid.
         from PIL.Image import Resampling
 
-        grid = tuple(min(side, _BACKGROUND_GRID) for side in image.size)
+        grid = (min(image.width, _BACKGROUND_GRID), min(image.height, _BACKGROUND_GRID))
         coarse, share = (np.asarray(i.resize(grid, Resampling.NEAREST)) for i in (image, opacity))
         outside = coarse[share == 0]
         if not len(outside):

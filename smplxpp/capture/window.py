@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 
@@ -18,8 +16,7 @@ if TYPE_CHECKING:
 class Window:
     """A rectangle of the full image, resampled to a size.
 
-    With pixel centres at +0.5 the image spans [0, width] x [0, height], and a point at x in the full image is at
-    `(x - x0) * width / (x1 - x0)` in the window: principal point and focal lengths follow.
+    Principal point and focal lengths follow as in `Camera.cropped`.
 
     Attributes:
         box: x0, y0, x1, y1 in pixels of the full image.
@@ -42,7 +39,7 @@ class Window:
         return self.width / (x1 - x0), self.height / (y1 - y0)
 
     def resized(self, scale: float) -> Window:
-        """At `scale` times the resolution; the size is rounded, and the intrinsics follow the rounded size."""
+        """Return the window at `scale` times the resolution; its size is rounded, and the intrinsics follow that."""
         size = (round(self.width * scale), round(self.height * scale))
         if not scale > 0 or min(size) < 1:
             raise InputError("scale", expected="a factor that leaves at least 1 x 1 pixels", received=str(scale))
@@ -63,10 +60,7 @@ class Window:
 
     def camera(self, full: Camera) -> Camera:
         """The camera of the window's pixels."""
-        sx, sy = self.scale
-        x0, y0 = self.box[:2]
-        window_from_full = np.array([[sx, 0.0, -x0 * sx], [0.0, sy, -y0 * sy], [0.0, 0.0, 1.0]])
-        return replace(full, K=window_from_full @ full.K, width=self.width, height=self.height)
+        return full.cropped(self.box, size=(self.width, self.height))
 
     def apply(self, image: Image, *, labels: bool = False) -> Image:
         """Cut and resample an image: the mean over the area of a pixel where that is a whole number of pixels each way
@@ -76,11 +70,12 @@ class Window:
         if self == Window((0.0, 0.0, float(image.width), float(image.height)), image.width, image.height):
             return image
         whole_box = all(edge == int(edge) for edge in self.box)
-        if whole_box and self.scale == (1.0, 1.0):
-            return image.crop(tuple(int(edge) for edge in self.box))
         x0, y0, x1, y1 = self.box
+        pixels = (int(x0), int(y0), int(x1), int(y1))
+        if whole_box and self.scale == (1.0, 1.0):
+            return image.crop(pixels)
         if whole_box and not labels and (x1 - x0) % self.width == 0 and (y1 - y0) % self.height == 0:
             factors = int(x1 - x0) // self.width, int(y1 - y0) // self.height
-            return image.reduce(factors, box=tuple(int(edge) for edge in self.box))
+            return image.reduce(factors, box=pixels)
         resample = Resampling.NEAREST if labels else Resampling.LANCZOS
         return image.resize((self.width, self.height), resample, box=self.box)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Float64, Int, Int64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import border_loops, face_components
 
 
-def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> np.ndarray:
-    """(M,) bool: faces of components with at least `area_fraction` of the mesh's area (the largest always)."""
+def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
+    """The faces of components with at least `area_fraction` of the mesh's area (the largest always)."""
     component = face_components(mesh.faces)
     area = np.bincount(component, mesh.face_areas)
     kept = area >= area_fraction * area.sum()
@@ -17,13 +18,13 @@ def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> np.ndarra
     return kept[component]
 
 
-def loop_lengths(mesh: TriangleMesh, loops: list[np.ndarray]) -> np.ndarray:
-    """(L,) perimeter of each closed loop of vertex indices, metres."""
+def loop_lengths(mesh: TriangleMesh, loops: list[Int[np.ndarray, " _"]]) -> Float64[np.ndarray, " L"]:
+    """The perimeter of each closed loop of vertex indices, metres."""
     positions = [mesh.vertices[loop] for loop in loops]
     return np.array([np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1).sum() for p in positions])
 
 
-def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[TriangleMesh, np.ndarray]:
+def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
     """Close border loops shorter than `max_length` metres; longer ones are openings (hem, cuffs, neck) and stay.
 
     A loop of three edges takes one triangle, a longer one a fan about its mean. The border of a component that is

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import igl
 import numpy as np
+from jaxtyping import Int, Int64, UInt8
 
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.simplify import simplify
@@ -70,17 +71,17 @@ class CleanedPart:
 
     mesh: TriangleMesh
     label: int
-    source_vertex: np.ndarray
-    vertex_colors: np.ndarray | None
+    source_vertex: Int64[np.ndarray, " n"]
+    vertex_colors: UInt8[np.ndarray, "n 3"] | None
     report: PartReport
 
 
 def clean_parts(
     mesh: TriangleMesh,
-    face_labels: np.ndarray,
+    face_labels: Int[np.ndarray, " M"],
     *,
     config: PartsConfig | None = None,
-    vertex_colors: np.ndarray | None = None,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
 ) -> dict[str, CleanedPart]:
     """Cut a labelled scan into its loose parts and clean each.
 

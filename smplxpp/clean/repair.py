@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass, fields
 
 import numpy as np
+from jaxtyping import Int64, Integer, Num
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -62,12 +63,14 @@ class Sanitized:
     """
 
     mesh: TriangleMesh
-    source_vertex: np.ndarray
-    source_face: np.ndarray
+    source_vertex: Int64[np.ndarray, " n"]
+    source_face: Int64[np.ndarray, " m"]
     report: CleanReport
 
 
-def sanitize(vertices: np.ndarray, faces: np.ndarray, *, weld_tolerance: float | None = None) -> Sanitized:
+def sanitize(
+    vertices: Num[np.ndarray, "N 3"], faces: Integer[np.ndarray, "M 3"], *, weld_tolerance: float | None = None
+) -> Sanitized:
     """Repair raw arrays: NaN, duplicates, faces without area, winding, non-manifold places.
 
     In this order: vertices that are not finite go with their faces; vertices closer than `weld_tolerance` merge into
@@ -152,7 +155,7 @@ def _first_of_each(faces: np.ndarray) -> np.ndarray:
 
 
 def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(M,) bool: faces to turn over, for consistent winding in each component and then outward.
+    """The faces to turn over, for consistent winding in each component and then outward.
 
     Consistency is connectivity in the double cover: every face is two nodes, as given and turned over, and each edge
     with two faces joins the nodes that agree. A component whose two sheets join (a Moebius strip) is left as it is.

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import fast_simplification
 import igl
 import numpy as np
+from jaxtyping import Int64
 
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import edge_groups, manifold_corners
+from smplxpp.core.validation import require_at_least
 
 # Collapses per pass: 3 keeps the quadric order well; higher is no faster at these sizes and breaks manifoldness.
 _AGGRESSIVENESS = 3
@@ -30,8 +31,8 @@ class Simplified:
     """
 
     mesh: TriangleMesh
-    new_from_old: np.ndarray
-    source_vertex: np.ndarray
+    new_from_old: Int64[np.ndarray, " N"]
+    source_vertex: Int64[np.ndarray, " n"]
     restored_faces: int
     flipped_faces: int
 
@@ -49,8 +50,7 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     Raises:
         InputError: a budget below 4.
     """
-    if face_budget < 4:
-        raise InputError("face budget", expected="at least 4", received=str(face_budget))
+    require_at_least("face budget", face_budget, 4)
     if mesh.face_count <= face_budget:
         used = np.bincount(mesh.faces.ravel(), minlength=mesh.vertex_count) > 0
         identity = np.where(used, np.cumsum(used) - 1, -1)
@@ -108,14 +108,14 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
 
 
 def _opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
-    """(m,) bool: faces whose normal opposes the source face nearest to their middle, or that have no area."""
+    """The faces whose normal opposes the source face nearest to their middle, or that have no area."""
     _, nearest, _ = tree.squared_distance(source.vertices, source.faces, result.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", result.face_normals, source.face_normals[nearest])
     return (cosine < 0) | (result.face_areas <= 0)
 
 
 def _non_manifold(faces: np.ndarray) -> np.ndarray:
-    """(m,) bool: faces at an edge with more than two faces."""
+    """The faces at an edge with more than two faces."""
     order, _, count = edge_groups(faces)
     bad = np.zeros(len(faces), dtype=bool)
     bad[order[np.repeat(count > 2, count)] // 3] = True
@@ -125,7 +125,7 @@ def _non_manifold(faces: np.ndarray) -> np.ndarray:
 def _nearest_source(
     mesh: TriangleMesh, result: TriangleMesh, new_from_old: np.ndarray, source_of_cut: np.ndarray
 ) -> np.ndarray:
-    """(n,) source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
+    """The source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
     old = np.flatnonzero(new_from_old >= 0)
     new = new_from_old[old]
     position = np.empty((int(source_of_cut.max()) + 1, 3))

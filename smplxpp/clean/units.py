@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float, Float64, Num
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Rotations that bring the named axis to +Y and keep the frame right-handed.
@@ -20,8 +22,8 @@ _Y_FROM_UP = {
 _HEIGHT = (0.7, 2.6)
 
 
-def convert_points(points: np.ndarray, *, units: str = "m", up: str = "y") -> np.ndarray:
-    """(N, 3) points in the stated units and axes -> metres, +Y up.
+def convert_points(points: Num[np.ndarray, "N 3"], *, units: str = "m", up: str = "y") -> Float64[np.ndarray, "N 3"]:
+    """Convert points in the stated units and axes to metres, +Y up.
 
     Args:
         units: "m", "cm", "mm" or "inch". up: the source's upward axis: "y", "z", "x", "-y", "-z" or "-x".
@@ -30,12 +32,11 @@ def convert_points(points: np.ndarray, *, units: str = "m", up: str = "y") -> np
         InputError: an unknown name.
     """
     for name, value, known in (("units", units, METRES_PER_UNIT), ("up", up, _Y_FROM_UP)):
-        if value not in known:
-            raise InputError(f"option {name}", expected=f"one of {', '.join(known)}", received=repr(value))
+        require_choice(f"option {name}", value, tuple(known))
     return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * METRES_PER_UNIT[units]
 
 
-def check_human_scale(vertices: np.ndarray, *, subject: str = "scan") -> None:
+def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "scan") -> None:
     """Refuse a person that is not in metres or does not stand along Y.
 
     The largest extent tells the unit, the axis of an extent more than 1.3 times the vertical one tells swapped axes

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float64, Num
 
 from smplxpp.core.errors import InputError
 
@@ -21,8 +22,8 @@ class Camera:
         name: for messages and files.
     """
 
-    K: np.ndarray
-    cam_from_world: np.ndarray
+    K: Float64[np.ndarray, "3 3"]
+    cam_from_world: Float64[np.ndarray, "4 4"]
     width: int
     height: int
     orthographic: bool = False
@@ -45,17 +46,17 @@ class Camera:
             )
 
     @property
-    def position(self) -> np.ndarray:
-        """(3,) centre of projection in the world (meaningless for an orthographic camera)."""
+    def position(self) -> Float64[np.ndarray, " 3"]:
+        """The centre of projection in the world (meaningless for an orthographic camera)."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @property
-    def forward(self) -> np.ndarray:
-        """(3,) unit viewing direction in the world."""
+    def forward(self) -> Float64[np.ndarray, " 3"]:
+        """The unit viewing direction in the world."""
         return self.cam_from_world[2, :3]
 
-    def screen_from_world(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) world points -> (N, 4): x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
+    def screen_from_world(self, points: Num[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
+        """Project world points: x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
         # Coordinates as rows: every step then runs along memory.
         cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]
         screen = np.empty((4, cam.shape[1]))
@@ -64,6 +65,35 @@ class Camera:
             screen[3] = 1.0 if self.orthographic else 1.0 / cam[2]
             screen[:2] = self.K[:2, :2] @ cam[:2] * screen[3] + self.K[:2, 2:]
         return screen.T
+
+    def cropped(self, box: tuple[float, float, float, float], *, size: tuple[int, int] | None = None) -> Camera:
+        """The camera of a rectangle of the image, resampled where a size is given.
+
+        With pixel centres at +0.5 the image spans [0, width] x [0, height], and a point at x is at
+        `(x - x0) * width / (x1 - x0)` afterwards: principal point and focal lengths follow.
+
+        Args:
+            box: x0, y0, x1, y1 in pixels; it may reach beyond the image.
+            size: width and height of the result; None keeps the resolution, and the box must be of whole pixels.
+
+        Raises:
+            InputError: an empty box, or one of a part of a pixel without a size.
+        """
+        x0, y0, x1, y1 = box
+        if not (x0 < x1 and y0 < y1) or (size is None and not all(float(edge).is_integer() for edge in box)):
+            raise InputError(
+                f"camera {self.name!r}: crop box",
+                expected="x0 < x1 and y0 < y1" + ("" if size else ", whole pixels"),
+                received=f"{tuple(box)}",
+            )
+        width, height = size or (int(x1 - x0), int(y1 - y0))
+        sx, sy = width / (x1 - x0), height / (y1 - y0)
+        window_from_full = np.array([[sx, 0.0, -x0 * sx], [0.0, sy, -y0 * sy], [0.0, 0.0, 1.0]])
+        return replace(self, K=window_from_full @ self.K, width=width, height=height)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the whole image at another resolution."""
+        return self.cropped((0, 0, self.width, self.height), size=(width, height))
 
     @staticmethod
     def look_at(

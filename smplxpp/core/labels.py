@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Integer, UInt8
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,13 @@ CLOTH_LABELS: tuple[Label, ...] = (UPPER, LOWER, OUTER)
 LABEL_BY_NAME: dict[str, Label] = {label.name: label for label in LABELS}
 
 
-def display_colors(label_ids: np.ndarray) -> np.ndarray:
-    """(N,) label ids -> (N, 3) uint8 display colours; background black."""
+def display_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
+    """The display colours of label ids; background black."""
     table = np.array([label.display_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]
 
 
-def semantic_colors(label_ids: np.ndarray) -> np.ndarray:
-    """(N,) label ids -> (N, 3) uint8 semantic colours; background black."""
+def semantic_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
+    """The semantic colours of label ids; background black."""
     table = np.array([label.semantic_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]

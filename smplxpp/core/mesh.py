@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float64, Int64, Integer
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.topology import edge_groups
@@ -27,8 +27,8 @@ class TriangleMesh:
         InputError: wrong shapes, NaN or infinite coordinates, indices out of range.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: Float64[np.ndarray, "N 3"]
+    faces: Int64[np.ndarray, "M 3"]
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
@@ -71,35 +71,35 @@ class TriangleMesh:
         return len(self.faces)
 
     @cached_property
-    def triangles(self) -> np.ndarray:
-        """(M, 3, 3) corner positions."""
+    def triangles(self) -> Float64[np.ndarray, "M 3 3"]:
+        """The positions of each face's corners."""
         return self.vertices[self.faces]
 
     @cached_property
-    def face_centers(self) -> np.ndarray:
-        """(M, 3) means of the corners."""
+    def face_centers(self) -> Float64[np.ndarray, "M 3"]:
+        """The means of the corners."""
         t = self.triangles
         return (t[:, 0] + t[:, 1] + t[:, 2]) / 3.0
 
     @cached_property
-    def face_cross(self) -> np.ndarray:
-        """(M, 3) normals of length twice the area."""
+    def face_cross(self) -> Float64[np.ndarray, "M 3"]:
+        """The faces' normals, of length twice the area."""
         t = self.triangles
         return np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
 
     @cached_property
-    def face_areas(self) -> np.ndarray:
-        """(M,) square metres."""
+    def face_areas(self) -> Float64[np.ndarray, " M"]:
+        """The faces' areas, square metres."""
         return 0.5 * row_lengths(self.face_cross)
 
     @cached_property
-    def face_normals(self) -> np.ndarray:
-        """(M, 3) unit normals; zero for a face without area."""
+    def face_normals(self) -> Float64[np.ndarray, "M 3"]:
+        """The faces' unit normals; zero for a face without area."""
         return normalize_rows(self.face_cross)
 
     @cached_property
-    def vertex_normals(self) -> np.ndarray:
-        """(N, 3) unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
+    def vertex_normals(self) -> Float64[np.ndarray, "N 3"]:
+        """The unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
         t, normals = self.triangles, self.face_normals
         out = np.zeros_like(self.vertices)
         for k in range(3):
@@ -111,8 +111,8 @@ class TriangleMesh:
         return normalize_rows(out)
 
     @cached_property
-    def referenced(self) -> np.ndarray:
-        """(n,) vertices that a face uses, in increasing order."""
+    def referenced(self) -> Int64[np.ndarray, " n"]:
+        """The vertices that a face uses, in increasing order."""
         return _occurring(self.faces, self.vertex_count)
 
     @cached_property
@@ -124,13 +124,13 @@ class TriangleMesh:
         return float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
 
     @cached_property
-    def edges(self) -> np.ndarray:
-        """(E, 2) undirected edges, each once, lower index first, sorted."""
+    def edges(self) -> Int64[np.ndarray, "E 2"]:
+        """The undirected edges, each once, lower index first, sorted."""
         return self.edges_with_counts[0]
 
     @cached_property
-    def edges_with_counts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(E, 2) undirected edges and (E,) the number of faces at each."""
+    def edges_with_counts(self) -> tuple[Int64[np.ndarray, "E 2"], Int64[np.ndarray, " E"]]:
+        """The undirected edges, and the number of faces at each."""
         f = self.faces
         directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
         key = directed[:, 0] * max(self.vertex_count, 1) + directed[:, 1]
@@ -139,14 +139,14 @@ class TriangleMesh:
         return np.stack([unique // n, unique % n], axis=1), counts
 
     @cached_property
-    def border_edges(self) -> np.ndarray:
-        """(B, 2) edges with one face."""
+    def border_edges(self) -> Int64[np.ndarray, "B 2"]:
+        """The edges with one face."""
         edges, counts = self.edges_with_counts
         return edges[counts == 1]
 
     @cached_property
-    def face_pairs(self) -> np.ndarray:
-        """(P, 2) pairs of faces at an edge that has exactly two."""
+    def face_pairs(self) -> Int64[np.ndarray, "P 2"]:
+        """The pairs of faces at an edge that has exactly two."""
         order, first, count = edge_groups(self.faces)
         start = first[count == 2]
         return np.stack([order[start], order[start + 1]], axis=1) // 3
@@ -155,7 +155,9 @@ class TriangleMesh:
         """The same faces on other positions."""
         return replace(self, vertices=vertices)
 
-    def submesh(self, face_mask: np.ndarray) -> tuple[TriangleMesh, np.ndarray]:
+    def submesh(
+        self, face_mask: Bool[np.ndarray, " M"] | Integer[np.ndarray, " m"]
+    ) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
         """Faces selected by a mask or index array, unreferenced vertices dropped.
 
         Returns the mesh and (n,) the index in this mesh of each of its vertices, in increasing order.
@@ -174,12 +176,12 @@ def _occurring(indices: np.ndarray, count: int) -> np.ndarray:
     return np.flatnonzero(mask)
 
 
-def row_lengths(x: np.ndarray) -> np.ndarray:
-    """(N,) lengths of the rows of (N, D); several times as fast as `np.linalg.norm` where D is small."""
+def row_lengths(x: Float[np.ndarray, "N D"]) -> Float[np.ndarray, " N"]:
+    """The lengths of the rows; several times as fast as `np.linalg.norm` where D is small."""
     return np.sqrt(np.einsum("ij,ij->i", x, x))
 
 
-def normalize_rows(x: np.ndarray) -> np.ndarray:
+def normalize_rows(x: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
     """Unit rows of (N, D); rows without length stay zero."""
     length = row_lengths(x)[:, None]
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64, Int64, UInt8
 
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
@@ -28,9 +29,9 @@ class RawMesh:
         vertex_properties, face_properties: other per-element arrays by name (PLY).
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    vertex_colors: np.ndarray | None = None
+    vertices: Float64[np.ndarray, "N 3"]
+    faces: Int64[np.ndarray, "M 3"]
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None
     vertex_properties: dict[str, np.ndarray] = field(default_factory=dict)
     face_properties: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -40,7 +41,7 @@ class MeshFile:
     """A checked mesh and what came with it; see `RawMesh` for the shapes."""
 
     mesh: TriangleMesh
-    vertex_colors: np.ndarray | None = None
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None
     vertex_properties: dict[str, np.ndarray] = field(default_factory=dict)
     face_properties: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -119,11 +120,10 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         raise InputError(f"mesh file {path}", expected="a triangle mesh", received=type(loaded).__name__)
     colors = None
     visual = loaded.visual
-    if visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
-    elif (
-        visual.kind == "texture" and getattr(visual, "uv", None) is not None and len(visual.uv) == len(loaded.vertices)
-    ):
+    if isinstance(visual, trimesh.visual.ColorVisuals):
+        if visual.kind == "vertex":
+            colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
+    elif visual is not None and visual.uv is not None and len(visual.uv) == len(loaded.vertices):
         colors = np.asarray(visual.to_color().vertex_colors)[:, :3].astype(np.uint8)
     vertex_properties, face_properties = _ply_properties(loaded)
     return RawMesh(
@@ -151,7 +151,7 @@ def write_ply(
     path: str | Path,
     mesh: TriangleMesh,
     *,
-    vertex_colors: np.ndarray | None = None,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
     vertex_properties: dict[str, np.ndarray] | None = None,
     face_properties: dict[str, np.ndarray] | None = None,
 ) -> None:

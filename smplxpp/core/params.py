@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
@@ -43,16 +44,16 @@ class BodyParams:
         InputError: wrong widths, unequal numbers of frames (one frame stands for all), NaN or infinity.
     """
 
-    global_orient: np.ndarray
-    body_pose: np.ndarray
-    jaw_pose: np.ndarray
-    leye_pose: np.ndarray
-    reye_pose: np.ndarray
-    left_hand_pose: np.ndarray
-    right_hand_pose: np.ndarray
-    betas: np.ndarray
-    expression: np.ndarray
-    transl: np.ndarray
+    global_orient: Float64[np.ndarray, "T 3"]
+    body_pose: Float64[np.ndarray, "T 63"]
+    jaw_pose: Float64[np.ndarray, "T 3"]
+    leye_pose: Float64[np.ndarray, "T 3"]
+    reye_pose: Float64[np.ndarray, "T 3"]
+    left_hand_pose: Float64[np.ndarray, "T L"]
+    right_hand_pose: Float64[np.ndarray, "T R"]
+    betas: Float64[np.ndarray, "T B"]
+    expression: Float64[np.ndarray, "T E"]
+    transl: Float64[np.ndarray, "T 3"]
     fps: float | None = None
     flat_hand_mean: bool = False
 
@@ -89,8 +90,8 @@ class BodyParams:
         return len(self.global_orient)
 
     @property
-    def full_pose(self) -> np.ndarray:
-        """(T, 55, 3) axis-angle in SMPL-X joint order.
+    def full_pose(self) -> Float64[np.ndarray, "T 55 3"]:
+        """The axis-angle vectors of all joints in SMPL-X order.
 
         Raises:
             InputError: hands given as PCA coefficients, which only a body model can expand.
@@ -105,14 +106,14 @@ class BodyParams:
         return np.concatenate([getattr(self, name) for name, _ in POSE_BLOCKS], axis=1).reshape(len(self), -1, 3)
 
     def frame(self, index: int) -> BodyParams:
-        """One frame as a BodyParams of length 1 (negative indices count from the end)."""
+        """Return one frame as a BodyParams of length 1 (negative indices count from the end)."""
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
         return self.select([index % len(self)])
 
-    def select(self, indices) -> BodyParams:
-        """The frames named by an index array or slice."""
-        return replace(self, **{name: getattr(self, name)[indices] for name in ARRAY_NAMES})
+    def select(self, indices: slice | Sequence[int] | np.ndarray) -> BodyParams:
+        """The frames named by indices, a mask or a slice."""
+        return self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES})
 
     @staticmethod
     def concatenate(parts: Sequence[BodyParams]) -> BodyParams:
@@ -133,35 +134,45 @@ class BodyParams:
                         f"parameter {name} of part {index}", expected=f"{first}, as in part 0", received=str(other)
                     )
         joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAY_NAMES}
-        return replace(parts[0], **joined)
+        return parts[0]._with_arrays(joined)
 
     @staticmethod
-    def rest(*, betas: np.ndarray | int = 10, expressions: int = 10) -> BodyParams:
+    def rest(*, betas: Float[np.ndarray, " B"] | int = 10, expressions: int = 10) -> BodyParams:
         """The zero pose (T-pose) of one frame; `betas` as values (B,) or as their number."""
         values = np.zeros(betas) if isinstance(betas, int) else np.asarray(betas)
-        zero = {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS}
-        return BodyParams(**zero, betas=values, expression=np.zeros(expressions), transl=np.zeros(3))
+        return _from_arrays(
+            _zero_pose() | {"betas": values, "expression": np.zeros(expressions), "transl": np.zeros(3)}
+        )
 
     @staticmethod
-    def from_full_pose(full_pose: np.ndarray, **others) -> BodyParams:
-        """(T, 55, 3) axis-angle plus betas, expression, transl (and fps)."""
+    def from_full_pose(
+        full_pose: Float[np.ndarray, "T 55 3"],
+        *,
+        betas: np.ndarray,
+        expression: np.ndarray,
+        transl: np.ndarray,
+        fps: float | None = None,
+        flat_hand_mean: bool = False,
+    ) -> BodyParams:
+        """Parameters of an axis-angle pose in SMPL-X joint order; one row of the others stands for all frames."""
         flat = np.asarray(full_pose, dtype=np.float64).reshape(len(full_pose), -1)
         split = np.cumsum([3 * joints for _, joints in POSE_BLOCKS])[:-1]
         blocks = dict(zip([name for name, _ in POSE_BLOCKS], np.split(flat, split, axis=1), strict=True))
-        return BodyParams(**blocks, **others)
+        others = {"betas": betas, "expression": expression, "transl": transl}
+        return _from_arrays(blocks | others, fps=fps, flat_hand_mean=flat_hand_mean)
 
     def as_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name, with `fps` where known and `flat_hand_mean` where true."""
-        out = {name: getattr(self, name) for name in ARRAY_NAMES}
+        out: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAY_NAMES}
         if self.fps is not None:
-            out["fps"] = np.float64(self.fps)
+            out["fps"] = np.asarray(np.float64(self.fps))
         if self.flat_hand_mean:
-            out["flat_hand_mean"] = np.bool_(True)
+            out["flat_hand_mean"] = np.asarray(np.bool_(True))
         return out
 
     @staticmethod
     def from_mapping(values: Mapping[str, np.ndarray], *, source: str = "parameters") -> BodyParams:
-        """From arrays by SMPL-X name; face, hands and expression may be missing (zero)."""
+        """Read arrays by SMPL-X name; face, hands and expression may be missing (zero)."""
         required = ("global_orient", "body_pose", "betas", "transl")
         missing = [name for name in required if name not in values]
         if missing:
@@ -171,20 +182,47 @@ class BodyParams:
                 received=f"keys {sorted(values)}",
                 remedy="see `smplxpp params convert --help` for the layouts that are read",
             )
-        zeros = {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS} | {"expression": np.zeros(10)}
+        zeros = _zero_pose() | {"expression": np.zeros(10)}
         arrays = zeros | {name: values[name] for name in ARRAY_NAMES if name in values}
         fps = float(values["fps"]) if "fps" in values else None
-        return BodyParams(**arrays, fps=fps, flat_hand_mean=bool(values.get("flat_hand_mean", False)))
+        return _from_arrays(arrays, fps=fps, flat_hand_mean=bool(values.get("flat_hand_mean", False)))
 
     def save(self, path: str | Path) -> None:
         """Write our npz layout (SMPL-X names, stacked frames), whole or not at all."""
         with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(stream, **self.as_dict())
+            # numpy's signature lists options of its own among the arrays' names.
+            np.savez_compressed(stream, **self.as_dict())  # type: ignore[arg-type]
+
+    def _with_arrays(self, arrays: Mapping[str, np.ndarray]) -> BodyParams:
+        return _from_arrays(arrays, fps=self.fps, flat_hand_mean=self.flat_hand_mean)
 
 
-def _numbers(name: str, value) -> np.ndarray:
+def _from_arrays(
+    arrays: Mapping[str, np.ndarray], *, fps: float | None = None, flat_hand_mean: bool = False
+) -> BodyParams:
+    return BodyParams(
+        global_orient=arrays["global_orient"],
+        body_pose=arrays["body_pose"],
+        jaw_pose=arrays["jaw_pose"],
+        leye_pose=arrays["leye_pose"],
+        reye_pose=arrays["reye_pose"],
+        left_hand_pose=arrays["left_hand_pose"],
+        right_hand_pose=arrays["right_hand_pose"],
+        betas=arrays["betas"],
+        expression=arrays["expression"],
+        transl=arrays["transl"],
+        fps=fps,
+        flat_hand_mean=flat_hand_mean,
+    )
+
+
+def _zero_pose() -> dict[str, np.ndarray]:
+    return {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS}
+
+
+def _numbers(name: str, value: object) -> np.ndarray:
     """A (T, width) float64 copy."""
     try:
-        return np.array(np.atleast_2d(value), dtype=np.float64)
+        return np.array(np.atleast_2d(np.asarray(value)), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"parameter {name}", expected="numbers of shape (T, width)", received=str(error)) from error

@@ -4,31 +4,35 @@ from __future__ import annotations
 
 import sys
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
+
+Array: TypeAlias = Any
+"""A numpy array or a torch tensor; what takes one gives the same kind back."""
 
 # Below this squared angle the series of sin(x)/x is exact to float64's last bit (next term: angle^6 / 5040 < 2e-16).
 _SMALL_SQUARED_ANGLE = 1e-4
 
 
-def array_namespace(array: Any) -> ModuleType:
+def array_namespace(array: Array) -> ModuleType:
     """numpy, or torch when `array` is a torch tensor. Never imports torch by itself."""
     return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
 
 
-def matrix_from_rotvec(rotvec: Any) -> Any:
+def matrix_from_rotvec(rotvec: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
     """Rotation matrices of axis-angle vectors (Rodrigues), smooth and differentiable at zero.
 
     `R = I + a K + b K^2` with K the cross-product matrix of the vector, `a = sin(t) / t` and
     `b = (1 - cos t) / t^2 = (sin(t/2) / (t/2))^2 / 2`, the latter form without cancellation.
 
     Args:
-        rotvec: (..., 3) radians, numpy or torch.
+        rotvec: radians.
 
     Returns:
-        (..., 3, 3) of the same kind, type and device.
+        An array of the same kind, type and device.
     """
     xp = array_namespace(rotvec)
     squared = (rotvec * rotvec).sum(-1)
@@ -44,20 +48,20 @@ def matrix_from_rotvec(rotvec: Any) -> Any:
     return xp.stack([xp.stack(row, -1) for row in rows], -2)
 
 
-def rotvec_from_matrix(matrix: np.ndarray) -> np.ndarray:
+def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarray, "*N 3"]:
     """Axis-angle vectors of rotation matrices, accurate near 0 and near pi (through quaternions).
 
     Args:
-        matrix: (..., 3, 3) rotation matrices.
+        matrix: rotation matrices.
 
     Returns:
-        (..., 3) float64, of length at most pi.
+        Vectors of length at most pi.
     """
     matrix = np.array(matrix, dtype=np.float64)  # a copy: scipy takes no read-only arrays
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
 
 
-def _sinc(xp: ModuleType, squared: Any) -> Any:
+def _sinc(xp: ModuleType, squared: Array) -> Array:
     """sin(t) / t as a function of t^2; both branches stay finite, so that gradients are clean at zero."""
     small = squared < _SMALL_SQUARED_ANGLE
     angle = xp.sqrt(xp.where(small, xp.ones_like(squared), squared))

@@ -42,6 +42,8 @@ class InertObject:
 
     __slots__ = ("arguments", "state")
     origin: str
+    arguments: tuple[Any, ...]
+    state: Any
 
     def __new__(cls, *arguments: Any) -> InertObject:
         self = super().__new__(cls)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
@@ -21,7 +22,7 @@ _BURIED_PROBE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SignedDistance:
-    """Where N points lie with respect to a surface.
+    """The place of N points with respect to a surface.
 
     Attributes:
         distance: (N,) metres, negative inside.
@@ -32,12 +33,12 @@ class SignedDistance:
         on_border: (N,) bool, `closest` lies on an edge with one face, where an open surface has no sides.
     """
 
-    distance: np.ndarray
-    closest: np.ndarray
-    gradient: np.ndarray
-    normal: np.ndarray
-    face: np.ndarray
-    on_border: np.ndarray
+    distance: Float64[np.ndarray, " N"]
+    closest: Float64[np.ndarray, "N 3"]
+    gradient: Float64[np.ndarray, "N 3"]
+    normal: Float64[np.ndarray, "N 3"]
+    face: Int64[np.ndarray, " N"]
+    on_border: Bool[np.ndarray, " N"]
 
 
 class SignedDistanceField:
@@ -91,6 +92,7 @@ class SignedDistanceField:
         return outer
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
+        assert self._winding is not None, "asked of solids alone"
         return self._winding.winding_number(points) > 0.5
 
     def _index_edges(self) -> None:
@@ -107,7 +109,7 @@ class SignedDistanceField:
         self._vertex_border = np.zeros(mesh.vertex_count, dtype=bool)
         self._vertex_border[edges[self._edge_border]] = True
 
-    def query(self, points: np.ndarray) -> SignedDistance:
+    def query(self, points: Float[np.ndarray, "N 3"]) -> SignedDistance:
         """Signed distance of (N, 3) points, metres."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -143,8 +145,10 @@ class SignedDistanceField:
         return normal, on_border
 
 
-def barycentric_coordinates(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(N, 3) barycentric coordinates of points in the planes of (N, 3, 3) triangles with an area; rows sum to 1."""
+def barycentric_coordinates(
+    points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "N 3 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """The barycentric coordinates of points in the planes of triangles with an area; rows sum to 1."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = points - triangles[:, 0]
     normal = np.cross(a, b)

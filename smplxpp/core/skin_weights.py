@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int32
 
 from smplxpp.core.errors import InputError
 
@@ -24,26 +25,28 @@ class SkinWeights:
         policies: the policy taken for each component ("matched", "nearest", "rigid:head", ...).
     """
 
-    joint_indices: np.ndarray
-    joint_weights: np.ndarray
+    joint_indices: Int32[np.ndarray, "N K"]
+    joint_weights: Float64[np.ndarray, "N K"]
     joint_count: int
-    matched: np.ndarray
-    distance: np.ndarray
-    angle: np.ndarray
-    component: np.ndarray
+    matched: Bool[np.ndarray, " N"]
+    distance: Float64[np.ndarray, " N"]
+    angle: Float64[np.ndarray, " N"]
+    component: Int32[np.ndarray, " N"]
     policies: tuple[str, ...] = field(default=())
 
     def __len__(self) -> int:
         return len(self.joint_indices)
 
-    def dense(self) -> np.ndarray:
-        """(N, J) float64; every row sums to 1."""
+    def dense(self) -> Float64[np.ndarray, "N J"]:
+        """The weights of every joint; every row sums to 1."""
         out = np.zeros((len(self), self.joint_count))
         np.add.at(out, (np.arange(len(self))[:, None], self.joint_indices), self.joint_weights)
         return out
 
     @staticmethod
-    def from_dense(weights: np.ndarray, *, max_influences: int | None = None, **provenance) -> SkinWeights:
+    def from_dense(
+        weights: Float[np.ndarray, "N J"], *, max_influences: int | None = None, **provenance
+    ) -> SkinWeights:
         """Keep the `max_influences` largest of each row of (N, J) weights, clip at 0, renormalise.
 
         Raises:

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:
-    """At most `count` of the values, evenly from the first to the last, both among them."""
+    """Pick at most `count` of the values, evenly from the first to the last, both among them."""
     if not len(values):
         return []
     chosen = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
@@ -19,6 +19,6 @@ def spread(values: Sequence[T], count: int) -> list[T]:
 
 
 def spread_inside(values: Sequence[T], count: int) -> list[T]:
-    """At most `count` of the values, each from the middle of its share of the sequence."""
+    """Pick at most `count` of the values, each from the middle of its share of the sequence."""
     count = min(count, len(values))
     return [values[int((k + 0.5) * len(values) / count)] for k in range(count)]

@@ -6,16 +6,19 @@ A half-edge `h = 3 f + k` runs from corner k of face f to the next corner.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 
-def half_edges(faces: np.ndarray) -> np.ndarray:
-    """(3M, 2) start and end vertex of every half-edge."""
+def half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "H 2"]:
+    """The start and end vertex of every half-edge, H = 3 M."""
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
-def edge_groups(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def edge_groups(
+    faces: Int[np.ndarray, "M 3"],
+) -> tuple[Int[np.ndarray, " H"], Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
     """Half-edges gathered by undirected edge.
 
     Returns (3M,) half-edges sorted by edge (then by index), and for each of the E edges the start of its run and the
@@ -29,15 +32,15 @@ def edge_groups(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return order, first, np.diff(first, append=len(key))
 
 
-def paired_half_edges(faces: np.ndarray) -> np.ndarray:
-    """(P, 2) the two half-edges of every edge that has exactly two faces, lower index first."""
+def paired_half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "P 2"]:
+    """The two half-edges of every edge that has exactly two faces, lower index first."""
     order, first, count = edge_groups(faces)
     start = first[count == 2]
     return np.stack([order[start], order[start + 1]], axis=1)
 
 
-def face_adjacency(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 2) pairs of faces that share an edge, each pair once an edge, and (P, 2) that edge's vertices.
+def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"], Int[np.ndarray, "P 2"]]:
+    """The pairs of faces that share an edge, each pair once an edge, and that edge's vertices.
 
     At an edge with more than two faces, faces that follow each other in index order are paired.
     """
@@ -49,8 +52,8 @@ def face_adjacency(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pairs // 3, half_edges(faces)[pairs[:, 0]]
 
 
-def component_labels(pairs: np.ndarray, count: int) -> np.ndarray:
-    """(count,) component of every node of the graph with edges `pairs`, numbered by lowest node."""
+def component_labels(pairs: Int[np.ndarray, "P 2"], count: int) -> Int[np.ndarray, " count"]:
+    """The component of every node of the graph with edges `pairs`, numbered by lowest node."""
     graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels = connected_components(graph, directed=False)[1]
     first = np.full(int(labels.max(initial=-1)) + 1, count)
@@ -60,12 +63,12 @@ def component_labels(pairs: np.ndarray, count: int) -> np.ndarray:
     return rank[labels]
 
 
-def face_components(faces: np.ndarray) -> np.ndarray:
-    """(M,) edge-connected component of every face."""
+def face_components(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
+    """The edge-connected component of every face."""
     return component_labels(face_adjacency(faces)[0], len(faces))
 
 
-def manifold_corners(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def manifold_corners(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "M 3"], Int[np.ndarray, " n"]]:
     """Cut the surface where it is not a two-manifold, by giving corners new vertices.
 
     Corners of a vertex stay together when a chain of edges, each with exactly two faces of opposite direction, joins
@@ -92,7 +95,7 @@ def manifold_corners(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return place[fan].reshape(-1, 3), vertex_of_fan[order]
 
 
-def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
     """The vertices of every border loop of a manifold surface, in the direction of its faces, from its lowest index.
 
     Loops come in order of their lowest vertex.

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pygltflib
+from jaxtyping import Float64, Int
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.template.template import Template
@@ -22,7 +24,9 @@ DEFAULT_FPS = 30.0
 _STILL = 1e-6
 
 
-def joint_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np.ndarray]:
+def joint_motion(
+    template: Template, params: BodyParams
+) -> tuple[Float64[np.ndarray, "T J 3 3"], Float64[np.ndarray, "T J 3"]]:
     """Each joint's rotation and translation in its parent's frame, so that glTF's skinning gives the template's pose.
 
     The inverse bind matrices stand for the neutral joints `J`. An expression moves joints (the jaw's, the eyes') by
@@ -40,16 +44,16 @@ def joint_motion(template: Template, params: BodyParams) -> tuple[np.ndarray, np
         InputError: more expressions than the template has, a skeleton outside the SMPL family, hand coefficients that
             the template cannot expand.
     """
-    if template.joint_count not in JOINT_NAMES:
+    if template.body.joint_count not in JOINT_NAMES:
         raise InputError(
             "animation",
             expected=f"a template of {', '.join(map(str, sorted(JOINT_NAMES)))} joints, as the parameters",
-            received=f"{template.joint_count} joints",
+            received=f"{template.body.joint_count} joints",
             remedy="write the file without an animation",
         )
     posed = _joints_alone(template).forward(replace(params, betas=np.zeros((len(params), 0))))
     global_rotations = posed.posed_from_rest[..., :3, :3]
-    parents = template.parents
+    parents = template.body.parents
     above = np.where((parents >= 0)[:, None, None], global_rotations[:, parents], np.eye(3))
     rotations = above.swapaxes(-1, -2) @ global_rotations
     moved = posed.rest_joints - template.joints
@@ -64,7 +68,7 @@ def add_animation(
     template: Template,
     params: BodyParams,
     *,
-    joint_nodes: np.ndarray,
+    joint_nodes: Int[np.ndarray, " J"],
     morph_node: int | None,
 ) -> None:
     """Add the frames as the animation "motion".
@@ -90,7 +94,7 @@ def add_animation(
     if morph_node is None:
         params = replace(params, expression=np.zeros((len(params), 0)))
     rotations, translations = joint_motion(template, params)
-    if template.pose_basis is not None:
+    if template.body.posedirs is not None:
         warnings.warn(
             "animation: the pose correctives of the template are left out, glTF has no place for them",
             GeometryWarning,
@@ -108,10 +112,10 @@ def add_animation(
     moved = np.abs(translations - rest_offsets(template)).max(axis=(0, 2)) > _STILL
     for j, (node, quaternions) in enumerate(zip(joint_nodes, _quaternions(rotations), strict=True)):
         add_channel(node, "rotation", quaternions)
-        if moved[j] or template.parents[j] < 0:
+        if moved[j] or template.body.parents[j] < 0:
             add_channel(node, "translation", translations[:, j])
     if morph_node is not None:
-        weights = np.zeros((len(params), template.expression_basis.shape[2]))
+        weights = np.zeros((len(params), template.body.num_expressions))
         weights[:, : params.expression.shape[1]] = params.expression
         add_channel(morph_node, "weights", weights.reshape(-1))
     gltf.animations.append(animation)
@@ -119,7 +123,7 @@ def add_animation(
 
 def _joints_alone(template: Template) -> BodyModel:
     """The body model with its joints as the only vertices; being linear in the vertices, they move as in the model."""
-    model, regressor = template.body_model, template.joint_regressor
+    model, regressor = template.body, template.body.joint_regressor
     eye = np.eye(model.joint_count)
     return replace(
         model,
@@ -130,6 +134,8 @@ def _joints_alone(template: Template) -> BodyModel:
         posedirs=None,
         joint_regressor=eye,
         weights=eye,
+        part_labels=np.arange(model.joint_count),
+        part_label_names=model.joint_names,
     )
 
 
@@ -143,10 +149,9 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def _times(params: BodyParams) -> np.ndarray:
-    """(T,) float32 seconds."""
+    """The frames' times (T,), float32 seconds."""
     fps = DEFAULT_FPS if params.fps is None else params.fps
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("animation: fps", expected="a positive number of frames a second", received=str(fps))
+    require_positive("animation: fps, frames a second", fps)
     if not len(params):
         raise InputError("animation", expected="at least one frame", received="none")
     return (np.arange(len(params)) / fps).astype(np.float32)

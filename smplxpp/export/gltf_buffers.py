@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pygltflib
+from jaxtyping import Float32, Int, Shaped
 
 _COMPONENT_TYPES = {
     np.dtype(np.uint8): pygltflib.UNSIGNED_BYTE,
@@ -27,7 +28,12 @@ class BufferBuilder:
         self._size = 0
 
     def add(
-        self, array: np.ndarray, *, target: int | None = None, normalized: bool = False, bounds: bool = False
+        self,
+        array: Shaped[np.ndarray, "N ..."],
+        *,
+        target: int | None = None,
+        normalized: bool = False,
+        bounds: bool = False,
     ) -> int:
         """Store an array.
 
@@ -48,7 +54,7 @@ class BufferBuilder:
             accessor.min, accessor.max = _bounds(array)
         return self._append(accessor)
 
-    def add_sparse(self, array: np.ndarray, rows: np.ndarray) -> int:
+    def add_sparse(self, array: Float32[np.ndarray, "N 3"], rows: Int[np.ndarray, " n"]) -> int:
         """Store the given rows of a (N, 3) float32 array that is zero elsewhere; the bounds are always stated.
 
         Few moved rows are stored with their indices, many as a full array, whichever is smaller; none at all take no

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pygltflib
+from jaxtyping import UInt8, UInt16
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from smplxpp.core.labels import LABELS
@@ -50,7 +51,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
         )
         gltf.materials.append(_material(template, name, rows))
         mesh = pygltflib.Mesh(name=name, primitives=[primitive])
-        if morph_targets and name == BODY_PART and template.expression_basis.shape[2]:
+        if morph_targets and name == BODY_PART and template.body.num_expressions:
             _add_expressions(buffers, template, mesh)
         nodes.append(len(gltf.nodes))
         gltf.nodes.append(pygltflib.Node(name=name, mesh=len(gltf.meshes), skin=0))
@@ -58,8 +59,8 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     return nodes
 
 
-def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 sRGB -> (N, 4) uint16 linear RGB and full alpha.
+def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
+    """Convert sRGB to linear RGB with full alpha.
 
     Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge (IEC 61966-2-1).
     """
@@ -71,14 +72,14 @@ def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
 
 def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh) -> None:
     # (E, Vb, 3): each target's rows lie together.
-    offsets = np.ascontiguousarray(np.moveaxis(template.expression_basis, 2, 0))
+    offsets = np.ascontiguousarray(np.moveaxis(template.body.exprdirs, 2, 0), dtype=np.float32)
     moved = np.einsum("evc,evc->ev", offsets, offsets) > _STILL**2
     mesh.primitives[0].targets = [
         {"POSITION": buffers.add_sparse(target, np.flatnonzero(rows))}
         for target, rows in zip(offsets, moved, strict=True)
     ]
     mesh.weights = [0.0] * len(offsets)
-    mesh.extras = {"targetNames": list(template.expression_names)}
+    mesh.extras = {"targetNames": list(template.body.expression_names)}
 
 
 def _unit_normals(template: Template) -> np.ndarray:

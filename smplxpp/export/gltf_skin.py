@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pygltflib
+from jaxtyping import Float32, Float64, Int, Integer
 
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.export.gltf_buffers import BufferBuilder
@@ -16,7 +17,7 @@ MAX_INFLUENCES = 8
 _WEIGHT_STEP = 2.0**-24
 
 
-def quantized_influences(weights: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
+def quantized_influences(weights: SkinWeights) -> tuple[Integer[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
     """The strongest influences of every vertex, strongest first, in float32 weights whose rows sum to exactly 1.
 
     At most 8 joints are kept and renormalised. Weights are rounded to multiples of 2^-24; what a row lacks to 1 goes to
@@ -38,7 +39,9 @@ def quantized_influences(weights: SkinWeights) -> tuple[np.ndarray, np.ndarray]:
     return joints.astype(dtype), (steps * _WEIGHT_STEP).astype(np.float32)
 
 
-def influence_sets(joints: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def influence_sets(
+    joints: Integer[np.ndarray, "N K"], weights: Float32[np.ndarray, "N K"]
+) -> list[tuple[Integer[np.ndarray, "N 4"], Float32[np.ndarray, "N 4"]]]:
     """Split (N, K) influences into sets of 4 for JOINTS_n and WEIGHTS_n, as many as a vertex among these needs."""
     used = max(1, int((weights > 0).sum(axis=1).max(initial=0)))
     fill = ((0, 0), (0, -used % SET_SIZE))
@@ -46,7 +49,7 @@ def influence_sets(joints: np.ndarray, weights: np.ndarray) -> list[tuple[np.nda
     return [(joints[:, k : k + SET_SIZE], weights[:, k : k + SET_SIZE]) for k in range(0, joints.shape[1], SET_SIZE)]
 
 
-def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) -> np.ndarray:
+def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) -> Int[np.ndarray, " J"]:
     """Add the skeleton: a root node, a node for each joint at rest, and the skin that binds them.
 
     A joint's node holds its offset from its parent; its inverse bind matrix is the translation by `-J_j`, so that
@@ -55,13 +58,13 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
     Returns:
         (J,) indices of the joints' nodes. The skeleton's root node is the one before the first.
     """
-    joints, parents = template.joints, template.parents
+    joints, parents = template.joints, template.body.parents
     root = len(gltf.nodes)
     nodes = root + 1 + np.arange(len(parents))
     offsets = rest_offsets(template)
     children = [nodes[parents == j].tolist() for j in range(-1, len(parents))]
     gltf.nodes.append(pygltflib.Node(name="skeleton", children=children[0]))
-    for name, offset, below in zip(template.joint_names, offsets, children[1:], strict=True):
+    for name, offset, below in zip(template.body.joint_names, offsets, children[1:], strict=True):
         gltf.nodes.append(pygltflib.Node(name=name, translation=offset.tolist(), children=below))
     inverse_binds = np.tile(np.eye(4, dtype=np.float32), (len(parents), 1, 1))
     inverse_binds[:, :3, 3] = -joints
@@ -73,7 +76,7 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
     return nodes
 
 
-def rest_offsets(template: Template) -> np.ndarray:
-    """(J, 3) of each rest joint from its parent, of a root from the origin; metres."""
-    joints, parents = template.joints, template.parents
+def rest_offsets(template: Template) -> Float64[np.ndarray, "J 3"]:
+    """The way to each rest joint from its parent, to a root from the origin; metres."""
+    joints, parents = template.joints, template.body.parents
     return joints - np.where(parents[:, None] >= 0, joints[parents], 0.0)

@@ -20,13 +20,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)
 class Convention:
-    """One definition of P2S and Chamfer; see the module's equations.
+    """A definition of P2S and Chamfer; see the module's equations.
 
     Attributes:
         name: of the preset.
@@ -50,7 +51,7 @@ class Convention:
     definition: str
     source: str
 
-    def directed(self, distance: np.ndarray) -> float:
+    def directed(self, distance: Float[np.ndarray, " P"]) -> float:
         """Mean of one direction's distances (P,) in metres, in this convention's unit."""
         return float(self.scale * np.mean(distance**self.power))
 
@@ -165,6 +166,5 @@ def convention_named(name: str) -> Convention:
         InputError: no such preset.
     """
     known = presets()
-    if name not in known:
-        raise InputError("preset", expected=f"one of {', '.join(known)}", received=repr(name))
+    require_choice("preset", name, tuple(known))
     return known[name]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import partial
 
 import igl
 import numpy as np
+from jaxtyping import Float64, Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
+from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.metrics.conventions import DEFAULT, Convention, convention_named
 from smplxpp.metrics.sampling import (
     SurfaceSamples,
@@ -56,11 +59,11 @@ class DirectedDistances:
     """
 
     samples: SurfaceSamples
-    distance: np.ndarray
-    closest: np.ndarray
-    face: np.ndarray
-    angle: np.ndarray
-    label: np.ndarray | None = None
+    distance: Float64[np.ndarray, " P"]
+    closest: Float64[np.ndarray, "P 3"]
+    face: Int64[np.ndarray, " P"]
+    angle: Float64[np.ndarray, " P"]
+    label: Int64[np.ndarray, " P"] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,9 @@ class MeshComparison:
         return asdict(self)
 
 
-def point_to_surface(points: np.ndarray, mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def point_to_surface(
+    points: Num[np.ndarray, "P 3"], mesh: TriangleMesh
+) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Closest points of `mesh` to (P, 3) points: distance (P,) metres, closest (P, 3), face (P,).
 
     Exact, in float64, by an axis-aligned box tree (libigl). Faces without area are not hit: they add no surface.
@@ -136,8 +141,8 @@ def directed_distances(
     samples: int = 100_000,
     seed: int = 0,
     preset: str = DEFAULT,
-    source_labels: np.ndarray | None = None,
-    target_labels: np.ndarray | None = None,
+    source_labels: Shaped[np.ndarray, " S"] | None = None,
+    target_labels: Shaped[np.ndarray, " T"] | None = None,
     config: CompareConfig | None = None,
 ) -> DirectedDistances:
     """Distances from points of `source` to `target`, one by one (for histograms and heat maps); see `compare`.
@@ -182,8 +187,8 @@ def compare(
     samples: int = 100_000,
     seed: int = 0,
     preset: str = DEFAULT,
-    pred_labels: np.ndarray | None = None,
-    gt_labels: np.ndarray | None = None,
+    pred_labels: Shaped[np.ndarray, " S"] | None = None,
+    gt_labels: Shaped[np.ndarray, " T"] | None = None,
     config: CompareConfig | None = None,
 ) -> MeshComparison:
     """Compare a predicted surface with the true one.
@@ -208,15 +213,11 @@ def compare(
         >>> result.p2s, result.gt_to_pred.p95, result.labels["upper"].chamfer
     """
     convention, config = convention_named(preset), config or CompareConfig()
-    if not 0 < config.threshold_mm < np.inf or not 0 <= config.visible_tolerance < np.inf:
-        raise InputError(
-            "comparison config",
-            expected="threshold_mm > 0 and visible_tolerance >= 0",
-            received=f"{config.threshold_mm} and {config.visible_tolerance}",
-        )
-    common = {"samples": samples, "seed": seed, "preset": preset, "config": config}
-    forth = directed_distances(pred, gt, source_labels=pred_labels, target_labels=gt_labels, **common)
-    back = directed_distances(gt, pred, source_labels=gt_labels, target_labels=pred_labels, **common)
+    require_positive("comparison config threshold_mm", config.threshold_mm)
+    require_at_least("comparison config visible_tolerance", config.visible_tolerance, 0.0)
+    measure = partial(directed_distances, samples=samples, seed=seed, preset=preset, config=config)
+    forth = measure(pred, gt, source_labels=pred_labels, target_labels=gt_labels)
+    back = measure(gt, pred, source_labels=gt_labels, target_labels=pred_labels)
     return summarize(forth, back, convention=convention, threshold_mm=config.threshold_mm)
 
 
@@ -242,24 +243,30 @@ def _summary(
     threshold_mm: float,
     labels: dict[str, MeshComparison],
 ) -> MeshComparison:
-    stats = [_stats(d, mask) for d, mask in zip((forth, back), masks, strict=True)]
+    there, back_again = _stats(forth, masks[0]), _stats(back, masks[1])
     distances = [d.distance[mask] for d, mask in zip((forth, back), masks, strict=True)]
     directed = [convention.directed(d) if len(d) else None for d in distances]
-    shares = [float(np.mean(d * MM <= threshold_mm)) if len(d) else None for d in distances]
-    both = None not in directed
-    total = sum(shares) if both else 0.0
+    precision, recall = (float(np.mean(d * MM <= threshold_mm)) if len(d) else None for d in distances)
+    chamfer = hausdorff = fscore = None
+    if directed[0] is not None and directed[1] is not None:
+        chamfer = convention.chamfer(directed[0], directed[1])
+    if there is not None and back_again is not None:
+        hausdorff = max(there.max, back_again.max)
+    if precision is not None and recall is not None:
+        # Nothing within the threshold on either side is a score of 0, not an undefined one.
+        total = precision + recall
+        fscore = 2.0 * precision * recall / total if total else 0.0
     return MeshComparison(
         convention=convention.name,
         unit=convention.unit,
         p2s=directed[0 if convention.p2s_direction == "pred_to_gt" else 1],
-        chamfer=convention.chamfer(*directed) if both else None,
-        pred_to_gt=stats[0],
-        gt_to_pred=stats[1],
-        hausdorff=max(s.max for s in stats) if both else None,
-        precision=shares[0],
-        recall=shares[1],
-        # Nothing within the threshold on either side is a score of 0, not an undefined one.
-        fscore=(2.0 * shares[0] * shares[1] / total if total else 0.0) if both else None,
+        chamfer=chamfer,
+        pred_to_gt=there,
+        gt_to_pred=back_again,
+        hausdorff=hausdorff,
+        precision=precision,
+        recall=recall,
+        fscore=fscore,
         threshold_mm=threshold_mm,
         labels=labels,
     )

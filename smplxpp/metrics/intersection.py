@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.validation import require_at_least
 from smplxpp.metrics.distance import MM
 
 # Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
@@ -32,8 +34,8 @@ class PenetrationReport:
     depth_mean_mm: float
     depth_max_mm: float
     clearance_mm: float
-    signed_distance: np.ndarray
-    penetrating: np.ndarray
+    signed_distance: Float64[np.ndarray, " N"]
+    penetrating: Bool[np.ndarray, " N"]
 
     def as_dict(self) -> dict:
         """The scalars, for JSON."""
@@ -41,7 +43,9 @@ class PenetrationReport:
         return {name: getattr(self, name) for name in names}
 
 
-def signed_distance(points: np.ndarray, mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def signed_distance(
+    points: Float[np.ndarray, "P 3"], mesh: TriangleMesh
+) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Signed distance (P,) of (P, 3) points to `mesh`, negative inside; closest points (P, 3) and faces (P,).
 
     Inside is where the generalised winding number is above 1/2, the distance is to the outer surface
@@ -55,7 +59,9 @@ def signed_distance(points: np.ndarray, mesh: TriangleMesh) -> tuple[np.ndarray,
     return found.distance, found.closest, found.face
 
 
-def penetration(outer: TriangleMesh | np.ndarray, inner: TriangleMesh, *, clearance: float = 0.0) -> PenetrationReport:
+def penetration(
+    outer: TriangleMesh | Float[np.ndarray, "N 3"], inner: TriangleMesh, *, clearance: float = 0.0
+) -> PenetrationReport:
     """How far vertices of `outer` (a mesh, or points (N, 3)) lie inside `inner` or nearer than `clearance` metres.
 
     Raises:
@@ -64,8 +70,7 @@ def penetration(outer: TriangleMesh | np.ndarray, inner: TriangleMesh, *, cleara
     points = outer.vertices if isinstance(outer, TriangleMesh) else np.asarray(outer, dtype=np.float64)
     if not len(points):
         raise InputError("outer layer", expected="points", received="none")
-    if not 0 <= clearance < np.inf:
-        raise InputError("clearance", expected="0 or more metres", received=str(clearance))
+    require_at_least("clearance in metres", clearance, 0.0)
     signed, _, _ = signed_distance(points, inner)
     penetrating = signed < clearance - SIGN_RESOLUTION * inner.bbox_diagonal
     depth = (clearance - signed[penetrating]) * MM

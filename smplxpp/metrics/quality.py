@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Float64, Integer
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels
@@ -67,7 +68,7 @@ class MeshQuality:
         return not self.border_edges
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain numbers, for JSON."""
         return {**asdict(self), "manifold": self.manifold, "closed": self.closed}
 
 
@@ -111,8 +112,8 @@ def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> Mesh
     )
 
 
-def aspect_ratios(mesh: TriangleMesh) -> np.ndarray:
-    """(M,) circumradius / (2 inradius) = abc (a + b + c) / (16 A^2): 1 for an equilateral face, inf without area."""
+def aspect_ratios(mesh: TriangleMesh) -> Float64[np.ndarray, " M"]:
+    """The ratio circumradius / (2 inradius) = abc (a + b + c) / (16 A^2): 1 if equilateral, inf without area."""
     t = mesh.triangles
     a, b, c = (np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3))
     return np.divide(
@@ -120,8 +121,8 @@ def aspect_ratios(mesh: TriangleMesh) -> np.ndarray:
     )
 
 
-def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
-    """(L,) metres: length of each connected piece of border (a loop, where the mesh is manifold)."""
+def border_loop_lengths(mesh: TriangleMesh) -> Float64[np.ndarray, " L"]:
+    """The length in metres of each connected piece of border (a loop, where the mesh is manifold)."""
     border = mesh.border_edges
     if not len(border):
         return np.zeros(0)
@@ -132,8 +133,8 @@ def border_loop_lengths(mesh: TriangleMesh) -> np.ndarray:
     return np.bincount(piece, length)
 
 
-def fan_counts(mesh: TriangleMesh) -> np.ndarray:
-    """(N,) number of fans at each vertex: groups of its faces that hang together by edges at the vertex."""
+def fan_counts(mesh: TriangleMesh) -> Integer[np.ndarray, " N"]:
+    """The number of fans at each vertex: groups of its faces that hang together by edges at the vertex."""
     f, m = mesh.faces, mesh.face_count
     # Half-edge k of a face runs from corner k to corner k + 1; corner k of face i is node k * m + i.
     tail, head = np.arange(3 * m), np.roll(np.arange(3 * m), -m)
@@ -149,8 +150,8 @@ def fan_counts(mesh: TriangleMesh) -> np.ndarray:
     return np.bincount(vertex[first], minlength=mesh.vertex_count)
 
 
-def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:
-    """(E,) bool, in the order of `mesh.edges`: two faces run along the edge in the same direction."""
+def inconsistent_edges(mesh: TriangleMesh) -> Bool[np.ndarray, " E"]:
+    """The edges, in the order of `mesh.edges`, along which two faces run in the same direction."""
     edges, counts = mesh.edges_with_counts
     f, n = mesh.faces, mesh.vertex_count
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
@@ -159,8 +160,8 @@ def inconsistent_edges(mesh: TriangleMesh) -> np.ndarray:
     return (counts == 2) & (np.bincount(index, direction, minlength=len(edges)) != 0)
 
 
-def flipped_against_majority(mesh: TriangleMesh) -> np.ndarray:
-    """(M,) bool: faces wound against the majority of their orientable patch (libigl's `bfs_orient`)."""
+def flipped_against_majority(mesh: TriangleMesh) -> Bool[np.ndarray, " M"]:
+    """The faces wound against the majority of their orientable patch (libigl's `bfs_orient`)."""
     oriented, patch = igl.bfs_orient(mesh.faces)
     # The same cyclic order means that the face was kept; faces with a repeated corner have no orientation.
     kept = np.zeros(mesh.face_count, dtype=bool)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,14 +22,14 @@ class SurfaceSamples:
         normals: (P, 3) float64 unit normals, see `interpolated_normals`.
     """
 
-    points: np.ndarray
-    face: np.ndarray
-    normals: np.ndarray
+    points: Float64[np.ndarray, "P 3"]
+    face: Int64[np.ndarray, " P"]
+    normals: Float64[np.ndarray, "P 3"]
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, mask: np.ndarray) -> SurfaceSamples:
+    def select(self, mask: Bool[np.ndarray, " P"] | Integer[np.ndarray, " p"]) -> SurfaceSamples:
         """The points selected by a mask or index array."""
         return SurfaceSamples(self.points[mask], self.face[mask], self.normals[mask])
 
@@ -43,8 +45,7 @@ def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...
     Raises:
         InputError: `count` below 1, or a mesh without area.
     """
-    if count < 1:
-        raise InputError("sample count", expected="at least 1", received=str(count))
+    require_at_least("sample count", count, 1)
     require_surface(mesh, "mesh to sample")
     rng = np.random.Generator(np.random.PCG64(seed))
     cumulative = np.cumsum(mesh.face_areas)
@@ -65,8 +66,10 @@ def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
     return SurfaceSamples(mesh.vertices[vertex], first // 3, mesh.vertex_normals[vertex])
 
 
-def interpolated_normals(mesh: TriangleMesh, face: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-    """(P, 3) unit normals at barycentric coordinates (P, 3) of faces (P,), from the angle-weighted vertex normals.
+def interpolated_normals(
+    mesh: TriangleMesh, face: Integer[np.ndarray, " P"], barycentric: Float[np.ndarray, "P 3"]
+) -> Float64[np.ndarray, "P 3"]:
+    """The unit normals at barycentric coordinates of faces, from the angle-weighted vertex normals.
 
     Not the faces' own normals: the closest point of a convex surface often lies on an edge or a vertex, where the
     choice of the face, and so the angle, would be left to rounding.
@@ -74,7 +77,7 @@ def interpolated_normals(mesh: TriangleMesh, face: np.ndarray, barycentric: np.n
     return normalize_rows(np.einsum("pk,pkd->pd", barycentric, mesh.vertex_normals[mesh.faces[face]]))
 
 
-def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarray:
+def check_labels(mesh: TriangleMesh, labels: Shaped[np.ndarray, " N"], name: str) -> Int64[np.ndarray, " N"]:
     """Labels of faces (M,) or vertices (N,) as int64.
 
     Raises:
@@ -92,8 +95,13 @@ def check_labels(mesh: TriangleMesh, labels: np.ndarray, name: str) -> np.ndarra
     return labels.astype(np.int64)
 
 
-def labels_at(mesh: TriangleMesh, labels: np.ndarray, face: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(P,) labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
+def labels_at(
+    mesh: TriangleMesh,
+    labels: Integer[np.ndarray, " N"],
+    face: Integer[np.ndarray, " P"],
+    points: Float[np.ndarray, "P 3"],
+) -> Int64[np.ndarray, " P"]:
+    """The labels of points that lie on `face`: the face's own, or that of its corner nearest to the point."""
     if len(labels) == mesh.face_count:
         return labels[face]
     corner = np.linalg.norm(mesh.triangles[face] - points[:, None], axis=2).argmin(axis=1)

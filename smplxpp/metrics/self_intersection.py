@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Int64
 
 from smplxpp.core.mesh import TriangleMesh
 
@@ -14,8 +15,8 @@ TOLERANCE = 1e-9
 PAIRS_AT_ONCE = 500_000
 
 
-def self_intersections(mesh: TriangleMesh) -> np.ndarray:
-    """(P, 2) pairs of faces, lower index first, sorted, where an edge of one passes through the inside of the other.
+def self_intersections(mesh: TriangleMesh) -> Int64[np.ndarray, "P 2"]:
+    """The pairs of faces, lower index first, sorted, where an edge of one passes through the inside of the other.
 
     Faces that share an edge are neighbours and never a pair; touching and overlap in one plane are not counted.
     Candidates come from a uniform grid over the faces' boxes; the test is that of edges against triangles.

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.validation import require_positive
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,12 @@ class StretchReport:
     flipped_faces: int
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain numbers, for JSON."""
         return asdict(self)
 
 
-def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
-    """(E,) length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
+def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> Float64[np.ndarray, " E"]:
+    """The length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
 
     Raises:
         InputError: the meshes differ in faces or number of vertices, or have no faces.
@@ -49,8 +51,8 @@ def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
     return np.divide(after, before, out=np.full(len(before), np.nan), where=before > 0)
 
 
-def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> np.ndarray:
-    """(M,) bool: faces that agree with their edge neighbours at rest and oppose them in the pose.
+def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, " M"]:
+    """The faces that agree with their edge neighbours at rest and oppose them in the pose.
 
     A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors.
     Relative to the neighbours, so that the pose's own rotation does not count.
@@ -79,8 +81,7 @@ def stretch_report(rest: TriangleMesh, posed: TriangleMesh, *, limit: float = 3.
     Raises:
         InputError: as `edge_stretch`, a limit that is not positive, or no edge with a length.
     """
-    if not 0 < limit < np.inf:
-        raise InputError("stretch limit", expected="above 0", received=str(limit))
+    require_positive("stretch limit", limit)
     ratio = edge_stretch(rest, posed)
     known = ratio[np.isfinite(ratio)]
     if not len(known):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64, Integer, Num
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.skin_weights import SkinWeights
@@ -50,20 +51,20 @@ class WeightReport:
         return self.row_sum_error <= 1e-9 and not self.negative and not self.zero_rows
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain numbers, for JSON."""
         return {**asdict(self), "valid": self.valid}
 
 
-def total_variation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) half the L1 distance of two rows of weights (N, J): the share of a vertex that follows other joints."""
+def total_variation(a: Float[np.ndarray, "N J"], b: Float[np.ndarray, "N J"]) -> Float64[np.ndarray, " N"]:
+    """Half the L1 distance of two rows of weights: the share of a vertex that follows other joints."""
     return 0.5 * np.abs(a - b).sum(axis=1)
 
 
 def weight_report(
-    weights: np.ndarray | SkinWeights,
+    weights: Num[np.ndarray, "N J"] | SkinWeights,
     *,
-    reference: np.ndarray | SkinWeights | None = None,
-    edges: np.ndarray | None = None,
+    reference: Num[np.ndarray, "N J"] | SkinWeights | None = None,
+    edges: Integer[np.ndarray, "E 2"] | None = None,
 ) -> WeightReport:
     """Check skinning weights (N, J) and measure them against a reference (N, J) and along edges (E, 2).
 

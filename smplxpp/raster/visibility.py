@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster.zbuffer import rasterize_mesh
 
 
-def view_directions(count: int) -> np.ndarray:
+def view_directions(count: int) -> Float64[np.ndarray, "count 3"]:
     """`count` unit vectors spread evenly over the sphere (Fibonacci lattice): (count, 3)."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
@@ -27,8 +28,8 @@ def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
     ]
 
 
-def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> np.ndarray:
-    """(M,) bool: faces that own a pixel in some of `views` orthographic views from outside."""
+def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> Bool[np.ndarray, " M"]:
+    """The faces that own a pixel in some of `views` orthographic views from outside."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     for camera in _cameras(mesh, views, resolution):
         ids = rasterize_mesh(mesh, camera).face_id
@@ -37,9 +38,9 @@ def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int 
 
 
 def outer_visible_points(
-    mesh: TriangleMesh, points: np.ndarray, *, tolerance: float, views: int = 32, resolution: int = 640
-) -> np.ndarray:
-    """(P,) bool: points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
+    mesh: TriangleMesh, points: Float[np.ndarray, "P 3"], *, tolerance: float, views: int = 32, resolution: int = 640
+) -> Bool[np.ndarray, " P"]:
+    """The points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
     for camera in _cameras(mesh, views, resolution):

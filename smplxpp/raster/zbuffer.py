@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer, Num
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
@@ -23,16 +24,18 @@ class MeshMaps:
         depth: (H, W) float32, metres along the camera's z axis, inf on the background.
     """
 
-    face_id: np.ndarray
-    barycentric: np.ndarray
-    depth: np.ndarray
+    face_id: Int32[np.ndarray, "H W"]
+    barycentric: Float32[np.ndarray, "H W 3"]
+    depth: Float32[np.ndarray, "H W"]
 
     @property
-    def mask(self) -> np.ndarray:
-        """(H, W) bool: pixels covered by the mesh."""
+    def mask(self) -> Bool[np.ndarray, "H W"]:
+        """The pixels covered by the mesh."""
         return self.face_id >= 0
 
-    def interpolate(self, faces: np.ndarray, vertex_values: np.ndarray, background: float = 0.0) -> np.ndarray:
+    def interpolate(
+        self, faces: Integer[np.ndarray, "M 3"], vertex_values: Num[np.ndarray, "N D"], background: float = 0.0
+    ) -> Float64[np.ndarray, "H W D"]:
         """Vertex values (N, D) at every pixel: (H, W, D) float64; `background` where nothing is hit."""
         values = np.asarray(vertex_values)
         out = np.full((*self.face_id.shape, values.shape[1]), background, dtype=np.float64)
@@ -51,7 +54,12 @@ def rasterize_mesh(mesh: TriangleMesh, camera: Camera, *, near: float = 1e-3, th
 
 
 def rasterize_triangles(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, near: float = 1e-3, threads: int | None = None
+    vertices: Float[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "M 3"],
+    camera: Camera,
+    *,
+    near: float = 1e-3,
+    threads: int | None = None,
 ) -> MeshMaps:
     """`rasterize_mesh` for arrays that the caller has checked: vertices (N, 3) finite, faces (M, 3) within them."""
     screen = np.ascontiguousarray(camera.screen_from_world(vertices), dtype=np.float64)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Int64, Integer, Num
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -25,12 +26,14 @@ class PottsProblem:
         unary: (n, L) int64. pairs: (E, 2) nodes, each pair once. weights: (E,) int64, none negative.
     """
 
-    unary: np.ndarray
-    pairs: np.ndarray
-    weights: np.ndarray
+    unary: Int64[np.ndarray, "n L"]
+    pairs: Int64[np.ndarray, "E 2"]
+    weights: Int64[np.ndarray, " E"]
 
     @staticmethod
-    def from_costs(unary: np.ndarray, pairs: np.ndarray, weights: np.ndarray) -> PottsProblem:
+    def from_costs(
+        unary: Num[np.ndarray, "n L"], pairs: Integer[np.ndarray, "E 2"], weights: Num[np.ndarray, " E"]
+    ) -> PottsProblem:
         """Round real costs to 1/1000.
 
         Raises:
@@ -48,15 +51,15 @@ class PottsProblem:
             np.rint(weights * COST_SCALE).astype(np.int64),
         )
 
-    def energy(self, labels: np.ndarray) -> int:
+    def energy(self, labels: Integer[np.ndarray, " n"]) -> int:
         """E(L) in thousandths."""
         p, q = self.pairs.T
         return int(self.unary[np.arange(len(labels)), labels].sum() + self.weights[labels[p] != labels[q]].sum())
 
 
 def minimize_potts(
-    problem: PottsProblem, *, labels: np.ndarray | None = None, reduce: bool = True
-) -> tuple[np.ndarray, int]:
+    problem: PottsProblem, *, labels: Integer[np.ndarray, " n"] | None = None, reduce: bool = True
+) -> tuple[Int64[np.ndarray, " n"], int]:
     """Alpha-expansion to convergence: no single label can grow to a lower energy.
 
     Starts from `labels`, else from the cheapest label of each node. `reduce` leaves out of each cut the nodes that
@@ -79,7 +82,9 @@ def minimize_potts(
     return current, energy
 
 
-def expand(problem: PottsProblem, labels: np.ndarray, alpha: int, *, reduce: bool = True) -> np.ndarray:
+def expand(
+    problem: PottsProblem, labels: Integer[np.ndarray, " n"], alpha: int, *, reduce: bool = True
+) -> Int64[np.ndarray, " n"]:
     """The labelling of least energy among those where each node keeps its label or takes `alpha`.
 
     With x = 1 for "takes alpha", an edge costs A, B, C, 0 for (x_p, x_q) = 00, 01, 10, 11. All costs doubled, that is
@@ -105,7 +110,7 @@ def expand(problem: PottsProblem, labels: np.ndarray, alpha: int, *, reduce: boo
 
 
 def _may_switch(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray) -> np.ndarray:
-    """(n,) bool: a set outside which no node takes alpha in some minimal cut.
+    """A set of nodes outside which none takes alpha in some minimal cut.
 
     It starts as the nodes that gain by switching alone (cost < 0) and takes in, until nothing changes, every node i
     with cost_i < sum of the capacities to nodes inside. Then for any set S of nodes outside, switching S back to its

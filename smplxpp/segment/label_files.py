@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
@@ -32,7 +33,7 @@ def read_labels(
     face_count: int,
     label_set: str | Path | LabelSet = "4ddress",
     color_tolerance: float = 24.0,
-) -> np.ndarray:
+) -> Int64[np.ndarray, " n"]:
     """Labels of a scan's vertices (N,) or faces (M,), in our ids; which of the two, the length tells.
 
     Reads `.npz` and `.pkl` (a key such as `label`, `labels`, `scan_labels`, `face_labels`), `.npy`, and mesh files:
@@ -71,7 +72,9 @@ def read_labels(
         ) from None
 
 
-def check_element_count(values: np.ndarray, *, vertex_count: int, face_count: int, subject: str) -> bool:
+def check_element_count(
+    values: Shaped[np.ndarray, "n ..."], *, vertex_count: int, face_count: int, subject: str
+) -> bool:
     """True where `values` has one entry a vertex, False where one a face.
 
     Raises:
@@ -146,15 +149,15 @@ def _read_from_mesh(
     return labels
 
 
-def labels_from_colors(colors: np.ndarray, *, tolerance: float = 24.0) -> np.ndarray:
-    """(N, 3) uint8 display colours -> (N,) label ids; -1 farther than `tolerance` from every colour of the table."""
+def labels_from_colors(colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.0) -> Int64[np.ndarray, " N"]:
+    """The label ids of display colours; -1 farther than `tolerance` from every colour of the table."""
     table = cKDTree(np.array([label.display_rgb for label in LABELS], dtype=np.float64))
     distance, nearest = table.query(np.asarray(colors, dtype=np.float64), distance_upper_bound=tolerance + 1e-9)
     ids = np.array([label.id for label in LABELS] + [BACKGROUND])
     return np.where(np.isfinite(distance), ids[nearest], BACKGROUND)
 
 
-def read_label_map(path: str | Path, *, label_set: str | Path | LabelSet) -> np.ndarray:
+def read_label_map(path: str | Path, *, label_set: str | Path | LabelSet) -> Int64[np.ndarray, "H W"]:
     """A view's label map, (H, W) in our ids: an index PNG (palette or grey) or an integer `.npy`.
 
     Raises:

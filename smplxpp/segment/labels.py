@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64, Num
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
@@ -175,7 +176,9 @@ def find_label_set(name: str | Path | LabelSet) -> LabelSet:
     return LabelSet(path.stem, classes)
 
 
-def map_labels(ids: np.ndarray, label_set: str | Path | LabelSet | Mapping[int, int]) -> np.ndarray:
+def map_labels(
+    ids: Num[np.ndarray, "*N"], label_set: str | Path | LabelSet | Mapping[int, int]
+) -> Int64[np.ndarray, "*N"]:
     """Ids of a label set, of any shape -> ours, int64 (background -1).
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float64, Int64, Num
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
@@ -51,9 +52,9 @@ class SegmentedScan:
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
     """
 
-    face_labels: np.ndarray
-    confidence: np.ndarray
-    seen: np.ndarray
+    face_labels: Int64[np.ndarray, " M"]
+    confidence: Float64[np.ndarray, " M"]
+    seen: Bool[np.ndarray, " M"]
     island_faces: int
     energy_before: float
     energy_after: float
@@ -62,9 +63,9 @@ class SegmentedScan:
 def segment_scan(
     mesh: TriangleMesh,
     *,
-    votes: np.ndarray | None = None,
-    vertex_labels: np.ndarray | None = None,
-    face_labels: np.ndarray | None = None,
+    votes: Num[np.ndarray, "M L"] | None = None,
+    vertex_labels: Num[np.ndarray, " N"] | None = None,
+    face_labels: Num[np.ndarray, " M"] | None = None,
     config: SegmentConfig | None = None,
 ) -> SegmentedScan:
     """Label every face of a scan from one of: votes, labels of its vertices, labels of its faces.
@@ -121,7 +122,7 @@ def segment_scan(
 def _votes_of_labels(
     mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None
 ) -> np.ndarray:
-    """(M, L) three votes a face, fewer where corners are unlabelled."""
+    """Three votes (M, L) a face, fewer where corners are unlabelled."""
     name, labels, count = (
         ("vertex labels", vertex_labels, mesh.vertex_count)
         if face_labels is None
@@ -145,7 +146,7 @@ def _votes_of_labels(
 
 
 def _fold_weights(mesh: TriangleMesh, pairs: np.ndarray, ends: np.ndarray, config: SegmentConfig) -> np.ndarray:
-    """(P,) pairwise cost of a label change across each edge."""
+    """The cost (P,) of a label change across each edge."""
     length = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
     normal = mesh.face_normals
     n0, n1 = normal[pairs[:, 0]], normal[pairs[:, 1]]

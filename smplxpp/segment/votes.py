@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64, Integer
 from scipy.ndimage import distance_transform_edt
 
 from smplxpp.core.camera import Camera
@@ -18,8 +19,10 @@ _SILHOUETTE_PX = 4.0
 _LEAST_WEIGHT = 0.1
 
 
-def vote_on_faces(mesh: TriangleMesh, views: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """(M, L) sum over the views' pixels that show a face of `cos(view, normal) clip(d / 4, 0.1, 1)`.
+def vote_on_faces(
+    mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
+) -> Float64[np.ndarray, "M L"]:
+    """Sum `cos(view, normal) clip(d / 4, 0.1, 1)` over the views' pixels that show a face, for each label.
 
     d is the pixel's distance to the silhouette of the labelled foreground, in pixels. Background pixels do not vote;
     faces that look away from the camera get nothing (the far side of an open sheet).
@@ -67,7 +70,7 @@ def vote_on_faces(mesh: TriangleMesh, views: Sequence[tuple[Camera, np.ndarray]]
 
 
 def _rays(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """(P, 3) unit viewing directions in the world through pixel centres."""
+    """The unit viewing directions (P, 3) in the world through pixel centres."""
     if camera.orthographic:
         return np.broadcast_to(camera.forward, (len(row), 3))
     pixel = np.stack([col + 0.5, row + 0.5, np.ones(len(row))], axis=1)

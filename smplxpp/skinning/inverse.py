@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64, Num
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.skin_weights import SkinWeights
@@ -57,18 +58,18 @@ class Unposed:
         report: summary.
     """
 
-    vertices: np.ndarray
-    determinant: np.ndarray
+    vertices: Float64[np.ndarray, "N 3"]
+    determinant: Float64[np.ndarray, " N"]
     report: UnposeReport
 
 
 def pose(
-    rest_vertices: np.ndarray,
-    weights: SkinWeights | np.ndarray,
-    posed_from_rest: np.ndarray,
+    rest_vertices: Num[np.ndarray, "N 3"],
+    weights: SkinWeights | Float[np.ndarray, "N J"],
+    posed_from_rest: Float[np.ndarray, "J 4 4"],
     *,
-    rest_offsets: np.ndarray | None = None,
-) -> np.ndarray:
+    rest_offsets: Float[np.ndarray, "N 3"] | None = None,
+) -> Float64[np.ndarray, "N 3"]:
     """Linear blend skinning, `x = (sum_j w_j G_j) (x_T + b)`.
 
     Args:
@@ -88,11 +89,11 @@ def pose(
 
 
 def unpose(
-    posed_vertices: np.ndarray,
-    weights: SkinWeights | np.ndarray,
-    posed_from_rest: np.ndarray,
+    posed_vertices: Num[np.ndarray, "N 3"],
+    weights: SkinWeights | Float[np.ndarray, "N J"],
+    posed_from_rest: Float[np.ndarray, "J 4 4"],
     *,
-    rest_offsets: np.ndarray | None = None,
+    rest_offsets: Float[np.ndarray, "N 3"] | None = None,
     config: UnposeConfig | None = None,
 ) -> Unposed:
     """Undo linear blend skinning, `x_T = (sum_j w_j G_j)^-1 x - b`.

@@ -6,16 +6,20 @@ The kind of the result is the kind of the arguments; in torch everything is diff
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Integer
 
-from smplxpp.core.rotations import array_namespace
+from smplxpp.core.rotations import Array, array_namespace
 
 
 def forward_kinematics(
-    rest_joints: Any, parents: np.ndarray, rotations: Any, *, transl: Any | None = None
-) -> tuple[Any, Any]:
+    rest_joints: Float[Array, "... J 3"],
+    parents: Integer[np.ndarray, " J"],
+    rotations: Float[Array, "... J 3 3"],
+    *,
+    transl: Float[Array, "... 3"] | None = None,
+) -> tuple[Float[Array, "... J 4 4"], Float[Array, "... J 3"]]:
     """Transforms of a skeleton whose joints turn about themselves.
 
     With `L_j = [R_j, J_j - J_parent; 0, 1]` (the root's offset being `J_root + transl`) and `G_j = G_parent L_j`,
@@ -23,14 +27,14 @@ def forward_kinematics(
     2015, equations 3 and 4). The root turns about its own joint; the translation comes last.
 
     Args:
-        rest_joints: (..., J, 3) metres.
-        parents: (J,) integers, -1 at the root; the order of the joints is free.
-        rotations: (..., J, 3, 3), each relative to its parent's frame.
-        transl: (..., 3) metres, moves the whole body.
+        rest_joints: metres.
+        parents: -1 at the root; the order of the joints is free.
+        rotations: each relative to its parent's frame.
+        transl: metres, moves the whole body.
 
     Returns:
-        posed_from_rest: (..., J, 4, 4).
-        joints: (..., J, 3) posed joints.
+        posed_from_rest: of each joint.
+        joints: where they are in the pose, metres.
     """
     xp = array_namespace(rotations)
     parents = np.asarray(parents)
@@ -57,22 +61,26 @@ def forward_kinematics(
     return xp.concatenate([upper, last], -2), joints
 
 
-def blend_transforms(weights: Any, posed_from_rest: Any) -> Any:
-    """Weighted sums of the joints' transforms: (N, J) weights, (..., J, 4, 4) -> (..., N, 4, 4)."""
+def blend_transforms(
+    weights: Float[Array, "N J"], posed_from_rest: Float[Array, "... J 4 4"]
+) -> Float[Array, "... N 4 4"]:
+    """Each point's weighted sum of the joints' transforms."""
     flat = posed_from_rest.reshape(posed_from_rest.shape[:-2] + (16,))
     return (weights @ flat).reshape(flat.shape[:-2] + (weights.shape[0], 4, 4))
 
 
-def skin(vertices: Any, weights: Any, posed_from_rest: Any) -> Any:
+def skin(
+    vertices: Float[Array, "... V 3"], weights: Float[Array, "V J"], posed_from_rest: Float[Array, "... J 4 4"]
+) -> Float[Array, "... V 3"]:
     """Linear blend skinning, `x = sum_j w_j G_j x_rest`.
 
     Args:
-        vertices: (..., V, 3) rest positions.
-        weights: (V, J), rows sum to 1.
-        posed_from_rest: (..., J, 4, 4).
+        vertices: rest positions.
+        weights: of each vertex over the joints; rows sum to 1.
+        posed_from_rest: transforms of the joints.
 
     Returns:
-        (..., V, 3) posed positions.
+        Posed positions.
     """
     xp = array_namespace(posed_from_rest)
     batch, joint_count = tuple(posed_from_rest.shape[:-3]), posed_from_rest.shape[-3]

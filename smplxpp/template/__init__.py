@@ -1,5 +1,5 @@
 """The personalised clothed body: the naked body and its parts as one skinned mesh, and its file."""
 
-from smplxpp.template.template import Template
+from smplxpp.template.template import BODY_PART, Template
 
-__all__ = ["Template"]
+__all__ = ["BODY_PART", "Template"]

@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 
+from smplxpp.body.model import BodyModel, PosedBody
+from smplxpp.core.array_file import read_arrays, write_arrays
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, semantic_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
-
-if TYPE_CHECKING:
-    from smplxpp.body.model import BodyModel, PosedBody
+from smplxpp.core.validation import require_choice
+from smplxpp.skinning.linear_blend import skin
+from smplxpp.template import template_arrays
 
 # The name of the part that comes first.
 BODY_PART = "body"
-# How the arrays are kept; bases in float32, which is what model files hold.
+# How the template's own arrays are kept, and in its file.
 _DTYPES = {
     "vertices": np.float64,
     "faces": np.int64,
     "vertex_labels": np.int32,
     "vertex_part": np.int32,
     "vertex_colors": np.uint8,
-    "joint_regressor": np.float64,
-    "parents": np.int64,
     "betas": np.float64,
-    "shape_basis": np.float32,
-    "expression_basis": np.float32,
-    "pose_basis": np.float32,
-    "left_hand_components": np.float64,
-    "right_hand_components": np.float64,
-    "left_hand_mean": np.float64,
-    "right_hand_mean": np.float64,
-    "body_labels": np.int64,
     "body_index": np.int64,
     "scan_index": np.int64,
 }
@@ -51,101 +45,76 @@ class Template:
     pose-corrective bases; parts follow the joints alone.
 
     Attributes:
-        vertices: (V, 3) float64 T-pose, metres.
-        faces: (F, 3) int64; the body's first, then each part's, no face across parts.
-        vertex_labels: (V,) int32 ids of `smplxpp.core.labels`; skin on the body.
-        vertex_part: (V,) int32 index into `part_names`, increasing.
+        body: the naked body of this identity over J joints: its mean shape is the template's, so betas given to it are
+            changes. Its mean shape, faces and weights are taken from the first part when the template is made,
+            whatever the model given held there; its bases are rounded to float32, the precision of the file.
+        vertices: T-pose, metres.
+        faces: the body's first, then each part's, no face across parts.
+        vertex_labels: ids of `smplxpp.core.labels`; skin on the body.
+        vertex_part: index into `part_names`, increasing.
         part_names: "body", then the parts.
-        vertex_colors: (V, 3) uint8 sRGB as scanned.
+        vertex_colors: sRGB as scanned.
         weights: of all V vertices over J joints.
-        joint_regressor: (J, Vb) float64: rest joints of the body's vertices.
-        parents: (J,) int64, -1 at the root. joint_names: J names.
-        betas: (B',) the identity, B' <= B.
-        shape_basis: (Vb, 3, B) float32 metres a unit of beta.
-        expression_basis: (Vb, 3, E) float32 metres a unit; E may be 0.
-        pose_basis: (Vb, 3, 9 (J - 1)) float32 pose correctives, or None.
-        left_hand_components, right_hand_components: (K, 45) or None. left_hand_mean, right_hand_mean: (45,) or None.
-        body_labels: (Vb,) int64 index into `body_label_names`: anatomical parts of the body's file.
-        body_label_names: their names.
-        body_index: (V,) int64 the nearest body vertex at rest; its own index for a body vertex.
-        scan_index: (V,) int64 vertex of the scan that a vertex comes from, or -1.
-        expression_names: E names; numbered where none are given.
+        betas: the identity, B' <= B.
+        body_index: the nearest body vertex at rest; its own index for a body vertex.
+        scan_index: vertex of the scan that a vertex comes from, or -1.
         metadata: short texts: name of the body, versions.
 
     Raises:
         InputError: arrays that do not fit each other.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    vertex_labels: np.ndarray
-    vertex_part: np.ndarray
+    body: BodyModel
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    vertex_labels: Int32[np.ndarray, " V"]
+    vertex_part: Int32[np.ndarray, " V"]
     part_names: tuple[str, ...]
-    vertex_colors: np.ndarray
+    vertex_colors: UInt8[np.ndarray, "V 3"]
     weights: SkinWeights
-    joint_regressor: np.ndarray
-    parents: np.ndarray
-    joint_names: tuple[str, ...]
-    betas: np.ndarray
-    shape_basis: np.ndarray
-    expression_basis: np.ndarray
-    pose_basis: np.ndarray | None
-    left_hand_components: np.ndarray | None
-    right_hand_components: np.ndarray | None
-    left_hand_mean: np.ndarray | None
-    right_hand_mean: np.ndarray | None
-    body_labels: np.ndarray
-    body_label_names: tuple[str, ...]
-    body_index: np.ndarray
-    scan_index: np.ndarray
-    expression_names: tuple[str, ...] = ()
+    betas: Float64[np.ndarray, " B"]
+    body_index: Int64[np.ndarray, " V"]
+    scan_index: Int64[np.ndarray, " V"]
     metadata: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
-            value = getattr(self, name)
-            if value is not None:
-                value = np.array(value, dtype=dtype, order="C")
-                value.setflags(write=False)
-                object.__setattr__(self, name, value)
-        for name in ("part_names", "joint_names", "body_label_names", "expression_names"):
-            object.__setattr__(self, name, tuple(map(str, getattr(self, name))))
-        if len(self.expression_names) != self.expression_basis.shape[-1]:
-            numbered = tuple(f"expression_{k:02d}" for k in range(self.expression_basis.shape[-1]))
-            object.__setattr__(self, "expression_names", numbered)
+            object.__setattr__(self, name, template_arrays.read_only(getattr(self, name), dtype))
+        object.__setattr__(self, "part_names", tuple(map(str, self.part_names)))
         self._check()
+        count = self.body.vertex_count
+        body = template_arrays.completed_body(
+            self.body,
+            vertices=self.vertices[:count],
+            faces=self.faces[self.part_faces(BODY_PART)],
+            weights=self._dense_weights[:count],
+        )
+        object.__setattr__(self, "body", body)
 
     def _check(self) -> None:
-        V, J = len(self.vertices), len(self.parents)
-        Vb = self.joint_regressor.shape[-1]
+        V, J, Vb = len(self.vertices), self.body.joint_count, self.body.vertex_count
         shapes = {
             "vertices": (V, 3),
             "faces": (len(self.faces), 3),
             "vertex_labels": (V,),
             "vertex_part": (V,),
             "vertex_colors": (V, 3),
-            "joint_regressor": (J, Vb),
-            "parents": (J,),
             "betas": (len(self.betas),),
-            "shape_basis": (Vb, 3, None),
-            "expression_basis": (Vb, 3, None),
-            "pose_basis": (Vb, 3, 9 * (J - 1)),
-            "body_labels": (Vb,),
             "body_index": (V,),
             "scan_index": (V,),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
-            if value is None:
-                continue
-            fits = value.ndim == len(shape) and all(b in (None, a) for a, b in zip(value.shape, shape, strict=True))
-            _require(fits, name, f"shape {shape}", f"shape {value.shape}")
+            _require(value.shape == shape, name, f"shape {shape}", f"shape {value.shape}")
             _require(bool(np.isfinite(value).all()), name, "finite values", "NaN or infinity")
+        for name in template_arrays.BODY_KEYS:
+            value = getattr(self.body, name)
+            if isinstance(value, np.ndarray):
+                _require(bool(np.isfinite(value).all()), f"body.{name}", "finite values", "NaN or infinity")
         _require(Vb <= V, "vertices", f"at least the body's {Vb}", str(V))
         for name, bound in {
             "faces": V,
             "vertex_part": len(self.part_names),
-            "body_labels": len(self.body_label_names),
             "body_index": Vb,
             "vertex_labels": len(LABELS),
         }.items():
@@ -158,7 +127,6 @@ class Template:
             f"{V} vertices over {J} joints",
             f"{len(self.weights)} over {self.weights.joint_count}",
         )
-        _require(len(self.joint_names) == J, "joint_names", f"{J} names", str(len(self.joint_names)))
         _require(
             self.part_names[:1] == (BODY_PART,) and len(set(self.part_names)) == len(self.part_names),
             "part_names",
@@ -174,18 +142,10 @@ class Template:
     def vertex_count(self) -> int:
         return len(self.vertices)
 
-    @property
-    def body_vertex_count(self) -> int:
-        return self.joint_regressor.shape[1]
-
-    @property
-    def joint_count(self) -> int:
-        return len(self.parents)
-
     @cached_property
-    def joints(self) -> np.ndarray:
-        """(J, 3) rest joints, metres."""
-        return self.joint_regressor @ self.vertices[: self.body_vertex_count]
+    def joints(self) -> Float64[np.ndarray, "J 3"]:
+        """Rest joints, metres."""
+        return self.body.joint_regressor @ self.body.v_template
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -193,23 +153,22 @@ class Template:
         return TriangleMesh(self.vertices, self.faces)
 
     @property
-    def cloth_mask(self) -> np.ndarray:
-        """(V,) bool, vertices of clothes: upper, lower, outer."""
+    def cloth_mask(self) -> Bool[np.ndarray, " V"]:
+        """The vertices of clothes: upper, lower, outer."""
         return np.isin(self.vertex_labels, [label.id for label in CLOTH_LABELS])
 
     @property
-    def semantic_colors(self) -> np.ndarray:
-        """(V, 3) uint8 colours of the labels that a trainer sees."""
+    def semantic_colors(self) -> UInt8[np.ndarray, "V 3"]:
+        """The sRGB colours of the labels that a trainer sees."""
         return semantic_colors(self.vertex_labels)
 
-    def part_faces(self, name: str) -> np.ndarray:
-        """(F,) bool, the faces of a part.
+    def part_faces(self, name: str) -> Bool[np.ndarray, " F"]:
+        """The faces of a part.
 
         Raises:
             InputError: no such part.
         """
-        if name not in self.part_names:
-            raise InputError("part", expected=f"one of {', '.join(self.part_names)}", received=repr(name))
+        require_choice("part", name, self.part_names)
         return self.vertex_part[self.faces[:, 0]] == self.part_names.index(name)
 
     def part_mesh(self, name: str) -> TriangleMesh:
@@ -218,7 +177,7 @@ class Template:
 
     def naked(self) -> Template:
         """The body without its parts: the same person undressed, as a template of its own."""
-        count = self.body_vertex_count
+        count = self.body.vertex_count
         own = ("vertices", "vertex_labels", "vertex_part", "vertex_colors", "body_index", "scan_index")
         per_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
         weights = replace(self.weights, **{name: getattr(self.weights, name)[:count] for name in per_vertex})
@@ -231,37 +190,10 @@ class Template:
         )
 
     @cached_property
-    def body_model(self) -> BodyModel:
-        """The naked body of this identity: its mean shape is the template's, so betas given to it are changes."""
-        # The body's package builds on core; only a template that is posed reaches up to it, for the one skinning.
-        from smplxpp.body.model import BodyModel
-
-        count = self.body_vertex_count
-        return BodyModel(
-            name=self.metadata.get("body", "template"),
-            v_template=self.vertices[:count],
-            faces=self.faces[self.part_faces(BODY_PART)],
-            shapedirs=self.shape_basis.astype(np.float64),
-            exprdirs=self.expression_basis.astype(np.float64),
-            posedirs=None if self.pose_basis is None else self.pose_basis.astype(np.float64),
-            joint_regressor=self.joint_regressor,
-            parents=self.parents,
-            joint_names=self.joint_names,
-            weights=self._dense_weights[:count],
-            left_hand_components=self.left_hand_components,
-            right_hand_components=self.right_hand_components,
-            left_hand_mean=self.left_hand_mean,
-            right_hand_mean=self.right_hand_mean,
-            part_labels=self.body_labels,
-            part_label_names=self.body_label_names,
-            expression_names=self.expression_names,
-        )
-
-    @cached_property
-    def _dense_weights(self) -> np.ndarray:
+    def _dense_weights(self) -> Float64[np.ndarray, "V J"]:
         return self.weights.dense()
 
-    def pose(self, params: BodyParams) -> np.ndarray:
+    def pose(self, params: BodyParams) -> Float64[np.ndarray, "T V 3"]:
         """The template in T poses.
 
         The body takes expression and pose correctives as its model does, `x = sum_j w_j G_j (v + E psi + P vec(R - I))
@@ -272,31 +204,34 @@ class Template:
             params: T frames.
 
         Returns:
-            (T, V, 3) metres.
+            Metres.
 
         Raises:
             InputError: parameters that the body model refuses.
         """
-        from smplxpp.skinning.linear_blend import skin
-
         posed = self.posed_body(params)
-        count = self.body_vertex_count
+        count = self.body.vertex_count
         parts = skin(self.vertices[count:], self._dense_weights[count:], posed.posed_from_rest)
         return np.concatenate([posed.vertices, parts], axis=1)
 
-    def posed_from_rest(self, params: BodyParams) -> np.ndarray:
-        """(T, J, 4, 4) transforms of the joints in T poses, as `pose` applies them."""
+    def posed_from_rest(self, params: BodyParams) -> Float64[np.ndarray, "T J 4 4"]:
+        """Transforms of the joints in T poses, as `pose` applies them."""
         return self.posed_body(params).posed_from_rest
 
     def posed_body(self, params: BodyParams) -> PosedBody:
         """The naked body of this identity in T poses: what `pose` skins the parts with."""
-        return self.body_model.forward(replace(params, betas=np.zeros((len(params), 0))))
+        return self.body.forward(replace(params, betas=np.zeros((len(params), 0))))
 
     def save(self, path: str | Path) -> None:
         """Write an npz without pickled objects, whole or not at all; the same template gives the same bytes."""
-        from smplxpp.template.template_file import save_template
-
-        save_template(self, path)
+        arrays = {name: getattr(self, name) for name in _DTYPES}
+        arrays |= template_arrays.body_arrays(self.body) | template_arrays.weight_arrays(self.weights)
+        arrays |= {
+            template_arrays.SCHEMA_KEY: np.asarray(np.int64(template_arrays.SCHEMA)),
+            "part_names": template_arrays.plain_array(self.part_names),
+            "metadata": np.array(json.dumps(self.metadata, sort_keys=True)),
+        }
+        write_arrays(path, template_arrays.in_file_order(arrays))
 
     @staticmethod
     def load(path: str | Path) -> Template:
@@ -305,9 +240,49 @@ class Template:
         Raises:
             InputError: missing, damaged or foreign file, or one of a newer version.
         """
-        from smplxpp.template.template_file import load_template
+        arrays = read_arrays(path, subject="template file", remedy="the file is damaged or no template: build it again")
+        schema = arrays.pop(template_arrays.SCHEMA_KEY, None)
+        if schema is None:
+            raise InputError(
+                f"template file {path}",
+                expected="a file written by Template.save",
+                received=f"an npz with keys {sorted(arrays)[:6]}",
+            )
+        if int(schema) > template_arrays.SCHEMA:
+            raise InputError(
+                f"template file {path}",
+                expected=f"a file of version {template_arrays.SCHEMA} or older",
+                received=f"version {int(schema)}",
+                remedy="update smplxpp",
+            )
+        try:
+            return _from_arrays(arrays)
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"template file {path}",
+                expected="all arrays of a template",
+                received=f"{type(error).__name__}: {error}",
+            ) from None
 
-        return load_template(path)
+
+def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Template:
+    metadata = json.loads(str(arrays["metadata"]))
+    return Template(
+        body=template_arrays.body_from_arrays(arrays, name=metadata.get("body", "template")),
+        weights=template_arrays.weights_from_arrays(arrays),
+        part_names=tuple(map(str, arrays["part_names"])),
+        metadata=metadata,
+        vertices=arrays["vertices"],
+        faces=arrays["faces"],
+        vertex_labels=arrays["vertex_labels"],
+        vertex_part=arrays["vertex_part"],
+        vertex_colors=arrays["vertex_colors"],
+        betas=arrays["betas"],
+        body_index=arrays["body_index"],
+        scan_index=arrays["scan_index"],
+    )
 
 
 def _require(condition: bool, subject: str, expected: str, received: str) -> None:

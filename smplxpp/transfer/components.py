@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int32
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -12,17 +13,17 @@ from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
 
 
-def vertex_components(mesh: TriangleMesh) -> np.ndarray:
-    """(N,) int32 component of every vertex, numbered from 0."""
+def vertex_components(mesh: TriangleMesh) -> Int32[np.ndarray, " N"]:
+    """The component of every vertex, numbered from 0."""
     return component_labels(mesh.edges, mesh.vertex_count).astype(np.int32)
 
 
 def settle_unmatched(
-    component: np.ndarray,
-    matched: np.ndarray,
-    weights: np.ndarray,
+    component: Int32[np.ndarray, " N"],
+    matched: Bool[np.ndarray, " N"],
+    weights: Float[np.ndarray, "N J"],
     config: TransferConfig,
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+) -> tuple[Bool[np.ndarray, " N"], Float64[np.ndarray, "N J"], tuple[str, ...]]:
     """Give every component without a match its stated policy.
 
     Args:

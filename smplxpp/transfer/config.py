@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 from smplxpp.transfer.regions import JOINTS_OF_LABEL
 
 
@@ -55,17 +57,15 @@ class TransferConfig:
     def __post_init__(self) -> None:
         for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise InputError(f"config {name}", expected="a positive number", received=str(value))
+            if value is not None:
+                require_positive(f"config {name}", value, finite=False)
         if self.falloff is not None and not self.falloff > 2:
             raise InputError("config falloff", expected="more than 2, or None", received=str(self.falloff))
         for name in ("normal_doubt", "averaging_steps"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"config {name}", expected="zero or more", received=str(getattr(self, name)))
-        if self.max_influences is not None and self.max_influences < 1:
-            raise InputError("config max_influences", expected="at least 1, or None", received=str(self.max_influences))
-        if self.laplacian not in ("auto", "cotangent", "intrinsic"):
-            raise InputError("config laplacian", expected="auto, cotangent or intrinsic", received=repr(self.laplacian))
+            require_at_least(f"config {name}", getattr(self, name), 0)
+        if self.max_influences is not None:
+            require_at_least("config max_influences", self.max_influences, 1)
+        require_choice("config laplacian", self.laplacian, ("auto", "cotangent", "intrinsic"))
         if self.unmatched not in ("extend", "nearest", "raise") and not self.unmatched.startswith("rigid:"):
             raise InputError(
                 "config unmatched", expected="extend, nearest, raise or rigid:JOINT", received=repr(self.unmatched)
@@ -116,8 +116,8 @@ class TransferConfig:
             )
         return index
 
-    def allowed_mask(self, joint_count: int) -> np.ndarray | None:
-        """(J,) bool, or None where all joints are allowed."""
+    def allowed_mask(self, joint_count: int) -> Bool[np.ndarray, " J"] | None:
+        """The joints that a part may follow, or None where all are allowed."""
         if self.allowed_joints is None:
             return None
         mask = np.zeros(joint_count, dtype=bool)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import igl
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Bool, Float, Float64, Int32, Int64
 
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
@@ -24,20 +25,20 @@ class Correspondence:
         angle: (N,) radians between the normals, NaN where a normal is missing.
     """
 
-    face: np.ndarray
-    barycentric: np.ndarray
-    distance: np.ndarray
-    angle: np.ndarray
+    face: Int64[np.ndarray, " N"]
+    barycentric: Float64[np.ndarray, "N 3"]
+    distance: Float64[np.ndarray, " N"]
+    angle: Float64[np.ndarray, " N"]
 
-    def interpolate(self, source: TriangleMesh, values: np.ndarray) -> np.ndarray:
-        """(V, D) values at the source's vertices -> (N, D) at the closest points."""
+    def interpolate(self, source: TriangleMesh, values: Float[np.ndarray, "V D"]) -> Float64[np.ndarray, "N D"]:
+        """The values at the closest points, from those at the source's vertices."""
         rows = np.repeat(np.arange(len(self.face)), 3)
         corners = source.faces[self.face].ravel()
         matrix = sp.csr_matrix((self.barycentric.ravel(), (rows, corners)), (len(self.face), source.vertex_count))
         return matrix @ values
 
-    def matched(self, *, max_distance: float, max_angle: float) -> np.ndarray:
-        """(N,) bool: near enough (metres) and facing the same way (radians)."""
+    def matched(self, *, max_distance: float, max_angle: float) -> Bool[np.ndarray, " N"]:
+        """The points near enough (metres) and facing the same way (radians)."""
         return (self.distance <= max_distance) & (self.angle <= max_angle)
 
 
@@ -49,6 +50,8 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
     """
     points = np.ascontiguousarray(target.vertices)
     squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces)
+    # The tree counts in C's `long long`, another type to numpy even where it is as wide.
+    face = face.astype(np.int64)
     corners = source.faces[face]
     barycentric = _barycentric(closest, *(source.vertices[corners[:, k]] for k in range(3)))
     found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))
@@ -61,8 +64,8 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
 
 
 def face_outward(
-    found: Correspondence, target: TriangleMesh, component: np.ndarray, *, max_distance: float
-) -> tuple[Correspondence, np.ndarray]:
+    found: Correspondence, target: TriangleMesh, component: Int32[np.ndarray, " N"], *, max_distance: float
+) -> tuple[Correspondence, Float64[np.ndarray, "N 3"]]:
     """Turn the normals of components that are inside out: most of their near vertices face against the source.
 
     Args:

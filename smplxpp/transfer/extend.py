@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from smplxpp.core.mesh import TriangleMesh
@@ -24,14 +25,14 @@ class SurfaceSamples:
         points, normals: (S, 3). weights: (S, J). area: square metres that each stands for.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
-    weights: np.ndarray
+    points: Float64[np.ndarray, "S 3"]
+    normals: Float64[np.ndarray, "S 3"]
+    weights: Float64[np.ndarray, "S J"]
     area: float
 
 
-def sample_surface(mesh: TriangleMesh, weights: np.ndarray, *, count: int = _SAMPLES) -> SurfaceSamples:
-    """One face's centre from each of `count` equal shares of the area, in the order of the faces (deterministic)."""
+def sample_surface(mesh: TriangleMesh, weights: Float[np.ndarray, "V J"], *, count: int = _SAMPLES) -> SurfaceSamples:
+    """Take a face's centre from each of `count` equal shares of the area, in the order of the faces (deterministic)."""
     cumulative = np.cumsum(mesh.face_areas)
     at = (np.arange(count) + 0.5) / count * cumulative[-1]
     face = np.minimum(np.searchsorted(cumulative, at), mesh.face_count - 1)
@@ -43,14 +44,14 @@ def sample_surface(mesh: TriangleMesh, weights: np.ndarray, *, count: int = _SAM
 
 
 def extend_weights(
-    points: np.ndarray,
-    normals: np.ndarray,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
     found: Correspondence,
-    copied: np.ndarray,
+    copied: Float[np.ndarray, "N J"],
     samples: SurfaceSamples,
     *,
     falloff: float = 6.0,
-) -> np.ndarray:
+) -> Float64[np.ndarray, "N J"]:
     """Weights at points off the body: a mean over the body that widens with the distance to it.
 
         W(x) = integral of W(y) g(x, y) |x - y|^-p dA(y) / integral of g(x, y) |x - y|^-p dA(y)

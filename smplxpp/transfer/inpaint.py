@@ -7,6 +7,7 @@ import itertools
 import igl
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.laplacian import edge_lengths, laplacian_and_mass
@@ -15,8 +16,13 @@ _SHARP = 0.5  # of the median edge: smoothing over so little is none
 
 
 def fit_smoothly(
-    mesh: TriangleMesh, values: np.ndarray, width: np.ndarray, *, length: float, laplacian: str = "auto"
-) -> np.ndarray:
+    mesh: TriangleMesh,
+    values: Float[np.ndarray, "N J"],
+    width: Float[np.ndarray, " N"],
+    *,
+    length: float,
+    laplacian: str = "auto",
+) -> Float64[np.ndarray, "N J"]:
     """Smooth `values` over the surface, each as far as it is doubted.
 
     Minimises `tr(W' Q W) + sum_i (l^2 M_i / h_i^4) |W_i - values_i|^2` with `Q = -C + l^2 C M^-1 C`, the energy of
@@ -76,7 +82,9 @@ def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
     return back
 
 
-def average_neighbours(mesh: TriangleMesh, values: np.ndarray, rows: np.ndarray, *, steps: int) -> np.ndarray:
+def average_neighbours(
+    mesh: TriangleMesh, values: Float[np.ndarray, "N J"], rows: Bool[np.ndarray, " N"], *, steps: int
+) -> Float64[np.ndarray, "N J"]:
     """Move the rows selected by a mask a fifth of the way to their neighbours' mean, `steps` times, all at once."""
     n, e = mesh.vertex_count, mesh.edges
     adjacency = sp.coo_matrix((np.ones(len(e)), (e[:, 0], e[:, 1])), shape=(n, n)).tocsr()

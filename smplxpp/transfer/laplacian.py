@@ -5,6 +5,7 @@ from __future__ import annotations
 import igl
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
@@ -12,13 +13,13 @@ _SLACK = 1e-4  # of the mean edge: how far mollification keeps a face from colla
 _SMALL_ANGLE = np.radians(0.1)
 
 
-def edge_lengths(mesh: TriangleMesh) -> np.ndarray:
-    """(M, 3) lengths of the edges opposite to each corner."""
+def edge_lengths(mesh: TriangleMesh) -> Float64[np.ndarray, "M 3"]:
+    """The lengths of the edges opposite to each corner."""
     t = mesh.triangles
     return np.stack([row_lengths(t[:, (k + 1) % 3] - t[:, (k + 2) % 3]) for k in range(3)], axis=1)
 
 
-def mollify(lengths: np.ndarray) -> np.ndarray:
+def mollify(lengths: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
     """Lengthen all edges by the least constant that makes every face a proper triangle.
 
     `l_a + l_b - l_c >= 1e-4 * mean` afterwards (Sharp and Crane, "A Laplacian for Nonmanifold Triangle Meshes", 2020,
@@ -28,7 +29,7 @@ def mollify(lengths: np.ndarray) -> np.ndarray:
     return lengths + max(0.0, float(shortfall.max(initial=0.0)))
 
 
-def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.csc_matrix, np.ndarray]:
+def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.csc_matrix, Float64[np.ndarray, " N"]]:
     """Cotangent matrix C (N, N), negative semi-definite, and Voronoi masses (N,), all positive.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -24,7 +25,9 @@ JOINTS_OF_LABEL: dict[str, tuple[str, ...]] = {
 }
 
 
-def restrict_source(source: TriangleMesh, weights: np.ndarray, allowed: np.ndarray) -> tuple[TriangleMesh, np.ndarray]:
+def restrict_source(
+    source: TriangleMesh, weights: Float[np.ndarray, "V J"], allowed: Bool[np.ndarray, " J"]
+) -> tuple[TriangleMesh, Float64[np.ndarray, "n J"]]:
     """The part of the source that the allowed joints own (at least half of the weight at each corner).
 
     Args:

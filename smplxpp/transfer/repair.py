@@ -6,6 +6,7 @@ import warnings
 
 import igl
 import numpy as np
+from jaxtyping import Float, Float64
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
@@ -27,7 +28,7 @@ def check_target(target: TriangleMesh) -> None:
         raise InputError("target mesh", expected="at least one face", received="none")
 
 
-def check_source(source: TriangleMesh, weights: np.ndarray) -> np.ndarray:
+def check_source(source: TriangleMesh, weights: Float[np.ndarray, "V J"]) -> Float64[np.ndarray, "V J"]:
     """Checked (V, J) float64 weights, rows summing to 1 (zero where no face uses the vertex).
 
     Raises:
@@ -75,7 +76,7 @@ def extent(mesh: TriangleMesh) -> float:
     return 2.0 * float(row_lengths(mesh.vertices[mesh.referenced] - centroid).max())
 
 
-def check_placement(source: TriangleMesh, target: TriangleMesh, distance: np.ndarray) -> None:
+def check_placement(source: TriangleMesh, target: TriangleMesh, distance: Float[np.ndarray, " N"]) -> None:
     """Refuse a target that plainly does not lie on the source: other units, other axes, another place.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
@@ -17,7 +18,7 @@ from smplxpp.transfer.repair import check_placement, check_source, check_target,
 
 def transfer_weights(
     source: TriangleMesh,
-    source_weights: np.ndarray,
+    source_weights: Float[np.ndarray, "V J"],
     target: TriangleMesh,
     *,
     config: TransferConfig | None = None,
@@ -93,7 +94,7 @@ def _values(
     normals: np.ndarray,
     config: TransferConfig,
 ) -> np.ndarray:
-    """(N, J) what each vertex would take by itself: the closest point's weights, or their extension."""
+    """The weights (N, J) each vertex would take by itself: the closest point's, or their extension."""
     used = np.flatnonzero(weights.any(axis=0))
     values = found.interpolate(source, weights[:, used])
     if config.falloff is not None:
@@ -113,13 +114,13 @@ def _smooth(
     length: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """(N, J) the values fitted smoothly over the surface; vertices without a face keep theirs."""
+    """The values (N, J) fitted smoothly over the surface; vertices without a face keep theirs."""
     if config.smoothing is None:
         width = np.where(matched | settled, 0.0, np.inf)
     else:
         doubt = 1.0 + config.normal_doubt * (1.0 - np.cos(np.nan_to_num(found.angle)))
         width = np.where(settled, 0.0, config.smoothing * doubt * found.distance)
-    mesh, used = target.submesh(slice(None))
+    mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))
     fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)

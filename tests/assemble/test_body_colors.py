@@ -38,7 +38,9 @@ def test_far_or_turned_surfaces_give_no_colour(ball):
 
 
 def test_a_scan_without_skin_leaves_the_body_grey(ball):
-    colors, index = body_colors_from_scan(ball, ball, np.zeros((ball.vertex_count, 3)), np.zeros(ball.face_count, bool))
+    colors, index = body_colors_from_scan(
+        ball, ball, np.zeros((ball.vertex_count, 3), np.uint8), np.zeros(ball.face_count, bool)
+    )
     assert (colors == 180).all()
     assert (index == -1).all()
 

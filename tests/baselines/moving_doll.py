@@ -32,6 +32,7 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
+from tests.template.bodies import small_body
 
 WIDTH, HEIGHT = 48, 64
 TRAIN, HELD_OUT = ("Ring0", "Ring1", "Ring2", "Ring3"), "Held"
@@ -67,19 +68,14 @@ def template() -> Template:
         part_names=("body", "lower"),
         vertex_colors=np.full((own, 3), 128),
         weights=SkinWeights.from_dense(weights),
-        joint_regressor=np.full((joints, count), 1.0 / count),
-        parents=body.parents,
-        joint_names=body.joint_names,
+        body=small_body(
+            joint_regressor=np.full((joints, count), 1.0 / count),
+            parents=body.parents,
+            joint_names=body.joint_names,
+            shapedirs=np.zeros((count, 3, 2)),
+            exprdirs=0.002 * rng.normal(size=(count, 3, 2)),
+        ),
         betas=np.zeros(2),
-        shape_basis=np.zeros((count, 3, 2)),
-        expression_basis=0.002 * rng.normal(size=(count, 3, 2)),
-        pose_basis=None,
-        left_hand_components=None,
-        right_hand_components=None,
-        left_hand_mean=None,
-        right_hand_mean=None,
-        body_labels=np.zeros(count),
-        body_label_names=("all",),
         body_index=np.concatenate([np.arange(count), np.zeros(own - count)]),
         scan_index=np.full(own, -1),
     )
@@ -89,7 +85,7 @@ def params(frame: int) -> BodyParams:
     """Her nod in a frame."""
     rest = BodyParams.rest(betas=2, expressions=2)
     pose = rest.body_pose.copy()
-    pose[0, 3 * (template().joint_names.index("head") - 1) + 2] = ANGLES[frame]
+    pose[0, 3 * (template().body.joint_names.index("head") - 1) + 2] = ANGLES[frame]
     return replace(rest, body_pose=pose, expression=np.array([[ANGLES[frame], 0.5]]))
 
 

@@ -127,7 +127,7 @@ def test_the_naked_body_carries_them_too(capture):
     naked = AvatarSequence(capture, template().naked())
     for kind in KINDS:
         posed = made(kind, naked.rig)(naked.motion(1), torch.tensor([[0.0, 0.5, 2.0]]))
-        assert len(posed.vertices) == template().body_vertex_count
+        assert len(posed.vertices) == template().body.vertex_count
 
 
 def test_an_outer_surface_has_no_layers():

@@ -177,5 +177,5 @@ def test_units_and_axes_are_detected_and_converted(units: str, up: str):
 
 
 def test_unknown_units_are_refused():
-    with pytest.raises(InputError, match="one of m, cm, mm, inch"):
+    with pytest.raises(InputError, match="'m' or 'cm' or 'mm' or 'inch'"):
         convert_points(np.zeros((1, 3)), units="feet")

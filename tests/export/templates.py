@@ -8,6 +8,7 @@ from smplxpp.body import load_body
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.template.template import Template
+from tests.template.bodies import small_body
 
 
 def random_template(
@@ -21,30 +22,32 @@ def random_template(
     weights[sizes[0] :: 3, 2:] = 0  # some vertices of the parts follow one or two joints alone
     regressor = rng.uniform(0, 1, (joint_count, body)) ** 8
     faces = [_faces(rng, size, start) for size, start in zip(sizes[:3], (0, 40, 52), strict=True)]
-    expression_basis = rng.normal(scale=0.05, size=(body, 3, expressions))
-    expression_basis[10:, :, :1] = 0  # the first moves a few vertices,
-    expression_basis[:, :, 1:2] = 0  # the second none, the third all
+    exprdirs = rng.normal(scale=0.05, size=(body, 3, expressions))
+    exprdirs[10:, :, :1] = 0  # the first moves a few vertices,
+    exprdirs[:, :, 1:2] = 0  # the second none, the third all
+    vertices = rng.normal(size=(count, 3))
+    vertex_colors = rng.integers(0, 256, (count, 3))
+    shapedirs = rng.normal(scale=0.01, size=(body, 3, 2))
+    posedirs = rng.normal(scale=0.01, size=(body, 3, 9 * (joint_count - 1))) if pose_correctives else None
+    hand_means = rng.normal(scale=0.2, size=(2, 45))
     return Template(
-        vertices=rng.normal(size=(count, 3)),
+        vertices=vertices,
         faces=np.concatenate(faces),
         vertex_labels=np.repeat([0, 3, 2, 2], sizes),
         vertex_part=np.repeat(np.arange(4), sizes),
         part_names=("body", "upper", "shoes", "empty"),
-        vertex_colors=rng.integers(0, 256, (count, 3)),
+        vertex_colors=vertex_colors,
         weights=SkinWeights.from_dense(weights, max_influences=influences),
-        joint_regressor=regressor / regressor.sum(axis=1, keepdims=True),
-        parents=(np.arange(joint_count) - 1) // 2,
-        joint_names=tuple(f"joint{j}" for j in range(joint_count)),
+        body=small_body(
+            joint_regressor=regressor / regressor.sum(axis=1, keepdims=True),
+            parents=(np.arange(joint_count) - 1) // 2,
+            joint_names=tuple(f"joint{j}" for j in range(joint_count)),
+            shapedirs=shapedirs,
+            exprdirs=exprdirs,
+            posedirs=posedirs,
+            hand_means=hand_means,
+        ),
         betas=np.zeros(2),
-        shape_basis=rng.normal(scale=0.01, size=(body, 3, 2)),
-        expression_basis=expression_basis,
-        pose_basis=rng.normal(scale=0.01, size=(body, 3, 9 * (joint_count - 1))) if pose_correctives else None,
-        left_hand_components=None,
-        right_hand_components=None,
-        left_hand_mean=rng.normal(scale=0.2, size=45),
-        right_hand_mean=rng.normal(scale=0.2, size=45),
-        body_labels=np.zeros(body),
-        body_label_names=("all",),
         body_index=np.concatenate([np.arange(body), rng.integers(0, body, count - body)]),
         scan_index=np.full(count, -1),
     )
@@ -63,19 +66,8 @@ def open_body_template() -> Template:
         part_names=("body",),
         vertex_colors=rng.integers(0, 256, (count, 3)),
         weights=SkinWeights.from_dense(body.weights),
-        joint_regressor=body.joint_regressor,
-        parents=body.parents,
-        joint_names=body.joint_names,
+        body=body,
         betas=np.zeros(body.num_betas),
-        shape_basis=body.shapedirs,
-        expression_basis=body.exprdirs,
-        pose_basis=body.posedirs,
-        left_hand_components=body.left_hand_components,
-        right_hand_components=body.right_hand_components,
-        left_hand_mean=body.left_hand_mean,
-        right_hand_mean=body.right_hand_mean,
-        body_labels=body.part_labels,
-        body_label_names=body.part_label_names,
         body_index=np.arange(count),
         scan_index=np.full(count, -1),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -50,11 +52,11 @@ def test_a_material_for_each_part_named_by_its_label(reader):
 
 def test_joints_are_named_and_stand_in_their_hierarchy(reader, template):
     nodes, (skin,) = reader.json["nodes"], reader.json["skins"]
-    assert [nodes[j]["name"] for j in skin["joints"]] == list(template.joint_names)
+    assert [nodes[j]["name"] for j in skin["joints"]] == list(template.body.joint_names)
     place = {node: j for j, node in enumerate(skin["joints"])}
     for j, node in enumerate(skin["joints"]):
         assert {place[child] for child in nodes[node].get("children", [])} == set(
-            np.flatnonzero(template.parents == j).tolist()
+            np.flatnonzero(template.body.parents == j).tolist()
         )
 
 
@@ -93,7 +95,8 @@ def test_parts_of_few_influences_take_one_set(tmp_path):
 
 
 def test_a_joint_named_twice_becomes_one_influence():
-    twice = SkinWeights(np.array([[4, 4, 1]]), np.array([[0.25, 0.5, 0.25]]), 300, *(np.zeros(1) for _ in range(4)))
+    one = SkinWeights.from_dense(np.ones((1, 300)), max_influences=3)
+    twice = replace(one, joint_indices=np.array([[4, 4, 1]], np.int32), joint_weights=np.array([[0.25, 0.5, 0.25]]))
     joints, weights = quantized_influences(twice)
     np.testing.assert_array_equal(joints, [[4, 1]])
     np.testing.assert_array_equal(weights, [[0.75, 0.25]])
@@ -111,7 +114,7 @@ def test_morph_targets_are_the_expression_basis_on_the_body_alone(reader, templa
     assert mesh["extras"]["targetNames"] == ["expression_00", "expression_01", "expression_02"]
     assert mesh["weights"] == [0, 0, 0]
     for k, target in enumerate(primitive["targets"]):
-        np.testing.assert_allclose(reader.array(target["POSITION"]), template.expression_basis[..., k], atol=1e-6)
+        np.testing.assert_allclose(reader.array(target["POSITION"]), template.body.exprdirs[..., k], atol=1e-6)
     accessors = [reader.json["accessors"][target["POSITION"]] for target in primitive["targets"]]
     assert accessors[0]["sparse"]["count"] == 10  # few rows
     assert "sparse" not in accessors[1] and "bufferView" not in accessors[1]  # none

@@ -108,7 +108,9 @@ def test_pose_correctives_are_left_out_with_a_warning(tmp_path):
     with pytest.warns(GeometryWarning, match="pose correctives"):
         write_glb(tmp_path / "a.glb", template, animation=motion)
     found = _posed_parts(template, GlbReader(tmp_path / "a.glb"), 1)
-    np.testing.assert_allclose(found, replace(template, pose_basis=None).pose(motion)[1, : len(found)], atol=5e-6)
+    np.testing.assert_allclose(
+        found, replace(template, body=replace(template.body, posedirs=None)).pose(motion)[1, : len(found)], atol=5e-6
+    )
 
 
 @pytest.mark.parametrize(

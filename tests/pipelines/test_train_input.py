@@ -159,7 +159,9 @@ def test_a_template_without_clothes_trains(run, original, capsys):
 
 
 def test_a_body_without_expressions_can_be_baked_but_not_compensated(run, original, capsys):
-    without = replace(template(), expression_basis=template().expression_basis[..., :0], expression_names=())
+    without = replace(
+        template(), body=replace(template().body, exprdirs=template().body.exprdirs[..., :0], expression_names=())
+    )
     write_template(run, without)
     assert "expression" in refused(capsys, run, original)
     assert train(run, original, "--until", "fit") == 0

@@ -14,7 +14,8 @@ from smplxpp.segment.graph_cut import PottsProblem, expand, minimize_potts
 
 
 def random_problem(rng: np.random.Generator, n: int, labels: int, *, smooth: float = 2.0) -> PottsProblem:
-    pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n) if rng.random() < 0.5]).reshape(-1, 2)
+    chosen = [(i, j) for i in range(n) for j in range(i + 1, n) if rng.random() < 0.5]
+    pairs = np.array(chosen, dtype=np.int64).reshape(-1, 2)
     return PottsProblem.from_costs(rng.random((n, labels)) * 3, pairs, rng.random(len(pairs)) * smooth)
 
 

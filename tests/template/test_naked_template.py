@@ -19,8 +19,8 @@ def template():
 
 def test_only_the_body_is_left_and_it_poses_as_before(template):
     naked = template.naked()
-    count = template.body_vertex_count
-    assert naked.part_names == ("body",) and naked.vertex_count == naked.body_vertex_count == count
+    count = template.body.vertex_count
+    assert naked.part_names == ("body",) and naked.vertex_count == naked.body.vertex_count == count
     assert len(naked.faces) == template.part_faces("body").sum() and not naked.cloth_mask.any()
     params = stress_poses(BodyParams.rest(betas=template.betas, expressions=6))
     np.testing.assert_array_equal(naked.pose(params), template.pose(params)[:, :count])

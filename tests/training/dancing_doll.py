@@ -26,6 +26,7 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
+from tests.template.bodies import small_body
 
 WIDTH, HEIGHT = 48, 64
 FRAMES, NOVEL_POSES = 6, (4, 5)
@@ -76,19 +77,14 @@ def template() -> Template:
         part_names=("body", "dress"),
         vertex_colors=np.full((3 * size, 3), 128),
         weights=SkinWeights.from_dense(weights),
-        joint_regressor=regressor,
-        parents=body.parents,
-        joint_names=body.joint_names,
+        body=small_body(
+            joint_regressor=regressor,
+            parents=body.parents,
+            joint_names=body.joint_names,
+            shapedirs=shapes,
+            exprdirs=smile,
+        ),
         betas=np.zeros(2),
-        shape_basis=shapes,
-        expression_basis=smile,
-        pose_basis=None,
-        left_hand_components=None,
-        right_hand_components=None,
-        left_hand_mean=None,
-        right_hand_mean=None,
-        body_labels=np.zeros(2 * size),
-        body_label_names=("all",),
         body_index=np.concatenate([np.arange(2 * size), np.arange(size)]),
         scan_index=np.full(3 * size, -1),
     )
@@ -100,7 +96,7 @@ def dance() -> BodyParams:
     t = np.arange(FRAMES)[:, None] / FRAMES
     pose = np.zeros((FRAMES, 55, 3))
     pose[:, 0, 1:2] = 0.5 * t
-    names = template().joint_names
+    names = template().body.joint_names
     pose[:, names.index("head"), 0:1] = 0.4 * np.sin(5.0 * t)
     pose[:, names.index("spine1"), 2:3] = 0.3 * np.cos(4.0 * t)
     return BodyParams.from_full_pose(

@@ -18,6 +18,7 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
+from tests.template.bodies import small_body
 
 WIDTH, HEIGHT = 64, 80
 TRAIN, HELD_OUT = ("Ring0", "Ring1", "Ring2", "Ring3", "Ring4", "Ring5", "Face"), ("Held0", "Held1")
@@ -106,19 +107,14 @@ def _template(vertices: np.ndarray, faces: np.ndarray) -> Template:
         part_names=("body",),
         vertex_colors=np.full((count, 3), 128),
         weights=SkinWeights.from_dense(weights),
-        joint_regressor=np.full((joints, count), 1.0 / count),
-        parents=body.parents,
-        joint_names=body.joint_names,
+        body=small_body(
+            joint_regressor=np.full((joints, count), 1.0 / count),
+            parents=body.parents,
+            joint_names=body.joint_names,
+            shapedirs=np.zeros((count, 3, 2)),
+            exprdirs=np.zeros((count, 3, 0)),
+        ),
         betas=np.zeros(2),
-        shape_basis=np.zeros((count, 3, 2)),
-        expression_basis=np.zeros((count, 3, 0)),
-        pose_basis=None,
-        left_hand_components=None,
-        right_hand_components=None,
-        left_hand_mean=None,
-        right_hand_mean=None,
-        body_labels=np.zeros(count),
-        body_label_names=("all",),
         body_index=np.arange(count),
         scan_index=np.full(count, -1),
     )

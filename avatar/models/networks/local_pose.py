@@ -21,7 +21,7 @@ def seen_joints(template: Template, steps: int) -> np.ndarray:
     Returns:
         (V, 21) bool, the joints of theta.
     """
-    parents = np.asarray(template.parents)
+    parents = np.asarray(template.body.parents)
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True

@@ -19,7 +19,7 @@ _OURS = ("capture.json", "cameras.json", "scans")
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder is a sequence or one of its scales."""
+    """Tell whether a folder is a sequence or one of its scales."""
     return bool(_scales(root)) and not any((root / name).exists() for name in _OURS)
 
 

@@ -18,7 +18,7 @@ _FPS = 30.0
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder is a subject of AvatarReX."""
+    """Tell whether a folder is a subject of AvatarReX."""
     return (root / "calibration_full.json").is_file()
 
 

@@ -19,7 +19,7 @@ LOOKS_FOR = "cameras and images as .bin or .txt, in sparse/0, sparse or there"
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds a model."""
+    """Tell whether a folder holds a model."""
     return model_folder(root) is not None
 
 

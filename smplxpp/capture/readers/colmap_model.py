@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.core.errors import InputError
+
+T = TypeVar("T")
 
 # Name, number of parameters, in the order of COLMAP's model ids.
 MODELS = (
@@ -32,7 +37,7 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
-    def intrinsics(self, *, source: str) -> tuple[np.ndarray, list[float]]:
+    def intrinsics(self, *, source: str) -> tuple[Float64[np.ndarray, "3 3"], list[float]]:
         """K (3, 3), and the distortion in OpenCV's order.
 
         Raises:
@@ -61,14 +66,14 @@ class ColmapCamera:
 class ColmapImage:
     """A registered image: `x_cam = R x_world + t`, its camera's id, its path below the image folder."""
 
-    R: np.ndarray
-    t: np.ndarray
+    R: Float64[np.ndarray, "3 3"]
+    t: Float64[np.ndarray, " 3"]
     camera: int
     name: str
 
 
 def model_folder(root: Path) -> Path | None:
-    """Where the model lies: `sparse/0`, `sparse` or the folder itself."""
+    """The folder of the model: `sparse/0`, `sparse` or the folder itself."""
     for folder in (root / "sparse" / "0", root / "sparse", root):
         if any((folder / f"cameras.{s}").is_file() and (folder / f"images.{s}").is_file() for s in ("bin", "txt")):
             return folder
@@ -83,19 +88,21 @@ def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = "bin" if binary else "txt"
-    readers = (_cameras_bin, _images_bin) if binary else (_cameras_txt, _images_txt)
-    found = []
-    for name, reader in zip(("cameras", "images"), readers, strict=True):
-        path = folder / f"{name}.{suffix}"
-        try:
-            found.append(reader(path))
-        except (ValueError, IndexError, struct.error, OSError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"file {path}", expected=f"COLMAP's {name} as {suffix}", received=f"{type(error).__name__}: {error}"
-            ) from None
-    return found[0], found[1]
+    cameras = _read_table(_cameras_bin if binary else _cameras_txt, folder / f"cameras.{suffix}")
+    return cameras, _read_table(_images_bin if binary else _images_txt, folder / f"images.{suffix}")
+
+
+def _read_table(reader: Callable[[Path], T], path: Path) -> T:
+    try:
+        return reader(path)
+    except InputError:
+        raise
+    except (ValueError, IndexError, struct.error, OSError) as error:
+        raise InputError(
+            f"file {path}",
+            expected=f"COLMAP's {path.stem} as {path.suffix[1:]}",
+            received=f"{type(error).__name__}: {error}",
+        ) from None
 
 
 def _image(quaternion: list[float], t: list[float], camera: int, name: str) -> ColmapImage:

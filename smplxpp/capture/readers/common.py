@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.params import find_params
@@ -69,7 +70,7 @@ def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSourc
     return None if path is None else find_params(path, body=options.body)
 
 
-def inverted(world_from_cam: Any) -> tuple[np.ndarray, np.ndarray]:
+def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
     """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix."""
     matrix = np.asarray(world_from_cam, dtype=np.float64)
     rotation = matrix[:3, :3].T
@@ -77,7 +78,7 @@ def inverted(world_from_cam: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbered_images(folders: Mapping[str, Path]) -> dict[str, FileSeries]:
-    """For each camera the images of its folder whose names are numbers; cameras without any are left out."""
+    """Find each camera's images in its folder whose names are numbers; cameras without any are left out."""
     found = {name: FileSeries.find(folder, image_name()) for name, folder in folders.items()}
     return {name: series for name, series in found.items() if len(series)}
 
@@ -98,7 +99,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int, int]:
-    """For calibrations without the images' size.
+    """Read the images' size from the first one, for calibrations that do not say it.
 
     Raises:
         InputError: the camera has no image.
@@ -111,7 +112,7 @@ def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int
             remedy="remove the camera from the calibration, or add its images",
         )
     series = files[name]
-    return image_size(series.path(int(series.numbers[0])))
+    return image_size(series.required(int(series.numbers[0])))
 
 
 def first_folder(root: Path, names: Iterable[str]) -> Path | None:

@@ -22,7 +22,7 @@ LOOKS_FOR = "Capture/cameras.pkl beside Meshes_pkl/"
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder is a take."""
+    """Tell whether a folder is a take."""
     return (root / "Capture" / "cameras.pkl").is_file()
 
 

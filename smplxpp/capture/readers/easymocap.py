@@ -31,7 +31,7 @@ _PARAMS = ("output/smplx/smpl", "output/smplx", "output/smpl/smpl", "output/smpl
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds both camera files."""
+    """Tell whether a folder holds both camera files."""
     return (root / "intri.yml").is_file() and (root / "extri.yml").is_file()
 
 
@@ -50,13 +50,17 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     masks = first_folder(root, ("masks", "mask"))
     cameras, distortions = {}, {}
     for name in names:
-        size = (intri.get(f"W_{name}"), intri.get(f"H_{name}"))
-        if not all(size):
+        width, height = intri.get(f"W_{name}"), intri.get(f"H_{name}")
+        if isinstance(width, float) and isinstance(height, float) and width and height:
+            size = (int(width), int(height))
+        else:
             size = size_of_first_image(name, images)
         K = required(intri, f"K_{name}", source=f"file {root / 'intri.yml'}")
         cameras[name] = pinhole(name, K, *_pose(extri, name, root / "extri.yml"), size, opencv_pixels=True)
         coefficients = intri.get(f"dist_{name}", intri.get(f"D_{name}", []))
-        distortion = Distortion.from_opencv(np.ravel(coefficients), subject=f"file {root / 'intri.yml'}: {name}")
+        distortion = Distortion.from_opencv(
+            np.ravel(coefficients).tolist(), subject=f"file {root / 'intri.yml'}: {name}"
+        )
         if distortion is not None:
             distortions[name] = distortion
     return Recording(

@@ -28,7 +28,7 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds such files."""
+    """Tell whether a folder holds such files."""
     return bool(_moments(root))
 
 

@@ -51,11 +51,14 @@ def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | f
 def _matrix(key: str, text: str, path: Path) -> np.ndarray:
     size = {name: re.search(rf"{name}:\s*(\d+)", text) for name in ("rows", "cols")}
     data = re.search(r"data:\s*\[([^\]]*)\]", text)
+    rows, cols = size["rows"], size["cols"]
     try:
+        if data is None or rows is None or cols is None:
+            raise ValueError("one of them is missing")
         # OpenCV writes `.Nan` and `.Inf`.
         values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in data[1].split(",")]
-        return np.array(values).reshape(int(size["rows"][1]), int(size["cols"][1]))
-    except (TypeError, ValueError) as error:
+        return np.array(values).reshape(int(rows[1]), int(cols[1]))
+    except ValueError as error:
         raise InputError(
             f"file {path}: {key}", expected="rows, cols and as many numbers in data", received=str(error)
         ) from None

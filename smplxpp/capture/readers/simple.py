@@ -37,7 +37,7 @@ _BLACK = (0.0, 0.0, 0.0)
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder is in this layout. A calibration.csv without anything of ours is ActorsHQ's."""
+    """Tell whether a folder is in this layout. A calibration.csv without anything of ours is ActorsHQ's."""
     if (root / "capture.json").is_file() or ((root / "cameras.json").is_file() and (root / "rgbs").is_dir()):
         return True
     return (root / "scans").is_dir() and (root / "params").is_dir()

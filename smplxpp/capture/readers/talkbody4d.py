@@ -23,7 +23,7 @@ _PARAM_KEYS = {"body_pose", "betas", "Rh", "Th"}
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder holds such a calibration."""
+    """Tell whether a folder holds such a calibration."""
     return _calibration(root) is not None
 
 
@@ -104,7 +104,7 @@ def _params(root: Path, options: ReaderOptions) -> Any:
     for name in subfolders(root):
         series = FileSeries.find(root / name, r"\D*(?P<frame>\d+)\.json")
         if len(series):
-            content = read_json(series.path(int(series.numbers[0])))
+            content = read_json(series.required(int(series.numbers[0])))
             if isinstance(content, Mapping) and content.keys() >= _PARAM_KEYS:
                 return ParamFiles(series, "talkbody4d", options.body)
     return None

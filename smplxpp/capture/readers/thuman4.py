@@ -14,7 +14,7 @@ LOOKS_FOR = "calibration.json beside images/camNN/"
 
 
 def detect(root: Path) -> bool:
-    """Whether a folder is a subject of THuman4.0."""
+    """Tell whether a folder is a subject of THuman4.0."""
     return (root / "calibration.json").is_file() and any(root.glob("images/cam[0-9][0-9]"))
 
 

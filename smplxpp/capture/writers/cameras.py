@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.camera import Camera
@@ -56,7 +57,7 @@ def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
     atomic_write_text(path, text.getvalue())
 
 
-def write_actorshq_scene(folder: Path, boxes: np.ndarray, fps: float) -> None:
+def write_actorshq_scene(folder: Path, boxes: Float[np.ndarray, "T 2 3"], fps: float) -> None:
     """`aabbs.csv` and `scene.json` beside the scale folders; `boxes` (T, 2, 3) corners of each frame's bounds."""
     corners = [f"aabb_{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
     rows = [",".join(["frame_number", *corners])]

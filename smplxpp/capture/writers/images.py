@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 
 from smplxpp.core.atomic import atomic_write_bytes
@@ -16,29 +17,29 @@ from smplxpp.core.atomic import atomic_write_bytes
 _NORMAL_STEP = 16
 
 
-def write_jpeg(path: Path, image: np.ndarray, *, quality: int) -> None:
-    """(H, W, 3) uint8 sRGB."""
+def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], *, quality: int) -> None:
+    """Write an sRGB image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=quality, optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
 
 
-def write_gray_png(path: Path, image: np.ndarray) -> None:
-    """(H, W) uint8: masks and labels."""
+def write_gray_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:
+    """Write a mask or a label map."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
 
 
-def write_normal_png(path: Path, normals: np.ndarray) -> None:
-    """(H, W, 3) unit normals as 16-bit RGB, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
+def write_normal_png(path: Path, normals: Float[np.ndarray, "H W 3"]) -> None:
+    """Write unit normals as 16-bit RGB, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
     value = np.round((normals + 1.0) * (0.5 * 65535 / _NORMAL_STEP)) * _NORMAL_STEP
     value = np.where((normals == 0.0).all(axis=2, keepdims=True), 0, np.clip(value, _NORMAL_STEP, 65535))
     atomic_write_bytes(path, png16(value.astype(np.uint16)))
 
 
-def png16(image: np.ndarray) -> bytes:
-    """(H, W, 3) uint16 as a 16-bit RGB PNG (Pillow writes none); every row with the `Up` filter."""
+def png16(image: UInt16[np.ndarray, "H W 3"]) -> bytes:
+    """Encode a 16-bit RGB PNG (Pillow writes none); every row has the `Up` filter."""
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(height, -1)
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
