@@ -19,12 +19,15 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.template.template import Template
 
 TEMPLATE_FILE = Path("60_assemble") / "smplxpp.npz"
 DEFAULT_FPS = 20.0
 _FRAMING_POSES = 24  # poses that the camera is fitted to
 _BLOCK = 16  # frames posed at a time
+_SMALLEST = 16  # pixels of a picture
 
 
 @dataclass(frozen=True)
@@ -84,16 +87,12 @@ class Animate:
                 expected=".mp4, .gif, .glb, or no suffix for a folder of PNG pictures",
                 received=suffix,
             )
-        smallest = 16
-        for name, value, least in (
-            ("height", self.height, smallest),
-            ("width", self.width if self.width is not None else smallest, smallest),
-            ("step", self.step, 1),
-        ):
-            if value < least:
-                raise InputError(f"option {name}", expected=f"at least {least}", received=str(value))
-        if self.fps is not None and not self.fps > 0:
-            raise InputError("option fps", expected="more than 0", received=str(self.fps))
+        require_at_least("option height", self.height, _SMALLEST)
+        if self.width is not None:
+            require_at_least("option width", self.width, _SMALLEST)
+        require_at_least("option step", self.step, 1)
+        if self.fps is not None:
+            require_positive("option fps", self.fps)
         if suffix == FRAME_FOLDER and self.out.exists():
             # The folder is replaced as a whole: it must not hold anything but an earlier film.
             names = [p.name for p in self.out.iterdir()] if self.out.is_dir() else ["(a file)"]
@@ -136,7 +135,7 @@ class Animate:
 
     def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
         """A camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
-        some = np.unique(np.linspace(0, len(params) - 1, min(_FRAMING_POSES, len(params))).round().astype(int))
+        some = spread(range(len(params)), _FRAMING_POSES)
         points = template.pose(params.select(some)).reshape(-1, 3)
         height = self.height + self.height % 2  # h264 with 4:2:0 colour takes even sizes
         width = None if self.width is None else self.width + self.width % 2

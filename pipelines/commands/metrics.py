@@ -22,6 +22,7 @@ from pipelines.commands.options import OptionalPath
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_io import MeshFile, read_mesh
+from smplxpp.core.validation import require_at_least
 from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
 
 # A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.
@@ -70,8 +71,7 @@ class Metrics:
         """
         if self.out is not None and self.out.suffix.lower() not in (".json", ".csv"):
             raise InputError("output file", expected=".json or .csv", received=str(self.out))
-        if self.seed < 0:
-            raise InputError("option seed", expected="at least 0", received=str(self.seed))
+        require_at_least("option seed", self.seed, 0)
         pairs, skipped = pair_frames(self.a, self.b)
         frames = []
         console = Console(stderr=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from smplxpp.capture.writers.cameras import BODY, FACE, RigCamera
 from smplxpp.core.camera import Camera
+from smplxpp.core.spread import spread_inside
 
 # Height of the ring's cameras over the floor, in turns (metres), and their distance.
 _HEIGHTS = (1.05, 1.75, 0.55)
@@ -29,7 +30,8 @@ def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, 
     rng = np.random.default_rng([seed, 3])
     faces = 2 if count >= 4 else 0
     bodies = count - faces
-    held_out = set(_spread(bodies, max(1, round(bodies / 6)))) if bodies >= 4 else set()
+    # Evenly around the ring, but not the first, which looks at the front.
+    held_out = set(spread_inside(range(bodies), max(1, round(bodies / 6)))) if bodies >= 4 else set()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     width = max(8, round(size * 0.8 / 8) * 8)
     rig = []
@@ -47,11 +49,6 @@ def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, 
         eye = head + _FACE_DISTANCE * np.array([np.sin(azimuth), rng.uniform(-0.06, 0.1), np.cos(azimuth)])
         rig.append(RigCamera(_fitted(eye, head, heads, (square, square), rng, f"Face{k + 1}"), FACE, False))
     return rig
-
-
-def _spread(count: int, chosen: int) -> list[int]:
-    """`chosen` of `count` places on a ring, evenly; not the first, which looks at the front."""
-    return [int((j + 0.5) * count / chosen) for j in range(chosen)]
 
 
 def _fitted(

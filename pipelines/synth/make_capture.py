@@ -26,9 +26,9 @@ from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import write_gray_png, write_jpeg, write_normal_png
 from smplxpp.core.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
 log = logging.getLogger(__name__)
 
@@ -72,16 +72,10 @@ class SynthConfig:
 
     def __post_init__(self) -> None:
         for name in ("cameras", "frames", "supersampling", "truth_step", "normals_step"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"--{name.replace('_', '-')}", expected="at least 1", received=str(getattr(self, name))
-                )
-        if self.size < 16:
-            raise InputError("--size", expected="at least 16 pixels", received=str(self.size))
-        if not self.fps > 0:
-            raise InputError("--fps", expected="more than 0", received=str(self.fps))
-        if self.layout not in ("simple", "actorshq"):
-            raise InputError("--layout", expected="simple or actorshq", received=repr(self.layout))
+            require_at_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
+        require_at_least("--size", self.size, 16)
+        require_positive("--fps", self.fps)
+        require_choice("--layout", self.layout, ("simple", "actorshq"))
 
 
 def make_capture(

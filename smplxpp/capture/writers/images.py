@@ -8,37 +8,70 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 
 from smplxpp.core.atomic import atomic_write_bytes
 
+# kind of file -> folder, and what stands before the frame's number in a file's name.
+VIEW_FOLDERS = {
+    "image": ("rgbs", "rgb"),
+    "mask": ("masks", "mask"),
+    "label": ("labels", "label"),
+    "normal": ("normals", "normal"),
+}
+JPEG_SUFFIXES = (".jpg", ".jpeg")
 # Components of normals keep 12 bits of 16: the rest would be noise that does not compress.
 _NORMAL_STEP = 16
 
 
-def write_jpeg(path: Path, image: np.ndarray, *, quality: int) -> None:
-    """(H, W, 3) uint8 sRGB."""
+def view_path(root: Path, kind: str, camera: str, frame: int, suffix: str) -> Path:
+    """Return the place of a view's file: `kind` is a key of `VIEW_FOLDERS`, `suffix` starts with a dot."""
+    folder, tag = VIEW_FOLDERS[kind]
+    return root / folder / camera / f"{camera}_{tag}{frame:06d}{suffix}"
+
+
+def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], *, quality: int) -> None:
+    """Write sRGB as a small JPEG file."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=quality, optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
 
 
-def write_gray_png(path: Path, image: np.ndarray) -> None:
-    """(H, W) uint8: masks and labels."""
+def write_gray_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:
+    """Write a mask or labels as an 8-bit PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
 
 
-def write_normal_png(path: Path, normals: np.ndarray) -> None:
-    """(H, W, 3) unit normals as 16-bit RGB, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
+def write_normal_png(path: Path, normals: Float[np.ndarray, "H W 3"]) -> None:
+    """Write unit normals as 16-bit RGB, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
     value = np.round((normals + 1.0) * (0.5 * 65535 / _NORMAL_STEP)) * _NORMAL_STEP
     value = np.where((normals == 0.0).all(axis=2, keepdims=True), 0, np.clip(value, _NORMAL_STEP, 65535))
     atomic_write_bytes(path, png16(value.astype(np.uint16)))
 
 
-def png16(image: np.ndarray) -> bytes:
-    """(H, W, 3) uint16 as a 16-bit RGB PNG (Pillow writes none); every row with the `Up` filter."""
+def normal_codes(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
+    """Return all 16 bits of unit normals, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
+    codes = np.clip(np.round((normals + 1.0) * 32767.5), 1, 65535)
+    return np.where(normals.any(axis=2, keepdims=True), codes, 0).astype(np.uint16)
+
+
+def encoded_image(image: UInt8[np.ndarray, "H W *D"] | UInt16[np.ndarray, "H W 3"], suffix: str, quality: int) -> bytes:
+    """Return a file's bytes: a JPEG without subsampling where the suffix is one's, else a PNG of 8 or 16 bits."""
+    if image.dtype == np.uint16:
+        return png16(image)
+    buffer = io.BytesIO()
+    if suffix in JPEG_SUFFIXES:
+        Image.fromarray(image).save(buffer, "JPEG", quality=quality, subsampling=0)
+    else:
+        Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def png16(image: UInt16[np.ndarray, "H W 3"]) -> bytes:
+    """Return a 16-bit RGB PNG's bytes (Pillow writes none); every row with the `Up` filter."""
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(height, -1)
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
