@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.capture.writers.cameras import BODY, FACE, RigCamera
 from smplxpp.core.camera import Camera
@@ -17,12 +18,14 @@ _FACE_AZIMUTHS = (-6.0, 44.0)  # degrees to the subject's left: she turns that w
 _MARGIN = 1.06
 
 
-def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, seed: int) -> list[RigCamera]:
-    """`count` cameras that see the person in every frame.
+def camera_rig(
+    points: Float[np.ndarray, "P 3"], heads: Float[np.ndarray, "Q 3"], *, count: int, size: int, seed: int
+) -> list[RigCamera]:
+    """Place `count` cameras that see the person in every frame.
 
     Args:
-        points: (P, 3) what body cameras must hold: the person over all frames.
-        heads: (Q, 3) what face cameras must hold: the head over all frames.
+        points: what body cameras must hold: the person over all frames.
+        heads: what face cameras must hold: the head over all frames.
         count: of cameras; from four on two of them look at the face.
         size: height of body images in pixels; they are 4/5 as wide, face images square, 3/4 as high.
         seed: of small irregularities of places and principal points.
@@ -52,9 +55,14 @@ def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, 
 
 
 def _fitted(
-    eye: np.ndarray, target: np.ndarray, points: np.ndarray, size: tuple[int, int], rng: np.random.Generator, name: str
+    eye: Float[np.ndarray, " 3"],
+    target: Float[np.ndarray, " 3"],
+    points: Float[np.ndarray, "P 3"],
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    name: str,
 ) -> Camera:
-    """A camera whose image just holds `points`, its principal point a little off the middle."""
+    """Make a camera whose image just holds `points`, its principal point a little off the middle."""
     width, height = size
     camera = Camera.look_at(eye=eye, target=target, fov_y_deg=40.0, width=width, height=height)
     cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
