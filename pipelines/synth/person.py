@@ -45,12 +45,12 @@ class Person:
     body: BodyModel
     face: textures.FaceMarks
 
-    def posed(self, params: BodyParams) -> Float[np.ndarray, "T V 3"]:
-        """Pose every layer by linear blend skinning with the body's joints."""
+    def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
+        """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
         posed = self.body.forward(params)
         rest = np.repeat(self.tpose.vertices[None], len(params), axis=0)
         rest[:, : self.body.vertex_count] = posed.rest_vertices
-        return skin(rest, self.weights, posed.posed_from_rest)
+        return skin(rest, self.weights, posed.posed_from_rest), posed.posed_from_rest
 
     def colors(
         self, points: Float[np.ndarray, "P 3"], part: UInt8[np.ndarray, " P"], label: UInt8[np.ndarray, " P"]

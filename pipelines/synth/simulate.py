@@ -18,7 +18,6 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.skinning import skin
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 
@@ -203,15 +202,11 @@ class _Stage:
         self, times: Float[np.ndarray, " T"]
     ) -> tuple[BodyParams, Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Return parameters with the lowest vertex at y = 0, all layers skinned, the joints' transforms."""
-        person = self.person
         params = self.performance.at(times)
-        posed = person.body.forward(params)
-        rest = np.repeat(person.tpose.vertices[None], len(params), axis=0)
-        rest[:, : person.body.vertex_count] = posed.rest_vertices
-        layers = skin(rest, person.weights, posed.posed_from_rest)
+        layers, posed_from_rest = self.person.posed(params)
         up = np.round(-layers[..., 1].min(axis=1), 5)
         layers[..., 1] += up[:, None]
-        transforms = posed.posed_from_rest.copy()
+        transforms = posed_from_rest.copy()
         transforms[:, :, 1, 3] += up[:, None]
         return replace(params, transl=np.stack([0 * up, up, 0 * up], axis=1)), layers, transforms
 
