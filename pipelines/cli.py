@@ -11,7 +11,6 @@ import sys
 import warnings
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -73,7 +72,7 @@ USER_ERROR, INTERRUPTED = 2, 130
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one subcommand; returns the exit status (0, 2 for the user's errors, 1 for failed gates)."""
+    """Run one subcommand; return the exit status (0, 2 for the user's errors, 1 for failed gates)."""
     args = list(sys.argv[1:] if argv is None else argv)
     console = Console(stderr=True)
     if not args or args[0] in (*HELP, "help"):
@@ -134,19 +133,19 @@ def _error_fields(error: Exception) -> dict[str, str]:
 
 
 def _in_words(error: Exception) -> str:
-    """The message of an error; what the system refused (a full disk, no permission) with the file it is about."""
+    """Word an error; what the system refused (a full disk, no permission) with the file that it is about."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Warnings in words, as errors are, without the line of code that gave them."""
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Show a warning in words, as errors are, without the line of code that gave them."""
     logging.getLogger("smplxpp").warning("%s", message)
 
 
 def _print_help(group: str = "") -> None:
-    """All commands, or those that start with the word `group`."""
+    """Print all commands, or those that start with the word `group`."""
     table = Table(show_header=False, box=None, padding=(0, 2))
     for name, (_, _, line) in COMMANDS.items():
         if group and name.split()[0] != group:

@@ -165,7 +165,7 @@ def take() -> Take:
     files = sorted((FOLDER / "geometry").glob("frame_*.npz"))
     params = params.select([int(path.stem[-6:]) for path in files])
     vertices = np.stack([_load(f"geometry/{path.name}")["verts"].astype(np.float64) for path in files])
-    return Take(params, vertices, person.posed(params), _load("geometry/topology.npz")["pin"])
+    return Take(params, vertices, person.posed(params)[0], _load("geometry/topology.npz")["pin"])
 
 
 def test_the_capture_is_whole_and_split(capture):

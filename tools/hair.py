@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from jaxtyping import Float
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, smooth, submesh
 from pipelines.synth.noise import smooth_noise
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
-from tools.garments import DressForm, largest_component, settled
+from tools.garments import DressForm, largest_component, with_clean_weights
 
 
 def make_hair(form: DressForm, *, seed: int, radius: float = 0.010, cell: float = 0.005) -> ClothMesh:
-    """An open sheet over scalp and neck: the level set at `radius` metres around strips and scalp, beyond the skin."""
+    """Make an open sheet over scalp and neck: the level set `radius` metres around strips and scalp, off the skin."""
     skeleton = _skeleton(form)
     low = skeleton.vertices.min(axis=0) - 4 * radius
     size = np.ceil((skeleton.vertices.max(axis=0) + 4 * radius - low) / cell).astype(int)
@@ -35,11 +36,11 @@ def make_hair(form: DressForm, *, seed: int, radius: float = 0.010, cell: float 
     strands = smooth_noise(cloth.vertices, scale=(0.008, 0.25, 0.008), seed=seed)
     vertices = cloth.vertices + 0.0014 * strands[:, None] * cloth.mesh.vertex_normals
     weights = diffuse(cloth.mesh, cloth.weights, radius=0.04)
-    return settled(ClothMesh(vertices, cloth.faces, weights))
+    return with_clean_weights(ClothMesh(vertices, cloth.faces, weights))
 
 
 def _skeleton(form: DressForm) -> TriangleMesh:
-    """Scalp and shortened strips without those that hang before the face."""
+    """Return scalp and shortened strips without those that hang before the face."""
     head, eye, neck = form.joints["head"], form.joints["left_eye_smplhf"], form.joints["neck"]
     strips = form.helper("helper-hair")
     strips = clip(strips, strips.vertices[:, 1] - neck[1] - 0.045)
@@ -53,8 +54,10 @@ def _skeleton(form: DressForm) -> TriangleMesh:
     return concatenate_meshes([strips.mesh, form.body.submesh(scalp[form.body.faces].all(axis=1))[0]])
 
 
-def _closest_weights(form: DressForm, skeleton: TriangleMesh, points: np.ndarray) -> np.ndarray:
-    """(P, J) authored weights at the closest point of the skeleton; its vertices are the form's own."""
+def _closest_weights(
+    form: DressForm, skeleton: TriangleMesh, points: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "P J"]:
+    """Return the authored weights at the closest point of the skeleton; its vertices are the form's own."""
     whole = ClothMesh(form.vertices, form.base.faces, form.base.weights)
     sources = [submesh(whole, form.base.face_group == group) for group in ("helper-hair", "body")]
     mesh = concatenate_meshes([source.mesh for source in sources])

@@ -6,20 +6,19 @@ the mesh, then dropped onto its front. Expect some millimetres.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from jaxtyping import Float, Int
 
 from tools.anny_base import JOINT_NAMES, BaseMesh
-
-if TYPE_CHECKING:
-    from tools.tpose_body import TPoseBody
+from tools.tpose_body import TPoseBody
 
 _LASH_LENGTH = 0.004  # metres that lashes reach beyond the outer corner of the eye
 
 
-def face_landmarks(base: BaseMesh, body: TPoseBody, expression_dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangle index (51,) and barycentric coordinates (51, 3) of each landmark.
+def face_landmarks(
+    base: BaseMesh, body: TPoseBody, expression_dirs: Float[np.ndarray, "V 3 E"]
+) -> tuple[Int[np.ndarray, " 51"], Float[np.ndarray, "51 3"]]:
+    """Return triangle and barycentric coordinates of each landmark.
 
     Order: right brow 5, left brow 5 (outer to inner, inner to outer), nose bridge 4, nostrils 5, right eye 6, left
     eye 6, outer lips 12, inner lips 8; "right" is the subject's.
@@ -31,10 +30,12 @@ def face_landmarks(base: BaseMesh, body: TPoseBody, expression_dirs: np.ndarray)
     return _drop_on_front(points, triangles, head)
 
 
-def _frontal_points(base: BaseMesh, body: TPoseBody, expression_dirs: np.ndarray) -> np.ndarray:
-    """(51, 2) x (to the subject's left) and y, from features of the left half mirrored."""
+def _frontal_points(
+    base: BaseMesh, body: TPoseBody, expression_dirs: Float[np.ndarray, "V 3 E"]
+) -> Float[np.ndarray, "51 2"]:
+    """Draw x (to the subject's left) and y, from features of the left half mirrored."""
 
-    def most_moved(unit: str) -> np.ndarray:
+    def most_moved(unit: str) -> Float[np.ndarray, " 3"]:
         amount = np.linalg.norm(expression_dirs[:, :, base.expression_names.index(unit)], axis=1)
         return body.vertices[np.argmax(amount)].astype(np.float64)
 
@@ -64,12 +65,12 @@ def _frontal_points(base: BaseMesh, body: TPoseBody, expression_dirs: np.ndarray
     outer_lip = np.radians([180, 145, 112, 90, 68, 35, 0, -40, -68, -90, -112, -140])
     inner_lip = np.radians([180, 115, 90, 65, 0, -65, -90, -115])
 
-    def lips(angles: np.ndarray, radii: tuple[float, float, float]) -> np.ndarray:
+    def lips(angles: Float[np.ndarray, " L"], radii: tuple[float, float, float]) -> Float[np.ndarray, "L 2"]:
         across, up, down = (r * width for r in radii)
         height = np.where(np.sin(angles) > 0, up, down)
         return np.stack([across * np.cos(angles), mouth_y + height * np.sin(angles)], 1)
 
-    def mirrored(points: np.ndarray) -> np.ndarray:
+    def mirrored(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
         return points * [-1.0, 1.0]
 
     # dlib runs from the subject's right to the left: each eye clockwise as seen from the front, the first corner right.
@@ -78,8 +79,10 @@ def _frontal_points(base: BaseMesh, body: TPoseBody, expression_dirs: np.ndarray
     return np.concatenate([*parts, lips(outer_lip, (1.0, 0.25, 0.5)), lips(inner_lip, (0.85, 0.03, 0.15))])
 
 
-def _drop_on_front(points: np.ndarray, triangles: np.ndarray, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The front-most candidate triangle over each (x, y), and the barycentric coordinates there."""
+def _drop_on_front(
+    points: Float[np.ndarray, "L 2"], triangles: Float[np.ndarray, "F 3 3"], candidates: Int[np.ndarray, " C"]
+) -> tuple[Int[np.ndarray, " L"], Float[np.ndarray, "L 3"]]:
+    """Find the front-most candidate triangle over each (x, y), and the barycentric coordinates there."""
     a, b, c = triangles[candidates].transpose(1, 0, 2)
     ab, ac = (b - a)[:, :2], (c - a)[:, :2]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]

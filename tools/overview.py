@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
@@ -45,24 +46,24 @@ class Overview:
             label_colors = display_colors(labels["face_labels"])
         poses = dict(zip(STRESS_POSES, template.pose(stress_poses(load_params_of_run(self.run_folder))), strict=True))
         step = template.mesh.with_vertices(poses["high_step"])
-        looks = {"vertex_colors": template.vertex_colors}
-        weights = {"vertex_colors": blend_joint_colors(template.weights)}
-        cells = [
-            ("scan", scan, {"vertex_colors": colors}),
-            ("labels", scan, {"face_colors": label_colors}),
-            ("skin weights", template.mesh, weights),
-            ("T-pose", template.mesh, looks),
-            ("high step", step, looks),
+        looks = template.vertex_colors
+        pictures = [
+            caption(_front(scan, vertex_colors=colors), "scan"),
+            caption(_front(scan, face_colors=label_colors), "labels"),
+            caption(_front(template.mesh, vertex_colors=blend_joint_colors(template.weights)), "skin weights"),
+            caption(_front(template.mesh, vertex_colors=looks), "T-pose"),
+            caption(_front(step, vertex_colors=looks), "high step"),
         ]
-        pictures = [caption(_front(mesh, options), name) for name, mesh, options in cells]
         photograph, skinned, student = _cut(held_out_view(self.run_folder))
         pictures += [caption(photograph, "held-out view")]
         pictures += [caption(skinned, "Gaussians, skinned"), caption(student, "student")]
         atomic_write_bytes(self.out, encode_png(row(pictures, gap=4)))
 
 
-def held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
+def held_out_view(
+    run: Path,
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]]:
+    """Return the photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
     manifest = read_manifest(run / EVALUATE_STAGE)
     numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]
     views = [shown for shown in numbers["views"] if shown["set"] == "novel_view"]
@@ -78,17 +79,23 @@ def held_out_view(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return photograph, rendered[models.index("reference-fit")], rendered[models.index("student")]
 
 
-def _cut(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """The same columns of each, those that the person in the first is in, at the height of the other pictures."""
+def _cut(images: tuple[UInt8[np.ndarray, "H W 3"], ...]) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Cut the columns that the person in the first is in out of each, at the height of the other pictures."""
     columns = np.flatnonzero((images[0] > 16).any(axis=(0, 2)))
     cut = [image[:, max(columns[0] - 4, 0) : columns[-1] + 5] for image in images]
     size = (round(cut[0].shape[1] * HEIGHT / len(cut[0])), HEIGHT)
     return [np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS)) for image in cut]
 
 
-def _front(mesh: TriangleMesh, options: dict) -> np.ndarray:
+def _front(
+    mesh: TriangleMesh,
+    *,
+    vertex_colors: UInt8[np.ndarray, "V 3"] | None = None,
+    face_colors: UInt8[np.ndarray, "F 3"] | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a mesh from the front with colours of its vertices or faces."""
     camera = body_cameras(mesh, views=("three-quarter",), height=HEIGHT)[0]
-    return render_shaded(mesh, camera, **options)
+    return render_shaded(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors)
 
 
 if __name__ == "__main__":

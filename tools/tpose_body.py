@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float32, Int, Int16
 
 from tools.anny_base import BODY_VERTEX_COUNT, BaseMesh
 
@@ -21,18 +22,24 @@ KEPT_GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class TPoseBody:
-    """The kept part of the base mesh in the T-pose, at the precision that is stored."""
+    """The kept part of the base mesh in the T-pose, at the precision that is stored.
 
-    full_index: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-    uvs: np.ndarray
-    face_uvs: np.ndarray
-    directions: np.ndarray
-    weights: np.ndarray
-    labels: np.ndarray
-    joints: np.ndarray
-    joint_shape_dirs: np.ndarray
+    Attributes:
+        full_index: which of the base mesh's vertices are kept.
+        directions: shape directions, then those of the expressions.
+        labels: indices into the values of `KEPT_GROUPS`.
+    """
+
+    full_index: Int[np.ndarray, " V"]
+    vertices: Float32[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    uvs: Float[np.ndarray, "T 2"]
+    face_uvs: Int[np.ndarray, "F 3"]
+    directions: Float32[np.ndarray, "V 3 D"]
+    weights: Float32[np.ndarray, "V 55"]
+    labels: Int16[np.ndarray, " V"]
+    joints: Float[np.ndarray, "55 3"]
+    joint_shape_dirs: Float[np.ndarray, "55 3 K"]
 
 
 def reduce_to_body(base: BaseMesh) -> TPoseBody:

@@ -12,18 +12,19 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Literal
 
 from pipelines.captures.convert_views import ViewWriter
 from smplxpp.capture import Capture
 from smplxpp.capture.meshes import PosedTopology
-from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv
+from smplxpp.capture.writers.arrays import save_params_by_row
+from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv, write_plain_cameras_json
+from smplxpp.capture.writers.description import write_description
 from smplxpp.core.atomic import atomic_path, atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh_io import write_ply
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_between, require_choice, require_positive
 
 Progress = Callable[[int, int], None]
 _RECORD = "conversion.json"
@@ -50,12 +51,10 @@ class ConvertConfig:
     quality: int = 95
 
     def __post_init__(self) -> None:
-        if self.layout not in ("simple", "actorshq"):
-            raise InputError("--layout", expected="simple or actorshq", received=repr(self.layout))
-        if not 0 < self.scale <= 4:
-            raise InputError("--scale", expected="a factor above 0, at most 4", received=str(self.scale))
-        if not 1 <= self.quality <= 100:
-            raise InputError("--quality", expected="1 to 100", received=str(self.quality))
+        require_choice("--layout", self.layout, ("simple", "actorshq"))
+        require_positive("--scale", self.scale)
+        require_between("--scale", self.scale, 0, 4)
+        require_between("--quality", self.quality, 1, 100)
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,9 @@ def convert_capture(
     left_out += _write_params(capture, out, frames, config)
     if config.layout == "simple":
         _write_geometry(capture, out, frames)
-        _write_ours(source, out, cameras, frames)
+        write_plain_cameras_json(out / "cameras.json", {n: c for n, c in source.cameras.items() if n in cameras})
+        splits = source.splits.restricted(cameras, frames)
+        write_description(out / "capture.json", source.recording, splits, frames)
     else:
         write_calibration_csv(root / "calibration.csv", [RigCamera(source.cameras[c], "body", False) for c in cameras])
     copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))
@@ -120,11 +121,12 @@ def convert_capture(
 
 
 def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[int]]:
+    """Return the cameras and frames that are kept, in the capture's order."""
     for name, wanted, have in (
         ("--cameras", config.cameras, tuple(capture.cameras)),
         ("--frames", config.frames, capture.frames),
     ):
-        unknown = [item for item in wanted or () if item not in have]
+        unknown = [one for one in wanted or () if one not in have]
         if unknown or wanted == () or not have:
             raise InputError(
                 name,
@@ -159,7 +161,7 @@ def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
 
 
 def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: ConvertConfig) -> list[str]:
-    """Parameters of the frames, and words about those that cannot be read."""
+    """Write the parameters of the frames; return words about those that cannot be read."""
     params: dict[int, BodyParams] = {}
     left_out = []
     for frame in frames:
@@ -173,7 +175,7 @@ def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: Co
     if not params:
         return left_out
     if config.layout == "actorshq":
-        _write_rows(out / "smpl_params.npz", params)
+        save_params_by_row(out / "smpl_params.npz", params)
     elif list(params) == list(range(len(params))):
         BodyParams.concatenate(list(params.values())).save(out / "params" / "params.npz")
     else:  # a row for each number would leave gaps
@@ -182,21 +184,8 @@ def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: Co
     return left_out
 
 
-def _write_rows(path: Path, params: dict[int, BodyParams]) -> None:
-    """Row n is frame n; NaN where a frame has none, which spoils that frame alone."""
-    joined = BodyParams.concatenate(list(params.values()))
-    rows = np.array(list(params))
-    arrays: dict[str, Any] = {"flat_hand_mean": np.bool_(joined.flat_hand_mean)}
-    for name in ARRAY_NAMES:
-        values = getattr(joined, name)
-        arrays[name] = np.full((rows.max() + 1, values.shape[1]), np.nan)
-        arrays[name][rows] = values
-    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
-
-
 def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
-    """True surfaces, and the scans that a template is built from."""
+    """Write true surfaces, and the scans that a template is built from."""
     meshes = capture.recording.meshes
     if isinstance(meshes, PosedTopology):
         atomic_write_bytes(out / "geometry" / "topology.npz", meshes.topology.read_bytes())
@@ -214,40 +203,3 @@ def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
         for frame in frames:
             for path in sorted((capture.root / "scans").glob(f"scan_{frame:06d}*")):
                 atomic_write_bytes(out / "scans" / path.name, path.read_bytes())
-
-
-def _write_ours(capture: Capture, out: Path, cameras: Sequence[str], frames: Sequence[int]) -> None:
-    """cameras.json and capture.json."""
-    entries = [
-        {
-            "name": name,
-            "w": camera.width,
-            "h": camera.height,
-            "K": camera.K.tolist(),
-            "R": camera.cam_from_world[:3, :3].tolist(),
-            "T": camera.cam_from_world[:3, 3].tolist(),
-        }
-        for name, camera in capture.cameras.items()
-        if name in cameras
-    ]
-    splits, recording = capture.splits.restricted(cameras, frames), capture.recording
-    description: dict[str, Any] = {"name": capture.name}
-    if capture.fps is not None:
-        description["fps"] = capture.fps
-    description |= {
-        "background": None if recording.background is None else list(recording.background),
-        "label_set": capture.label_set,
-        "train_views": list(splits.train_cameras),
-        "novel_views": list(splits.novel_view_cameras),
-        "train_frames": _ranges(splits.train_frames, frames),
-        "novel_pose_frames": _ranges(splits.novel_pose_frames, frames),
-    }
-    atomic_write_text(out / "cameras.json", json.dumps({"cameras": entries}, indent=1) + "\n")
-    atomic_write_text(out / "capture.json", json.dumps(description, indent=1) + "\n")
-
-
-def _ranges(chosen: Sequence[int], frames: Sequence[int]) -> list[list[int]]:
-    """[first, last] of every run of `frames` that is chosen."""
-    marks = np.concatenate([[0], np.isin(frames, chosen).astype(np.int8), [0]])
-    starts, ends = np.flatnonzero(np.diff(marks) == 1), np.flatnonzero(np.diff(marks) == -1) - 1
-    return [[int(frames[first]), int(frames[last])] for first, last in zip(starts, ends, strict=True)]

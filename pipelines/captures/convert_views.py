@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8, UInt16
 from PIL import Image
 
 from smplxpp.capture import Capture
 from smplxpp.capture.window import Window
-from smplxpp.capture.writers.images import png16
+from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
-_JPEG = (".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -46,20 +45,21 @@ class ViewWriter:
     quality: int
 
     def write(self, camera: str, frame: int) -> ViewOutcome:
-        """All files of a view, or none where one of them cannot be read."""
+        """Write all files of a view, or none where one of them cannot be read."""
         targets = self._targets(camera, frame)
         if all(path.is_file() for path, _ in targets.values()):
             return ViewOutcome(kept=len(targets))
         read = {"image": self._image, "mask": self.capture.mask, "label": self.capture.labels, "normal": self._normals}
         contents, copied = {}, 0
         try:
-            for kind, (path, same) in targets.items():
+            for kind, (path, source) in targets.items():
                 value = read[kind](camera, frame)  # decoded in any case: a damaged file is not passed on
-                if same:
-                    contents[path] = self.capture.file(camera, frame, kind).read_bytes()
+                if source is not None:
+                    contents[path] = source.read_bytes()
                     copied += 1
                 else:
-                    contents[path] = self._encoded(value, path.suffix)
+                    assert value is not None  # only files that are there have a target
+                    contents[path] = encoded_image(value, path.suffix, self.quality)
         except InputError as error:
             return ViewOutcome(problem=f"camera {camera}, frame {frame} left out: {error}")
         # The image last: a view that has one is whole.
@@ -67,55 +67,47 @@ class ViewWriter:
             atomic_write_bytes(path, contents[path])
         return ViewOutcome(copied=copied, encoded=len(contents) - copied)
 
-    def _targets(self, camera: str, frame: int) -> dict[str, tuple[Path, bool]]:
-        """For each kind of file its place, and whether the source's bytes can be taken."""
+    def _targets(self, camera: str, frame: int) -> dict[str, tuple[Path, Path | None]]:
+        """For each kind of file its place, and the source's file where its bytes can be taken."""
         capture = self.capture
         unchanged = camera not in capture.recording.distortions and capture.windows[camera] == Window.full(
             capture.recording.cameras[camera]
         )
-        found = {kind: capture.file(camera, frame, kind) for kind in ("image", "mask", "label", "normal")}
-        suffix = found["image"].suffix.lower()
+        image, mask = capture.file(camera, frame), capture.file(camera, frame, "mask")
+        assert image is not None  # views are those with an image
+        suffix = image.suffix.lower()
+        mask_source = mask if unchanged and _is_plain_mask(mask) else None
 
-        def place(folder: str, tag: str, ending: str) -> Path:
-            return self.root / folder / camera / f"{camera}_{tag}{frame:06d}{ending}"
+        def target(kind: str, ending: str, source: Path | None) -> tuple[Path, Path | None]:
+            return view_path(self.root, kind, camera, frame, ending), source
 
         if self.layout == "actorshq":
             on_black = capture.recording.background == (0.0, 0.0, 0.0)
             same = unchanged and on_black and suffix == ".jpg"
+            # Without a mask the image cannot be put on black, which its reading tells.
             return {
-                "image": (place("rgbs", "rgb", ".jpg"), same),
-                "mask": (place("masks", "mask", ".png"), unchanged and _is_plain_mask(found["mask"])),
+                "image": target("image", ".jpg", image if same else None),
+                "mask": target("mask", ".png", mask_source),
             }
-        kept = suffix if unchanged or suffix in _JPEG else (".png" if suffix in _LOSSLESS else ".jpg")
-        targets = {"image": (place("rgbs", "rgb", kept), unchanged)}
-        if found["mask"] is not None:
-            targets["mask"] = (place("masks", "mask", ".png"), unchanged and _is_plain_mask(found["mask"]))
-        for kind, folder in (("label", "labels"), ("normal", "normals")):
-            if found[kind] is not None:
-                ending = found[kind].suffix.lower() if unchanged else ".png"
-                targets[kind] = (place(folder, kind, ending), unchanged)
+        kept = suffix if unchanged or suffix in JPEG_SUFFIXES else (".png" if suffix in _LOSSLESS else ".jpg")
+        targets = {"image": target("image", kept, image if unchanged else None)}
+        if mask is not None:
+            targets["mask"] = target("mask", ".png", mask_source)
+        for kind in ("label", "normal"):
+            found = capture.file(camera, frame, kind)
+            if found is not None:
+                ending = found.suffix.lower() if unchanged else ".png"
+                targets[kind] = target(kind, ending, found if unchanged else None)
         return targets
 
-    def _image(self, camera: str, frame: int) -> np.ndarray:
+    def _image(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
         if self.layout == "actorshq":
             return self.capture.foreground(camera, frame)[0]
         return self.capture.image(camera, frame)
 
-    def _normals(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W, 3) uint16 codes, n = value / 65535 * 2 - 1, black outside."""
+    def _normals(self, camera: str, frame: int) -> UInt16[np.ndarray, "H W 3"] | None:
         normals = self.capture.normals(camera, frame)
-        codes = np.clip(np.round((normals + 1.0) * 32767.5), 1, 65535)
-        return np.where(normals.any(axis=2, keepdims=True), codes, 0).astype(np.uint16)
-
-    def _encoded(self, image: np.ndarray, suffix: str) -> bytes:
-        if image.dtype == np.uint16:
-            return png16(image)
-        buffer = io.BytesIO()
-        if suffix in _JPEG:
-            Image.fromarray(image).save(buffer, "JPEG", quality=self.quality, subsampling=0)
-        else:
-            Image.fromarray(image).save(buffer, "PNG")
-        return buffer.getvalue()
+        return None if normals is None else normal_codes(normals)
 
 
 def _is_plain_mask(path: Path | None) -> bool:

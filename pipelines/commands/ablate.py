@@ -13,8 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from pipelines.commands.extras import require_avatar
-from pipelines.commands.options import OptionalInt, OptionalPath
+from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:

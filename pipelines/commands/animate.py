@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
@@ -19,12 +20,15 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.template.template import Template
 
 TEMPLATE_FILE = Path("60_assemble") / "smplxpp.npz"
 DEFAULT_FPS = 20.0
 _FRAMING_POSES = 24  # poses that the camera is fitted to
 _BLOCK = 16  # frames posed at a time
+_SMALLEST = 16  # pixels of a picture
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Animate:
         suffix = self.out.suffix.lower()
         self._check_options(suffix)
         template = Template.load(self._template_file())
-        params = self._load_params(template)
+        params, fps = self._load_params(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
 
@@ -72,10 +76,10 @@ class Animate:
             first = next(posed)
             cameras = self._cameras(template, params)
             frames = self._frames(template, _chain(first, posed), cameras)
-            write_film(self.out, frames, fps=params.fps, size=(cameras[0].width, cameras[0].height))
+            write_film(self.out, frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         if not self.json:
-            Console().print(f"{self.out}: {len(params)} frames at {params.fps:g} a second")
-        return {"out": str(self.out), "frames": len(params), "fps": params.fps}
+            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second")
+        return {"out": str(self.out), "frames": len(params), "fps": fps}
 
     def _check_options(self, suffix: str) -> None:
         if suffix not in (*SUFFIXES, ".glb"):
@@ -84,16 +88,12 @@ class Animate:
                 expected=".mp4, .gif, .glb, or no suffix for a folder of PNG pictures",
                 received=suffix,
             )
-        smallest = 16
-        for name, value, least in (
-            ("height", self.height, smallest),
-            ("width", self.width if self.width is not None else smallest, smallest),
-            ("step", self.step, 1),
-        ):
-            if value < least:
-                raise InputError(f"option {name}", expected=f"at least {least}", received=str(value))
-        if self.fps is not None and not self.fps > 0:
-            raise InputError("option fps", expected="more than 0", received=str(self.fps))
+        require_at_least("option height", self.height, _SMALLEST)
+        if self.width is not None:
+            require_at_least("option width", self.width, _SMALLEST)
+        require_at_least("option step", self.step, 1)
+        if self.fps is not None:
+            require_positive("option fps", self.fps)
         if suffix == FRAME_FOLDER and self.out.exists():
             # The folder is replaced as a whole: it must not hold anything but an earlier film.
             names = [p.name for p in self.out.iterdir()] if self.out.is_dir() else ["(a file)"]
@@ -116,7 +116,8 @@ class Animate:
             )
         return path
 
-    def _load_params(self, template: Template) -> BodyParams:
+    def _load_params(self, template: Template) -> tuple[BodyParams, float]:
+        """Read the chosen frames, and how many of them a second shows."""
         from smplxpp.body import load_params
 
         # Layouts that turn the body about the origin need its root joint. The identity is in the template already:
@@ -132,11 +133,11 @@ class Animate:
                 received=f"--start {self.start} --stop {self.stop} --step {self.step}",
             )
         fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
-        return replace(params.select(list(chosen)), fps=fps)
+        return replace(params.select(list(chosen)), fps=fps), fps
 
     def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
-        """A camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
-        some = np.unique(np.linspace(0, len(params) - 1, min(_FRAMING_POSES, len(params))).round().astype(int))
+        """Place a camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
+        some = spread(range(len(params)), _FRAMING_POSES)
         points = template.pose(params.select(some)).reshape(-1, 3)
         height = self.height + self.height % 2  # h264 with 4:2:0 colour takes even sizes
         width = None if self.width is None else self.width + self.width % 2
@@ -144,7 +145,10 @@ class Animate:
             return turntable_cameras(points, count=len(params), height=height, width=width)
         return fit_cameras(points, directions=[VIEWS[self.view]], height=height, width=width) * len(params)
 
-    def _frames(self, template: Template, posed: Iterator[np.ndarray], cameras: list[Camera]) -> Iterator[np.ndarray]:
+    def _frames(
+        self, template: Template, posed: Iterator[Float[np.ndarray, "V 3"]], cameras: list[Camera]
+    ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        """Draw the pictures one after the other."""
         colors = {
             "scan": lambda: template.vertex_colors,
             "labels": lambda: display_colors(template.vertex_labels),
@@ -159,13 +163,15 @@ class Animate:
             yield render_shaded(template.mesh.with_vertices(vertices), camera, vertex_colors=colors)
 
 
-def _pose_blocks(template: Template, params: BodyParams) -> Iterator[np.ndarray]:
-    """(t, V, 3) blocks of at most `_BLOCK` frames, so that long motions fit in memory."""
+def _pose_blocks(template: Template, params: BodyParams) -> Iterator[Float[np.ndarray, "t V 3"]]:
+    """Pose blocks of at most `_BLOCK` frames, so that long motions fit in memory."""
     for begin in range(0, len(params), _BLOCK):
         yield template.pose(params.select(slice(begin, begin + _BLOCK)))
 
 
-def _chain(first: np.ndarray, rest: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+def _chain(
+    first: Float[np.ndarray, "t V 3"], rest: Iterator[Float[np.ndarray, "_ V 3"]]
+) -> Iterator[Float[np.ndarray, "V 3"]]:
     yield from first
     for block in rest:
         yield from block

@@ -52,9 +52,12 @@ class CaptureCheckCommand:
         from pipelines.captures.check.terminal import print_check
         from pipelines.commands.progress import counted_progress
         from smplxpp.body import load_body
+        from smplxpp.capture import open_capture
 
         body = load_body(self.body)
-        capture = _open(self.capture, self.format, masks=self.masks, params=self.params, body=body)
+        capture = open_capture(
+            self.capture, format=_reader(self.format), masks=self.masks, params=self.params, body=body
+        )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
         with counted_progress("images", enabled=not self.json) as progress:
             check = check_capture(capture, body, config, progress=progress)
@@ -95,7 +98,7 @@ class CaptureConvertCommand:
     """Body model file that the parameters are for, where a layout turns it about the origin; the open body by
     default."""
     quality: int = 95
-    """Of JPEG images that cannot be copied."""
+    """Quality of JPEG images that cannot be copied."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -104,11 +107,19 @@ class CaptureConvertCommand:
         from pipelines.captures.convert import ConvertConfig, convert_capture
         from pipelines.commands.progress import counted_progress
         from smplxpp.body import load_body
+        from smplxpp.capture import open_capture
 
         body = None if self.body is None else load_body(self.body)
         if self.matting is not None:
-            self._matte()
-        capture = _open(self.capture, self.format, masks=self.masks, params=self.params, body=body, cache_bytes=0)
+            self._matte(self.matting)
+        capture = open_capture(
+            self.capture,
+            format=_reader(self.format),
+            masks=self.masks,
+            params=self.params,
+            body=body,
+            cache_bytes=0,
+        )
         config = ConvertConfig(
             layout=self.layout,
             scale=self.scale,
@@ -128,28 +139,28 @@ class CaptureConvertCommand:
             console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
 
-    def _matte(self) -> None:
+    def _matte(self, model_file: Path) -> None:
         """Run the model over every image that has no matte yet."""
         from pipelines.commands.progress import counted_progress
+        from smplxpp.capture import open_capture
         from smplxpp.capture.matting import MattingModel, write_mattes
 
         if self.masks is None:
             raise InputError("--matting", expected="--masks FOLDER for the mattes", received="no folder")
-        capture = _open(self.capture, self.format, cache_bytes=0)
-        model, total = MattingModel(self.matting), len(capture.views())
+        capture = open_capture(self.capture, format=_reader(self.format), cache_bytes=0)
+        model, total = MattingModel(model_file), len(capture.views())
         with counted_progress("mattes", enabled=not self.json) as progress:
             for done, _ in enumerate(write_mattes(capture, model, self.masks), start=1):
                 progress(done, total)
 
 
-def _open(path: Path, format: str, **options) -> Capture:
-    from smplxpp.capture import open_capture
-
-    return open_capture(path, format=None if format == "auto" else format, **options)
+def _reader(format: FormatName) -> str | None:
+    """Return the name of a reader; None where the files tell it."""
+    return None if format == "auto" else format
 
 
 def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | None:
-    """The capture's frames that a text names: `all`, `0,5`, `0:100:10`; None for None.
+    """Return the capture's frames that a text names: `all`, `0,5`, `0:100:10`; None for None.
 
     Raises:
         InputError: not understood, a number that is no frame, or a range without any.
@@ -161,16 +172,16 @@ def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | Non
     chosen: set[int] = set()
     for part in text.split(","):
         try:
-            numbers = [int(n) if n.strip() else None for n in part.split(":")]
-            if len(numbers) > 3 or numbers == [None] or numbers[2:] == [0]:
+            numbers = tuple(int(n) if n.strip() else None for n in part.split(":"))
+            if len(numbers) > 3 or numbers == (None,) or numbers[2:] == (0,):
                 raise ValueError
         except ValueError:
             raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
         if len(numbers) == 1:
-            found = {numbers[0]} & set(capture.frames)
+            found = {frame for frame in capture.frames if frame == numbers[0]}
         else:
             last = max(capture.frames, default=-1) + 1
-            start, stop, step = (*numbers, None)[:3]
+            start, stop, step = numbers if len(numbers) == 3 else (*numbers, None)
             found = set(range(start or 0, last if stop is None else min(stop, last), step or 1)) & set(capture.frames)
         if not found:
             have = f"{capture.frames[0]} to {capture.frames[-1]}" if capture.frames else "none"

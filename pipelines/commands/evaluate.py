@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from pipelines.commands.extras import require_avatar
-from pipelines.commands.options import OptionalPath
+from pipelines.commands.options import OptionalPath, require_avatar
 from pipelines.commands.progress import counted_progress
 from smplxpp.core.errors import InputError
 

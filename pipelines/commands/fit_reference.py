@@ -13,8 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.extras import require_avatar
-from pipelines.commands.options import OptionalInt, OptionalPath
+from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.stage import StageRecord
 from smplxpp.core.validation import require_at_least, require_positive

@@ -44,7 +44,7 @@ class Inspect:
 
 
 def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
-    """The stages of a run, finished or not, as JSON values, and all of its checks.
+    """Return the stages of a run, finished or not, as JSON values, and all of its checks.
 
     Raises:
         InputError: the folder holds no run.
@@ -82,7 +82,7 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
 
 
 def _remedy(run: Path, stage: str) -> str:
-    """The command that makes a stage."""
+    """Return the command that makes a stage."""
     if stage == BIND_STAGE:
         return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
     if stage in TRAIN_STAGES:
@@ -132,7 +132,7 @@ def _mark_outdated(stages: list[dict[str, Any]]) -> None:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; empty when it is missing or damaged, which a summary survives."""
+    """Read the mapping in a JSON file; empty when it is missing or damaged, which a summary survives."""
     try:
         content = jsonlib.loads(path.read_text())
     except (OSError, ValueError):

@@ -8,12 +8,14 @@ import json as json_format
 import re
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Shaped
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -22,6 +24,7 @@ from pipelines.commands.options import OptionalPath
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_io import MeshFile, read_mesh
+from smplxpp.core.validation import require_at_least
 from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
 
 # A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.
@@ -43,20 +46,20 @@ class Metrics:
     samples: int = 100_000
     """Points taken of each mesh, area-weighted."""
     seed: int = 0
-    """Of the points: the same seed gives the same numbers, bit for bit."""
+    """Seed of the points: the same seed gives the same numbers, bit for bit."""
     preset: Preset = "smplxpp"
     """Whose definition of P2S and Chamfer; the output states it. Everything else is in mm."""
     visible_only: bool = False
     """Measure from the outer surface of each mesh alone: skin hidden under clothes is left out."""
     threshold_mm: float = 5.0
-    """Of precision, recall and F-score."""
+    """Distance within which a point counts for precision, recall and F-score."""
     units: Literal["m", "cm", "mm"] = "m"
-    """Of both meshes' coordinates."""
+    """Units of both meshes' coordinates."""
     labels_a: OptionalPath = None
     """Labels of A's faces or vertices (.npy, or .npz with face_labels, vertex_labels, labels or label), 0 skin, 1 hair,
     2 shoe, 3 upper, 4 lower, 5 outer; or a folder of such files. Without it, a PLY property `label` counts."""
     labels_b: OptionalPath = None
-    """The same for B."""
+    """Labels of B, given in the same ways."""
     out: OptionalPath = None
     """Write the result there as well: .json (all of it) or .csv (a row a frame)."""
     json: bool = False
@@ -70,8 +73,7 @@ class Metrics:
         """
         if self.out is not None and self.out.suffix.lower() not in (".json", ".csv"):
             raise InputError("output file", expected=".json or .csv", received=str(self.out))
-        if self.seed < 0:
-            raise InputError("option seed", expected="at least 0", received=str(self.seed))
+        require_at_least("option seed", self.seed, 0)
         pairs, skipped = pair_frames(self.a, self.b)
         frames = []
         console = Console(stderr=True)
@@ -125,12 +127,12 @@ class Metrics:
             config=CompareConfig(threshold_mm=self.threshold_mm, visible_only=self.visible_only),
         )
 
-    def _report(self, frames: list[dict], skipped: list[dict]) -> dict[str, Any]:
+    def _report(self, frames: list[dict[str, Any]], skipped: list[dict[str, str]]) -> dict[str, Any]:
         convention = presets()[self.preset]
         rows = [flat_row(frame) for frame in frames]
         keys = dict.fromkeys(key for row in rows for key in row)
         known = {key: [row[key] for row in rows if row.get(key) is not None] for key in keys}
-        spread = {
+        over_frames = {
             key: {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)}
             for key, values in known.items()
             if values and key != "frame"
@@ -145,13 +147,13 @@ class Metrics:
             "threshold_mm": self.threshold_mm,
             "visible_only": self.visible_only,
             "frames": frames,
-            "over_frames": spread,
+            "over_frames": over_frames,
             "skipped": skipped,
         }
 
 
 def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[dict[str, str]]]:
-    """Pairs (name, file of A, file of B) and the frames without a partner, as {"frame", "reason"}.
+    """Match pairs (name, file of A, file of B) and tell the frames without a partner, as {"frame", "reason"}.
 
     Two files are one pair. Two folders pair files of the same stem, or, where no stem occurs in both, files whose names
     end in the same number.
@@ -182,13 +184,13 @@ def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[di
 
 
 def frame_number(path: Path) -> str:
-    """The last run of digits in a file's stem without leading zeros, or the stem where it has none."""
+    """Return the last run of digits in a file's stem without leading zeros, or the stem where it has none."""
     digits = re.findall(r"\d+", path.stem)
     return str(int(digits[-1])).zfill(12) if digits else path.stem
 
 
 def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
-    """One frame's numbers by flat name: `p2s`, `pred_to_gt.p95`, `upper.chamfer`, ..."""
+    """Return one frame's numbers by flat name: `p2s`, `pred_to_gt.p95`, `upper.chamfer`, ..."""
     row = {"frame": frame["frame"]}
     for prefix, result in [("", frame), *((f"{name}.", r) for name, r in frame["labels"].items())]:
         for key in ("p2s", "chamfer", "hausdorff", "precision", "recall", "fscore"):
@@ -204,6 +206,7 @@ def _stem(path: Path) -> str:
 
 
 def _frames(folder: Path) -> list[Path]:
+    """List the files of a folder that are frames."""
     for suffixes in FRAME_SUFFIXES:
         found = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in suffixes)
         if found:
@@ -211,7 +214,7 @@ def _frames(folder: Path) -> list[Path]:
     raise InputError(f"folder {folder}", expected="mesh files", received="none")
 
 
-def _by_key(files: list[Path], key: Any, folder: Path) -> dict[str, Path]:
+def _by_key(files: list[Path], key: Callable[[Path], str], folder: Path) -> dict[str, Path]:
     keyed: dict[str, Path] = {}
     for path in files:
         other = keyed.setdefault(key(path), path)
@@ -225,13 +228,14 @@ def _by_key(files: list[Path], key: Any, folder: Path) -> dict[str, Path]:
     return keyed
 
 
-def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> np.ndarray | None:
+def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> Shaped[np.ndarray, " N"] | None:
+    """Return the labels of faces or vertices, from their own file or the mesh's; None where there are none."""
     if given is None:
         properties = {**file.vertex_properties, **file.face_properties}
-        name = next((k for k in ("label", "labels") if k in properties), None)
+        stored = next((properties[k] for k in ("label", "labels") if k in properties), None)
         # PLY files often store labels as floats.
-        whole = name is not None and np.array_equal(properties[name], np.round(properties[name]))
-        return properties[name].astype(np.int64) if whole else None
+        whole = stored is not None and np.array_equal(stored, np.round(stored))
+        return stored.astype(np.int64) if stored is not None and whole else None
     if given.is_dir():
         same = [
             p
@@ -256,7 +260,7 @@ def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> np.ndarray |
         return data[key]
 
 
-def _csv(frames: list[dict]) -> str:
+def _csv(frames: list[dict[str, Any]]) -> str:
     rows = [flat_row(frame) for frame in frames]
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(dict.fromkeys(k for row in rows for k in row)), lineterminator="\n")
@@ -291,9 +295,9 @@ def _print(report: dict[str, Any], console: Console) -> None:
     for column in columns:
         table.add_column(column, justify="right")
 
-    def add(name: str, values: dict[str, Any], **style: Any) -> None:
+    def add(name: str, values: dict[str, Any], *, style: str | None = None, end_section: bool = False) -> None:
         cells = ["-" if values.get(key) is None else f"{values[key]:.4g}" for key in columns.values()]
-        table.add_row(name, *cells, **style)
+        table.add_row(name, *cells, style=style, end_section=end_section)
 
     for frame in frames:
         row = flat_row(frame)

@@ -1,13 +1,30 @@
-"""Types of options that may be left out, shown in help as what they take."""
+"""What commands share: types of options that may be left out, and the check that an optional package is there."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from smplxpp.core.errors import MissingExtraError
+
+# Help shows them as what they take.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(optional)")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="(optional)")]
+
+_AVATAR_PACKAGES = ("torch", "safetensors", "threadpoolctl")
+
+
+def require_avatar(purpose: str) -> None:
+    """Say which package of the extra `avatar` is missing before anything imports it.
+
+    Raises:
+        MissingExtraError: one of them is not installed.
+    """
+    for package in _AVATAR_PACKAGES:
+        if find_spec(package) is None:
+            raise MissingExtraError(package, extra="avatar", purpose=purpose)

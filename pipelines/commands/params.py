@@ -49,7 +49,7 @@ class ParamsConvert:
         layout = detect_layout(self.input) if self.layout == "auto" else self.layout
         params = load_params(
             self.input,
-            layout=layout,
+            layout=self.layout,
             body=None if self.body is None else load_body(self.body),
             person=self.person,
             up=self.up,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def stage_progress(count: int, *, enabled: bool = True) -> Iterator[Callable[[str, bool], None]]:
-    """A bar over `count` stages; yields `step(name, done)` to call before (False) and after (True) each."""
+    """Show a bar over `count` stages; yields `step(name, done)` to call before (False) and after (True) each."""
     columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not enabled) as progress:
         task = progress.add_task("start", total=count)
@@ -36,7 +36,7 @@ def stage_progress(count: int, *, enabled: bool = True) -> Iterator[Callable[[st
 
 @contextmanager
 def counted_progress(what: str, *, enabled: bool = True) -> Iterator[Callable[[int, int], None]]:
-    """A bar over things that are counted; yields `show(done, count)`."""
+    """Show a bar over things that are counted; yields `show(done, count)`."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
         task = progress.add_task(what, total=None)
@@ -51,7 +51,7 @@ def counted_progress(what: str, *, enabled: bool = True) -> Iterator[Callable[[i
 def training_progress(
     name: str, total: int, *, held_out: bool = True, enabled: bool = True
 ) -> Iterator[Callable[[TrainingProgress], None]]:
-    """A bar with loss, PSNR, speed and the time that is left; yields what a training reports to.
+    """Show a bar with loss, PSNR, speed and the time that is left; yields what a training reports to.
 
     Args:
         held_out: whether views are measured that training does not see, where an evaluation does not say so itself.
@@ -65,21 +65,24 @@ def training_progress(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    quality: dict[str, Any] = {}
+    psnr: float | None = None  # of the last evaluation that measured it
+    psnr_held_out = held_out
     bar = Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0)
     task = bar.add_task(name, total=total, figures="")
 
     def show(state: TrainingProgress) -> None:
+        nonlocal psnr, psnr_held_out
         bar.start()  # not before: a training that stands reports nothing
         if state.evaluation is not None:
-            quality.update(state.evaluation["mean"], held_out=state.evaluation.get("held_out", held_out))
+            psnr = state.evaluation["mean"].get("psnr", psnr)
+            psnr_held_out = state.evaluation.get("held_out", held_out)
         figures = []
         if "loss" in state.metrics:
             figures.append(f"loss {state.metrics['loss']:.4f}")
         if state.rate:
             figures.append(f"{state.rate:.1f} it/s")
-        if "psnr" in quality:  # a training taken up again has none before its next evaluation
-            figures.append(f"PSNR {quality['psnr']:.2f} dB {'held out' if quality['held_out'] else 'in training'}")
+        if psnr is not None:  # a training taken up again has none before its next evaluation
+            figures.append(f"PSNR {psnr:.2f} dB {'held out' if psnr_held_out else 'in training'}")
         bar.update(task, completed=state.iteration, total=state.iterations, figures="  ".join(figures))
 
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from pipelines.synth.make_capture import SynthConfig, make_capture
 from smplxpp.core.errors import InputError
@@ -28,13 +28,13 @@ class Synth:
     size: int = 640
     """Height of body images in pixels; they are 4/5 as wide, close-ups are square and 3/4 as high."""
     seed: int = 0
-    """Of the performance, the cameras and all noise."""
+    """Seed of the performance, the cameras and all noise."""
     fps: float = 10.0
     """Frames a second."""
     layout: Literal["simple", "actorshq"] = "simple"
     """Ours with everything, or images, masks and cameras in ActorsHQ's folders."""
     quality: int = 95
-    """Of JPEG images."""
+    """Quality of JPEG images."""
     truth_step: int = 1
     """Truth meshes of every n-th frame."""
     normals_step: int = 1
@@ -55,23 +55,22 @@ class Synth:
                 received=str(self.out),
                 remedy="name another, or delete it",
             )
-        names = (
-            "cameras",
-            "frames",
-            "size",
-            "seed",
-            "fps",
-            "layout",
-            "quality",
-            "truth_step",
-            "normals_step",
-            "scan_faces",
+        config = SynthConfig(
+            cameras=self.cameras,
+            frames=self.frames,
+            size=self.size,
+            seed=self.seed,
+            fps=self.fps,
+            layout=self.layout,
+            quality=self.quality,
+            truth_step=self.truth_step,
+            normals_step=self.normals_step,
+            scan_faces=self.scan_faces,
         )
-        config = SynthConfig(**{name: getattr(self, name) for name in names})
         console = Console(stderr=True)
         columns = (TextColumn("{task.description:<8}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
         with Progress(*columns, console=console) as bars:
-            tasks: dict[str, int] = {}
+            tasks: dict[str, TaskID] = {}
 
             def show(what: str, share: float) -> None:
                 if what not in tasks:

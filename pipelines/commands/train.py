@@ -15,8 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.extras import require_avatar
-from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.layout import BIND_STAGE
 from pipelines.runs.stage import StageRecord

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.capture.writers.cameras import BODY, FACE, RigCamera
 from smplxpp.core.camera import Camera
+from smplxpp.core.spread import spread_inside
 
 # Height of the ring's cameras over the floor, in turns (metres), and their distance.
 _HEIGHTS = (1.05, 1.75, 0.55)
@@ -16,12 +18,14 @@ _FACE_AZIMUTHS = (-6.0, 44.0)  # degrees to the subject's left: she turns that w
 _MARGIN = 1.06
 
 
-def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, seed: int) -> list[RigCamera]:
-    """`count` cameras that see the person in every frame.
+def camera_rig(
+    points: Float[np.ndarray, "P 3"], heads: Float[np.ndarray, "Q 3"], *, count: int, size: int, seed: int
+) -> list[RigCamera]:
+    """Place `count` cameras that see the person in every frame.
 
     Args:
-        points: (P, 3) what body cameras must hold: the person over all frames.
-        heads: (Q, 3) what face cameras must hold: the head over all frames.
+        points: what body cameras must hold: the person over all frames.
+        heads: what face cameras must hold: the head over all frames.
         count: of cameras; from four on two of them look at the face.
         size: height of body images in pixels; they are 4/5 as wide, face images square, 3/4 as high.
         seed: of small irregularities of places and principal points.
@@ -29,7 +33,8 @@ def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, 
     rng = np.random.default_rng([seed, 3])
     faces = 2 if count >= 4 else 0
     bodies = count - faces
-    held_out = set(_spread(bodies, max(1, round(bodies / 6)))) if bodies >= 4 else set()
+    # Evenly around the ring, but not the first, which looks at the front.
+    held_out = set(spread_inside(range(bodies), max(1, round(bodies / 6)))) if bodies >= 4 else set()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     width = max(8, round(size * 0.8 / 8) * 8)
     rig = []
@@ -49,15 +54,15 @@ def camera_rig(points: np.ndarray, heads: np.ndarray, *, count: int, size: int, 
     return rig
 
 
-def _spread(count: int, chosen: int) -> list[int]:
-    """`chosen` of `count` places on a ring, evenly; not the first, which looks at the front."""
-    return [int((j + 0.5) * count / chosen) for j in range(chosen)]
-
-
 def _fitted(
-    eye: np.ndarray, target: np.ndarray, points: np.ndarray, size: tuple[int, int], rng: np.random.Generator, name: str
+    eye: Float[np.ndarray, " 3"],
+    target: Float[np.ndarray, " 3"],
+    points: Float[np.ndarray, "P 3"],
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    name: str,
 ) -> Camera:
-    """A camera whose image just holds `points`, its principal point a little off the middle."""
+    """Make a camera whose image just holds `points`, its principal point a little off the middle."""
     width, height = size
     camera = Camera.look_at(eye=eye, target=target, fov_y_deg=40.0, width=width, height=height)
     cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from pipelines.synth.contact import depths
 from pipelines.synth.person import PART_NAMES, Person
@@ -17,7 +18,7 @@ _GARMENTS = ("upper", "lower")
 
 
 def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, float]:
-    """Body against skinning, cloth against skinning, strain of free edges, depth in the body, the tracker's error."""
+    """Measure body and cloth against skinning, strain of free edges, depth in the body, the tracker's error."""
     count = person.body.vertex_count
     posed = person.body.forward(take.params).vertices
     moved = row_lengths((take.vertices - take.skinned).reshape(-1, 3)).reshape(take.vertices.shape[:2])
@@ -42,20 +43,20 @@ def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, floa
     return out
 
 
-def free_edge_strain(person: Person, take: Take, garment: str) -> np.ndarray:
-    """(T, E) relative change of length, against frame 0's skinned layer, of edges whose ends both are free cloth."""
+def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarray, "T E"]:
+    """Return the strain, against frame 0's skinned layer, of edges whose ends both are free cloth."""
     mesh, used = person.tpose.submesh(person.face_part == PART_NAMES.index(garment))
     edges = used[mesh.edges]
     edges = edges[(take.attachment[edges] < 1.0).all(axis=1)]
 
-    def lengths(vertices: np.ndarray) -> np.ndarray:
+    def lengths(vertices: Float[np.ndarray, "*T V 3"]) -> Float[np.ndarray, "*T E"]:
         return np.linalg.norm(vertices[..., edges[:, 0], :] - vertices[..., edges[:, 1], :], axis=-1)
 
     return lengths(take.vertices) / lengths(take.skinned[0]) - 1.0
 
 
 def scan_checks(reference: TriangleMesh, scan: SimulatedScan) -> dict[str, float]:
-    """The scan against the layers that it shows."""
+    """Measure the scan against the layers that it shows."""
     shown = np.einsum("pk,pkx->px", scan.barycentric, reference.triangles[scan.face])
     distance = row_lengths(scan.mesh.vertices - shown) * _MM
     inside = SignedDistanceField(scan.mesh, solid=True).query(shown[distance < 5]).distance

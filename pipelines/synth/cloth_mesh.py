@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
@@ -15,35 +16,37 @@ from smplxpp.core.signed_distance import SignedDistanceField
 
 @dataclass(frozen=True, eq=False)
 class ClothMesh:
-    """A mesh whose vertices carry skinning weights: (N, 3), (M, 3), (N, J)."""
+    """A mesh whose vertices carry skinning weights."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    weights: np.ndarray
+    vertices: Float[np.ndarray, "N 3"]
+    faces: Int[np.ndarray, "M 3"]
+    weights: Float[np.ndarray, "N J"]
 
     @property
     def mesh(self) -> TriangleMesh:
+        """The mesh without the weights."""
         return TriangleMesh(self.vertices, self.faces)
 
-    def with_vertices(self, vertices: np.ndarray) -> ClothMesh:
+    def with_vertices(self, vertices: Float[np.ndarray, "N 3"]) -> ClothMesh:
+        """Return the same faces and weights at other places."""
         return replace(self, vertices=vertices)
 
 
-def submesh(cloth: ClothMesh, face_mask: np.ndarray) -> ClothMesh:
-    """The selected faces with the vertices that they use."""
+def submesh(cloth: ClothMesh, face_mask: Bool[np.ndarray, " M"]) -> ClothMesh:
+    """Return the selected faces with the vertices that they use."""
     mesh, used = cloth.mesh.submesh(face_mask)
     return ClothMesh(mesh.vertices, mesh.faces, cloth.weights[used])
 
 
 def loop_subdivide(cloth: ClothMesh, times: int = 1) -> ClothMesh:
-    """Loop subdivision (1987) of positions and weights alike; borders follow their own curve."""
+    """Subdivide positions and weights alike (Loop 1987); borders follow their own curve."""
     stacked = np.ascontiguousarray(np.hstack([cloth.vertices, cloth.weights]))
     values, faces = igl.loop(stacked, np.ascontiguousarray(cloth.faces, dtype=np.int64), times)
     return ClothMesh(values[:, :3], faces, values[:, 3:])
 
 
-def clip(cloth: ClothMesh, level: np.ndarray) -> ClothMesh:
-    """The part where the piecewise linear `level` (N,) is not negative, cut exactly along its zero line."""
+def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:
+    """Return the part where the piecewise linear `level` is not negative, cut exactly along its zero line."""
     # A vertex a hair's breadth from the line goes onto its keeping side: slivers would follow otherwise.
     level = np.where(np.abs(level) < 1e-3 * np.abs(level).max(), 1e-12, level)
     keep = level >= 0
@@ -59,7 +62,7 @@ def clip(cloth: ClothMesh, level: np.ndarray) -> ClothMesh:
     crossing = crossing.reshape(2, -1) + len(level)
     t = (level[edges[:, 0]] / (level[edges[:, 0]] - level[edges[:, 1]]))[:, None]
 
-    def extended(values: np.ndarray) -> np.ndarray:
+    def extended(values: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
         return np.concatenate([values, (1 - t) * values[edges[:, 0]] + t * values[edges[:, 1]]])
 
     a, b, c, p, q = cut[:, 0], cut[:, 1], cut[:, 2], crossing[0], crossing[1]
@@ -77,7 +80,7 @@ def clip(cloth: ClothMesh, level: np.ndarray) -> ClothMesh:
 
 
 def fairing_operator(mesh: TriangleMesh) -> csr_matrix:
-    """(N, N) mean of the neighbours; a border vertex has only border neighbours, so that hems stay smooth curves."""
+    """Make the (N, N) mean of neighbours; a border vertex has border neighbours alone, so that hems stay smooth."""
     n = mesh.vertex_count
     border = np.zeros(n, dtype=bool)
     border[mesh.border_edges] = True
@@ -92,16 +95,16 @@ def fairing_operator(mesh: TriangleMesh) -> csr_matrix:
     return diags(1.0 / np.maximum(degree, 1)) @ adjacency + diags((degree == 0).astype(float))
 
 
-def smooth(mesh: TriangleMesh, values: np.ndarray, *, steps: int) -> np.ndarray:
-    """`steps` half-way moves of vertex values (N, D) to the mean of their neighbours."""
+def smooth(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, steps: int) -> Float[np.ndarray, "N D"]:
+    """Move vertex values `steps` times half-way to the mean of their neighbours."""
     operator = fairing_operator(mesh)
     for _ in range(steps):
         values = 0.5 * (values + operator @ values)
     return values
 
 
-def diffuse(mesh: TriangleMesh, values: np.ndarray, *, radius: float) -> np.ndarray:
-    """Implicit diffusion of vertex values (N, D) over about `radius` metres: `(M + radius^2 L) x = M x0`."""
+def diffuse(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, radius: float) -> Float[np.ndarray, "N D"]:
+    """Diffuse vertex values implicitly over about `radius` metres: `(M + radius^2 L) x = M x0`."""
     laplacian = -igl.cotmatrix(mesh.vertices, mesh.faces)
     mass = igl.massmatrix(mesh.vertices, mesh.faces, igl.MASSMATRIX_TYPE_BARYCENTRIC)
     mass = mass + 1e-12 * identity(mesh.vertex_count)
@@ -110,8 +113,8 @@ def diffuse(mesh: TriangleMesh, values: np.ndarray, *, radius: float) -> np.ndar
 
 def push_out(
     mesh: TriangleMesh, inner: TriangleMesh, *, clearance: float, solid: bool, reach: float = 0.04
-) -> np.ndarray:
-    """(N, 3) vertices at least `clearance` metres outside `inner`; the moves are smoothed between rounds.
+) -> Float[np.ndarray, "N 3"]:
+    """Return vertices at least `clearance` metres outside `inner`; the moves are smoothed between rounds.
 
     `inner` is a body (`solid`) or an open sheet. Vertices deeper than `reach`, or whose closest point is on a border
     of a sheet, stay: the sign of the distance says nothing there.
@@ -124,6 +127,6 @@ def push_out(
         missing = np.where(known, np.clip(clearance - where.distance, 0.0, None), 0.0)[:, None]
         if not missing.any():
             break
-        spread = np.maximum(smooth(mesh, missing, steps=smoothing), missing)
-        vertices = vertices + spread * normalize_rows(smooth(mesh, where.gradient, steps=smoothing))
+        widened = np.maximum(smooth(mesh, missing, steps=smoothing), missing)
+        vertices = vertices + widened * normalize_rows(smooth(mesh, where.gradient, steps=smoothing))
     return vertices

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,7 +15,7 @@ from smplxpp.core.topology import paired_half_edges
 
 @dataclass(frozen=True)
 class Fabric:
-    """Material; SI units.
+    """A material, in SI units.
 
     Attributes:
         density: kg a square metre.
@@ -37,27 +38,27 @@ class ClothModel:
 
     Attributes:
         rest: the garments as they were cut.
-        inverse_mass: (N,) 1/kg; 0 where the particle follows the body exactly.
-        attach_compliance: (N,) m/N of the spring to its place on the body; inf where it is free.
-        colors: edges (E_k, 2) in groups that share no particle, with their rest lengths (E_k,).
+        inverse_mass: 1/kg; 0 where the particle follows the body exactly.
+        attach_compliance: m/N of the spring to its place on the body; inf where it is free.
+        colors: edges in groups that share no particle, with their rest lengths.
         stretch_compliance: m/N.
         hinges: see `Hinges`.
-        anchor, tether: (N,) the nearest particle that follows the body, and the longest distance to it; inf where
+        anchor, tether: the nearest particle that follows the body, and the longest distance to it; inf where
             there is none.
     """
 
     rest: TriangleMesh
-    inverse_mass: np.ndarray
-    attach_compliance: np.ndarray
-    colors: tuple[tuple[np.ndarray, np.ndarray], ...]
+    inverse_mass: Float[np.ndarray, " N"]
+    attach_compliance: Float[np.ndarray, " N"]
+    colors: tuple[tuple[Int[np.ndarray, "_ 2"], Float[np.ndarray, " _"]], ...]
     stretch_compliance: float
     hinges: Hinges
-    anchor: np.ndarray
-    tether: np.ndarray
+    anchor: Int[np.ndarray, " N"]
+    tether: Float[np.ndarray, " N"]
 
     @property
-    def fixed(self) -> np.ndarray:
-        """(N,) bool: particles that follow the body exactly."""
+    def fixed(self) -> Bool[np.ndarray, " N"]:
+        """The particles that follow the body exactly."""
         return self.inverse_mass == 0.0
 
 
@@ -69,28 +70,28 @@ class Hinges:
     along the hinge's normal is held at its value at rest.
 
     Attributes:
-        operator: (H, N) sparse, rows `c`.
-        faces: (H, 2) the two triangles.
-        rest: (H,) curvature at rest along the hinge's normal.
-        compliance: (H,) 1 / stiffness.
-        gather: (N, H) sparse: inverse mass times `c`, transposed.
-        weight: (H,) `sum_i c_i^2 / m_i`, times the hinges that share a particle, for a stable simultaneous update.
+        operator: (H, N), rows `c`.
+        faces: the two triangles.
+        rest: curvature at rest along the hinge's normal.
+        compliance: 1 / stiffness.
+        gather: (N, H) inverse mass times `c`, transposed.
+        weight: `sum_i c_i^2 / m_i`, times the hinges that share a particle, for a stable simultaneous update.
     """
 
     operator: csr_matrix
-    faces: np.ndarray
-    rest: np.ndarray
-    compliance: np.ndarray
+    faces: Int[np.ndarray, "H 2"]
+    rest: Float[np.ndarray, " H"]
+    compliance: Float[np.ndarray, " H"]
     gather: csr_matrix
-    weight: np.ndarray
+    weight: Float[np.ndarray, " H"]
 
 
-def build_cloth(rest: TriangleMesh, attachment: np.ndarray, fabric: Fabric) -> ClothModel:
-    """Constraints of garments from their shape at rest.
+def build_cloth(rest: TriangleMesh, attachment: Float[np.ndarray, " N"], fabric: Fabric) -> ClothModel:
+    """Derive the constraints of garments from their shape at rest.
 
     Args:
         rest: N vertices; lengths and curvatures of this shape are the garment's own.
-        attachment: (N,) in [0, 1]: 1 follows the body exactly, 0 is free, between is a spring.
+        attachment: in [0, 1]: 1 follows the body exactly, 0 is free, between is a spring.
         fabric: material.
     """
     n = rest.vertex_count
@@ -117,8 +118,8 @@ def build_cloth(rest: TriangleMesh, attachment: np.ndarray, fabric: Fabric) -> C
     )
 
 
-def color_edges(edges: np.ndarray, count: int) -> list[np.ndarray]:
-    """Groups of edge indices such that edges of one group share no vertex; maximal groups, largest first.
+def color_edges(edges: Int[np.ndarray, "E 2"], count: int) -> list[Int[np.ndarray, " _"]]:
+    """Group edge indices such that edges of one group share no vertex; maximal groups, largest first.
 
     Each round takes the edges whose number is the lowest at both ends; numbers are shuffled once with a fixed seed.
     """
@@ -141,7 +142,7 @@ def color_edges(edges: np.ndarray, count: int) -> list[np.ndarray]:
     return groups
 
 
-def _hinges(rest: TriangleMesh, inverse_mass: np.ndarray, stiffness: float) -> Hinges:
+def _hinges(rest: TriangleMesh, inverse_mass: Float[np.ndarray, " N"], stiffness: float) -> Hinges:
     # Edge k of a face runs from corner k to k + 1; corner k + 2 lies opposite.
     half = paired_half_edges(rest.faces)
     face, corner = half // 3, half % 3
@@ -151,7 +152,7 @@ def _hinges(rest: TriangleMesh, inverse_mass: np.ndarray, stiffness: float) -> H
     a, b, c, d, face = a[moves], b[moves], c[moves], d[moves], face[moves]
     x = rest.vertices
 
-    def cot(at: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    def cot(at: Int[np.ndarray, " H"], p: Int[np.ndarray, " H"], q: Int[np.ndarray, " H"]) -> Float[np.ndarray, " H"]:
         u, v = x[p] - x[at], x[q] - x[at]
         return np.einsum("hi,hi->h", u, v) / np.maximum(row_lengths(np.cross(u, v)), 1e-12)
 
@@ -175,14 +176,16 @@ def _hinges(rest: TriangleMesh, inverse_mass: np.ndarray, stiffness: float) -> H
     )
 
 
-def hinge_normals(face_normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(H, 3) unit means of the normals of both triangles."""
+def hinge_normals(face_normals: Float[np.ndarray, "M 3"], faces: Int[np.ndarray, "H 2"]) -> Float[np.ndarray, "H 3"]:
+    """Return unit means of the normals of both triangles."""
     total = face_normals[faces[:, 0]] + face_normals[faces[:, 1]]
     return total / np.maximum(row_lengths(total), 1e-9)[:, None]
 
 
-def _tethers(rest: TriangleMesh, fixed: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
-    """Long-range attachments (Kim et al. 2012): the nearest fixed particle along the cloth, and how far it may be."""
+def _tethers(
+    rest: TriangleMesh, fixed: Bool[np.ndarray, " N"], slack: float
+) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Find long-range attachments (Kim et al. 2012): the nearest fixed particle along the cloth and the longest way."""
     n = rest.vertex_count
     edges = rest.edges
     lengths = row_lengths(rest.vertices[edges[:, 0]] - rest.vertices[edges[:, 1]])

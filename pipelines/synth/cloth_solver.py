@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from pipelines.synth.cloth_model import ClothModel, hinge_normals
@@ -20,6 +21,9 @@ from smplxpp.core.mesh import row_lengths
 _BEND_NORMALS_EVERY = 4
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
+
+# Points at the start and at the end of a tick.
+Ends = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]
 
 
 @dataclass(frozen=True)
@@ -47,19 +51,21 @@ class Tick:
 
     Attributes:
         seconds: its length.
-        places: two (N, 3): where the particles would be on the body.
+        places: where the particles would be on the body.
         contacts: each with its surface's vertices at both ends; the last has the last word.
     """
 
     seconds: float
-    places: tuple[np.ndarray, np.ndarray]
-    contacts: list[tuple[Contacts, tuple[np.ndarray, np.ndarray]]]
+    places: Ends
+    contacts: list[tuple[Contacts, Ends]]
 
 
 class ClothSolver:
-    """State of the particles: `position`, `velocity` (N, 3); starts at rest."""
+    """Holds the state of the particles, `position` and `velocity` (N, 3), and moves it on; they start at rest."""
 
-    def __init__(self, model: ClothModel, position: np.ndarray, config: SolverConfig | None = None) -> None:
+    def __init__(
+        self, model: ClothModel, position: Float[np.ndarray, "N 3"], config: SolverConfig | None = None
+    ) -> None:
         self.model, self.config = model, config or SolverConfig()
         self.position = np.array(position, dtype=np.float64)
         self.velocity = np.zeros_like(self.position)
@@ -95,7 +101,7 @@ class ClothSolver:
             self.velocity = velocity * np.minimum(1.0, config.max_speed / np.maximum(speed, 1e-9))
             self.position = x
 
-    def _stretch(self, x: np.ndarray, h: float) -> None:
+    def _stretch(self, x: Float[np.ndarray, "N 3"], h: float) -> None:
         compliance = self.model.stretch_compliance / h**2
         for (edges, rest), mass in zip(self.model.colors, self._edge_masses, strict=True):
             a, b = x.take(edges[:, 0], axis=0), x.take(edges[:, 1], axis=0)
@@ -106,24 +112,24 @@ class ClothSolver:
             x[edges[:, 0]] = a - mass[:, :1] * d
             x[edges[:, 1]] = b + mass[:, 1:] * d
 
-    def _hinge_normals(self, x: np.ndarray) -> np.ndarray:
+    def _hinge_normals(self, x: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "H 3"]:
         corners = self.model.rest.faces
         a = x.take(corners[:, 0], axis=0)
         normals = _cross(x.take(corners[:, 1], axis=0) - a, x.take(corners[:, 2], axis=0) - a)
         normals *= (1.0 / np.maximum(row_lengths(normals), 1e-12))[:, None]
         return hinge_normals(normals, self.model.hinges.faces)
 
-    def _bend(self, x: np.ndarray, normal: np.ndarray, h: float) -> None:
+    def _bend(self, x: Float[np.ndarray, "N 3"], normal: Float[np.ndarray, "H 3"], h: float) -> None:
         hinges = self.model.hinges
         error = np.einsum("hi,hi->h", hinges.operator @ x, normal) - hinges.rest
         x -= hinges.gather @ ((error / (hinges.weight + hinges.compliance / h**2))[:, None] * normal)
 
-    def _attach(self, x: np.ndarray, place: np.ndarray, h: float) -> None:
+    def _attach(self, x: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "N 3"], h: float) -> None:
         at, mass = self._sprung, self.model.inverse_mass[self._sprung]
         gain = mass / (mass + self.model.attach_compliance[at] / h**2)
         x[at] += gain[:, None] * (place[at] - x[at])
 
-    def _tether(self, x: np.ndarray) -> None:
+    def _tether(self, x: Float[np.ndarray, "N 3"]) -> None:
         at = self._tied
         d = x[at] - x[self.model.anchor[at]]
         length = row_lengths(d)
@@ -131,17 +137,18 @@ class ClothSolver:
         x[at] -= over[:, None] * d
 
 
-def _between(ends: tuple[np.ndarray, np.ndarray], t: float) -> np.ndarray:
+def _between(ends: Ends, t: float) -> Float[np.ndarray, "N 3"]:
     return (1.0 - t) * ends[0] + t * ends[1]
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """np.cross without its bookkeeping."""
+def _cross(a: Float[np.ndarray, "N 3"], b: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Return what np.cross returns, without its bookkeeping."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _neighbour_mean(model: ClothModel) -> csr_matrix:
+    """Make the (N, N) mean over the neighbours along edges."""
     edges, n = model.rest.edges, model.rest.vertex_count
     ends = np.concatenate([edges, edges[:, ::-1]]).T
     adjacency = coo_matrix((np.ones(ends.shape[1]), tuple(ends)), shape=(n, n)).tocsr()

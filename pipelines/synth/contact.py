@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+from jaxtyping import Float, Int
 
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
@@ -21,27 +22,31 @@ class Contacts:
     """K planes that follow a surface.
 
     Attributes:
-        particle: (K,) index of the particle.
-        corners: (K, 3) vertices of the surface, with barycentric coordinates (K, 3): the closest point.
-        normal: (K, 3) unit, from the surface towards the side that the particle belongs on.
+        particle: index of the particle.
+        corners, barycentric: vertices of the surface and weights of them: the closest point.
+        normal: unit, from the surface towards the side that the particle belongs on.
         margin: metres to keep.
     """
 
-    particle: np.ndarray
-    corners: np.ndarray
-    barycentric: np.ndarray
-    normal: np.ndarray
+    particle: Int[np.ndarray, " K"]
+    corners: Int[np.ndarray, "K 3"]
+    barycentric: Float[np.ndarray, "K 3"]
+    normal: Float[np.ndarray, "K 3"]
     margin: float
 
-    def points(self, surface: np.ndarray) -> np.ndarray:
-        """(K, 3) the closest points on moved surface vertices."""
+    def points(self, surface: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "K 3"]:
+        """Return the closest points on moved surface vertices."""
         b = self.barycentric
         return sum(b[:, k : k + 1] * surface.take(self.corners[:, k], axis=0) for k in range(3))
 
     def resolve(
-        self, position: np.ndarray, previous: np.ndarray, surfaces: tuple[np.ndarray, np.ndarray], friction: float
+        self,
+        position: Float[np.ndarray, "N 3"],
+        previous: Float[np.ndarray, "N 3"],
+        surfaces: tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]],
+        friction: float,
     ) -> None:
-        """Move `position` (N, 3), in place, out of the surface; Coulomb friction against the surface's own motion.
+        """Move `position`, in place, out of the surface; Coulomb friction against the surface's own motion.
 
         `surfaces` are its vertices before and after the step, `previous` the particles before it.
         """
@@ -59,9 +64,14 @@ class Contacts:
 
 
 def body_contacts(
-    surface: TriangleMesh, cloth: TriangleMesh, particles: np.ndarray, *, margin: float, deepest: float = 0.05
+    surface: TriangleMesh,
+    cloth: TriangleMesh,
+    particles: Int[np.ndarray, " P"],
+    *,
+    margin: float,
+    deepest: float = 0.05,
 ) -> Contacts:
-    """Contacts of the cloth's `particles` with a closed surface; those deeper than `deepest` metres are left alone.
+    """Find contacts of the cloth's `particles` with a closed surface; those deeper than `deepest` metres are left.
 
     The side is told by the interpolated vertex normal at the closest point: a body's skin is smooth at that scale.
     Skin that faces the cloth's outer side makes no contact: where an arm lies on the flank, what the cloth covers
@@ -87,9 +97,9 @@ def body_contacts(
 
 
 def sheet_contacts(
-    sheet: TriangleMesh, cloth: TriangleMesh, particles: np.ndarray, *, margin: float, deepest: float = 0.02
+    sheet: TriangleMesh, cloth: TriangleMesh, particles: Int[np.ndarray, " P"], *, margin: float, deepest: float = 0.02
 ) -> Contacts:
-    """Contacts of the cloth's `particles` with the outer side of an open sheet; nothing beyond its border."""
+    """Find contacts of the cloth's `particles` with the outer side of an open sheet; nothing beyond its border."""
     where = SignedDistanceField(sheet, solid=False).query(cloth.vertices[particles])
     kept = (where.distance < REACH) & (where.distance > -deepest) & ~where.on_border
     face = where.face[kept]
@@ -102,6 +112,6 @@ def sheet_contacts(
     )
 
 
-def depths(surface: TriangleMesh, points: np.ndarray) -> np.ndarray:
-    """(P,) metres that points lie inside a closed surface; 0 outside. Exact sides (winding numbers), for reports."""
+def depths(surface: TriangleMesh, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """Return how deep points lie inside a closed surface, metres; 0 outside. Winding numbers tell the sides exactly."""
     return np.maximum(-SignedDistanceField(surface, solid=True).query(points).distance, 0.0)

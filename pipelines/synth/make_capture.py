@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
-from pipelines.synth.hidden import hidden_faces
 from pipelines.synth.motion import Performance, tracker_noise
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
 from pipelines.synth.person_file import load_person
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
 from pipelines.synth.soft_light import LightConfig, vertex_light
-from pipelines.synth.views import LitFrame, View, normal_map, render_view
+from pipelines.synth.views import LitFrame, RenderedView, hidden_faces, normal_map, render_view
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
-from smplxpp.capture.writers.images import write_gray_png, write_jpeg, write_normal_png
+from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
 from smplxpp.core.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
-
-log = logging.getLogger(__name__)
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
 Progress = Callable[[str, float], None]
 _NOVEL_POSE_SHARE = 0.2
@@ -72,16 +69,10 @@ class SynthConfig:
 
     def __post_init__(self) -> None:
         for name in ("cameras", "frames", "supersampling", "truth_step", "normals_step"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"--{name.replace('_', '-')}", expected="at least 1", received=str(getattr(self, name))
-                )
-        if self.size < 16:
-            raise InputError("--size", expected="at least 16 pixels", received=str(self.size))
-        if not self.fps > 0:
-            raise InputError("--fps", expected="more than 0", received=str(self.fps))
-        if self.layout not in ("simple", "actorshq"):
-            raise InputError("--layout", expected="simple or actorshq", received=repr(self.layout))
+            require_at_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
+        require_at_least("--size", self.size, 16)
+        require_positive("--fps", self.fps)
+        require_choice("--layout", self.layout, ("simple", "actorshq"))
 
 
 def make_capture(
@@ -136,12 +127,15 @@ def make_capture(
                 progress("scan", 1.0)
             atomic_write_text(root / "manifest.json", json.dumps(_manifest(out, rig, config), indent=1) + "\n")
             atomic_write_text(root / "checks.json", json.dumps(checks, indent=1) + "\n")
-        _write_views(images, person, take, rig, (hidden, config, progress))
+        _write_views(images, _lit_frames(person, take, hidden, config.light), person, rig, config, progress)
     return checks
 
 
 def split_frames(frames: int) -> tuple[int, int]:
-    """Frames [0, n) for training and [n, frames) held out: the last fifth, none of a take shorter than five."""
+    """Return how many frames are for training, and how many after them are held out: the last fifth.
+
+    A take shorter than five holds none out.
+    """
     novel = int(_NOVEL_POSE_SHARE * frames)
     return frames - novel, novel
 
@@ -161,7 +155,9 @@ def _rig(person: Person, take: Take, config: SynthConfig) -> list[RigCamera]:
     return [replace(item, camera=replace(item.camera, name=f"Cam{k + 1:03d}")) for k, item in enumerate(rig)]
 
 
-def _write_geometry(folder: Path, topology_file: Path, take: Take, hidden: np.ndarray, config: SynthConfig) -> None:
+def _write_geometry(
+    folder: Path, topology_file: Path, take: Take, hidden: Bool[np.ndarray, " M"], config: SynthConfig
+) -> None:
     with np.load(topology_file, allow_pickle=False) as data:
         arrays = {name: data[name] for name in data.files}
     arrays |= {"face_hidden": hidden, "pin": take.attachment.astype(np.float32)}
@@ -181,8 +177,10 @@ def _write_scan(folder: Path, person: Person, take: Take, config: SynthConfig) -
     return scan_checks(reference, scan)
 
 
-def _scan_attributes(person: Person, scan: SimulatedScan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Part (N,), label (N,) and colour (N, 3) of each scan vertex: of the point of the layers that it shows."""
+def _scan_attributes(
+    person: Person, scan: SimulatedScan
+) -> tuple[UInt8[np.ndarray, " N"], UInt8[np.ndarray, " N"], UInt8[np.ndarray, "N 3"]]:
+    """Return part, label and colour of each scan vertex: those of the point of the layers that it shows."""
     corners = person.tpose.faces[scan.face]
     rest = np.einsum("pk,pkx->px", scan.barycentric, person.tpose.vertices[corners])
     nearest = corners[np.arange(len(corners)), np.argmax(scan.barycentric, axis=1)]
@@ -192,21 +190,31 @@ def _scan_attributes(person: Person, scan: SimulatedScan) -> tuple[np.ndarray, n
     return part, np.where(part == shown, label, PART_LABELS[part]), colors
 
 
-def _write_views(
-    root: Path, person: Person, take: Take, rig: list[RigCamera], rest: tuple[np.ndarray, SynthConfig, Progress]
-) -> None:
-    hidden, config, progress = rest
+def _lit_frames(person: Person, take: Take, hidden: Bool[np.ndarray, " M"], light: LightConfig) -> Iterator[LitFrame]:
+    """Light the take's frames one after the other, without the hidden faces."""
     shown = np.flatnonzero(~hidden)
     faces = person.tpose.faces[shown]
-    for frame in range(config.frames):
-        mesh = TriangleMesh(take.vertices[frame], faces)
-        lit = LitFrame(mesh, shown, vertex_light(mesh, config.light))
+    for vertices in take.vertices:
+        mesh = TriangleMesh(vertices, faces)
+        yield LitFrame(mesh, shown, vertex_light(mesh, light))
+
+
+def _write_views(
+    root: Path,
+    lit_frames: Iterable[LitFrame],
+    person: Person,
+    rig: list[RigCamera],
+    config: SynthConfig,
+    progress: Progress,
+) -> None:
+    """Render every frame through every camera and write the files."""
+    for frame, lit in enumerate(lit_frames):
 
         def one(item: RigCamera, lit: LitFrame = lit, frame: int = frame) -> None:
             view = render_view(person, lit, item.camera, supersampling=config.supersampling)
             _write_view(root, item.camera.name, frame, view, config)
             if config.layout == "simple" and frame % config.normals_step == 0:
-                path = _view_path(root, "normals", "normal", item.camera.name, frame, "png")
+                path = view_path(root, "normal", item.camera.name, frame, ".png")
                 write_normal_png(path, normal_map(lit, item.camera))
 
         with ThreadPoolExecutor(2) as pool:
@@ -214,15 +222,11 @@ def _write_views(
         progress("views", (frame + 1) / config.frames)
 
 
-def _write_view(root: Path, camera: str, frame: int, view: View, config: SynthConfig) -> None:
-    write_jpeg(_view_path(root, "rgbs", "rgb", camera, frame, "jpg"), view.image, quality=config.quality)
-    write_gray_png(_view_path(root, "masks", "mask", camera, frame, "png"), view.mask)
+def _write_view(root: Path, camera: str, frame: int, view: RenderedView, config: SynthConfig) -> None:
+    write_jpeg(view_path(root, "image", camera, frame, ".jpg"), view.image, quality=config.quality)
+    write_gray_png(view_path(root, "mask", camera, frame, ".png"), view.mask)
     if config.layout == "simple":
-        write_gray_png(_view_path(root, "labels", "label", camera, frame, "png"), view.labels)
-
-
-def _view_path(root: Path, folder: str, tag: str, camera: str, frame: int, suffix: str) -> Path:
-    return root / folder / camera / f"{camera}_{tag}{frame:06d}.{suffix}"
+        write_gray_png(view_path(root, "label", camera, frame, ".png"), view.labels)
 
 
 def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:

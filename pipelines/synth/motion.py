@@ -10,15 +10,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 
-# Degrees a joint, axis-angle in the T-pose's world axes (x to the subject's left, y up, z to the front); fingers bend
-# by one number a hand. What a pose does not name stays relaxed.
-_RELAXED = {
+# Degrees a joint, axis-angle in the T-pose's world axes (x to the subject's left, y up, z to the front). What a pose
+# does not name stays relaxed.
+_Angles = dict[str, tuple[float, float, float]]
+_RELAXED: _Angles = {
     "left_collar": (0, 0, -4),
     "right_collar": (0, 0, 4),
     "left_shoulder": (0, -6, -46),
@@ -26,8 +28,7 @@ _RELAXED = {
     "left_elbow": (0, -14, 0),
     "right_elbow": (0, 14, 0),
 }
-_FINGERS = {"left_fingers": 12.0, "right_fingers": 12.0}
-_POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
+_POSES: dict[str, _Angles] = {
     "relaxed": {},
     "explain": {  # both hands before the belly
         "left_shoulder": (10, -40, -52),
@@ -37,8 +38,6 @@ _POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
         "head": (5, 10, 0),
         "left_wrist": (25, 0, 0),
         "right_wrist": (30, 0, 0),
-        "left_fingers": 22.0,
-        "right_fingers": 6.0,
     },
     "stress": {  # the hands part and fall a little, weight on one leg
         "left_shoulder": (16, -30, -46),
@@ -50,8 +49,6 @@ _POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
         "head": (-3, -6, 2),
         "left_wrist": (45, 0, 0),
         "right_wrist": (45, 0, 0),
-        "left_fingers": 4.0,
-        "right_fingers": 16.0,
     },
     "step": {  # turning to the left on the right foot
         "pelvis": (0, 34, 0),
@@ -85,7 +82,6 @@ _POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
         "head": (0, 26, 0),
         "spine3": (0, 12, 0),
         "neck": (0, 8, 0),
-        "left_fingers": 3.0,
     },
     "twist": {  # back to the right
         "pelvis": (0, 10, 0),
@@ -108,6 +104,13 @@ _POSES: dict[str, dict[str, tuple[float, float, float] | float]] = {
         "head": (-8, 0, 0),
     },
 }
+# Degrees by which the fingers of the left and of the right hand bend.
+_FINGERS = {
+    "explain": (22.0, 6.0),
+    "stress": (4.0, 16.0),
+    "point": (3.0, 12.0),
+}
+_RELAXED_FINGERS = (12.0, 12.0)
 # Seconds and poses of the opening; a longer performance goes on with poses drawn at random.
 _SCRIPT = (
     (0.0, "relaxed"),
@@ -145,19 +148,19 @@ class Performance:
     """What the person does, as a function of time.
 
     Attributes:
-        betas: (B,) shape.
+        betas: shape.
         expression_names: names of the E expressions.
         seconds: how long it lasts; later instants hold the last pose.
         seed: of timing, sizes of gestures, words and blinks.
     """
 
-    betas: np.ndarray
+    betas: Float[np.ndarray, " B"]
     expression_names: tuple[str, ...]
     seconds: float
     seed: int = 0
 
-    def at(self, times: np.ndarray, *, fps: float | None = None) -> BodyParams:
-        """Parameters at `times` (T,) in seconds; transl is zero, `fps` is stored as it is given."""
+    def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
+        """Return the parameters at `times` in seconds; transl is zero, `fps` is stored as it is given."""
         t = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
         pose, expression = self._poses(t), np.clip(self._faces(t), 0.0, 1.0)
         pose = pose + self._sway(t)
@@ -174,13 +177,13 @@ class Performance:
 
     @cached_property
     def _poses(self) -> CubicSpline:
-        """(T,) -> (T, 55, 3) radians, at rest at both ends."""
+        """The curve from instants (T,) to poses (T, 55, 3) in radians, at rest at both ends."""
         rng = np.random.default_rng(self.seed)
         times, names = map(list, zip(*_SCRIPT, strict=True))
         while times[-1] < self.seconds + 1.0:
             times.append(times[-1] + rng.uniform(*_PAUSE))
             names.append(rng.choice([name for name in _POSES if name != names[-1]]))
-        keys = np.stack([_pose(_RELAXED | _FINGERS | _POSES[name]) for name in names])
+        keys = np.stack([_pose(_RELAXED | _POSES[name], _FINGERS.get(name, _RELAXED_FINGERS)) for name in names])
         relaxed = keys[0]
         size = rng.uniform(0.9, 1.1, size=(len(keys), 1, 1))
         late = rng.uniform(-0.04, 0.04, len(times)) * (np.array(times) > 0)
@@ -188,7 +191,10 @@ class Performance:
 
     @cached_property
     def _faces(self) -> PchipInterpolator:
-        """(T,) -> (T, E): words at about five a second, looks, blinks; monotone between keys, so within [0, 1]."""
+        """The curve from instants (T,) to expressions (T, E): words at about five a second, looks, blinks.
+
+        It is monotone between keys, so it stays within [0, 1].
+        """
         rng = np.random.default_rng([self.seed, 1])
         times = np.concatenate([[0.0], 0.12 + np.cumsum(rng.uniform(0.13, 0.26, int(self.seconds / 0.13) + 8))])
         values = np.zeros((len(times), len(self.expression_names)))
@@ -202,8 +208,8 @@ class Performance:
                 values[k, self.expression_names.index(name)] = amount * rng.uniform(0.8, 1.05)
         return PchipInterpolator(times, values)
 
-    def _sway(self, t: np.ndarray) -> np.ndarray:
-        """(T, 55, 3) radians: breath, small movements of the head and the eyes; none at the start."""
+    def _sway(self, t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T 55 3"]:
+        """Return small turns in radians: breath, small movements of the head and the eyes; none at the start."""
         rng = np.random.default_rng([self.seed, 2])
         out = np.zeros((len(t), len(SMPLX_JOINTS), 3))
         sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
@@ -216,8 +222,8 @@ class Performance:
         return out * (1.0 - np.exp(-((t / 0.3) ** 2)))[:, None, None]
 
 
-def _wander(t: np.ndarray, rng: np.random.Generator, *, hertz: float) -> np.ndarray:
-    """(T, 3) smooth, of about unit size: a few sines an axis."""
+def _wander(t: Float[np.ndarray, " T"], rng: np.random.Generator, *, hertz: float) -> Float[np.ndarray, "T 3"]:
+    """Return smooth curves of about unit size: a few sines an axis."""
     frequency = hertz * rng.uniform(0.4, 1.6, size=(4, 3))
     phase = rng.uniform(0, 2 * np.pi, size=(4, 3))
     return np.sin(2 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) / np.sqrt(2.0)
@@ -232,7 +238,7 @@ def tracker_noise(
     expression: float = 0.04,
     betas: float = 0.12,
 ) -> BodyParams:
-    """Parameters as a tracker would give them; standard deviations of each joint's turn about each axis, of each
+    """Return parameters as a tracker would give them; standard deviations of each joint's turn about each axis, of each
     coordinate in metres (half white, half slow), of expression weights, and of one constant offset of betas."""
     rng = np.random.default_rng(seed)
     count = len(params)
@@ -240,22 +246,21 @@ def tracker_noise(
     pose = rotvec_from_matrix(turns @ matrix_from_rotvec(params.full_pose))
     phase = rng.uniform(0, 2 * np.pi, 3) + 2 * np.pi * np.arange(count)[:, None] / max(count, 2)
     slow, white = np.sin(phase) * np.sqrt(2), rng.normal(size=(count, 3))
-    blocks = BodyParams.from_full_pose(
+    tracked = BodyParams.from_full_pose(
         pose,
         betas=params.betas + rng.normal(0, betas, params.betas.shape[1]),
         expression=np.clip(params.expression + rng.normal(0, expression, params.expression.shape), 0, 1),
         transl=params.transl + transl * np.sqrt(0.5) * (slow + white),
     )
-    return replace(params, **blocks.as_dict())
+    return replace(tracked, fps=params.fps, flat_hand_mean=params.flat_hand_mean)
 
 
-def _pose(degrees: dict[str, tuple[float, float, float] | float]) -> np.ndarray:
-    """(55, 3) axis-angle in radians."""
+def _pose(degrees: _Angles, fingers: tuple[float, float]) -> Float[np.ndarray, "55 3"]:
+    """Return an axis-angle pose in radians; `fingers` are the bends of the left and of the right hand."""
     pose = np.zeros((sum(joints for _, joints in POSE_BLOCKS), 3))
     for j, name in enumerate(SMPLX_JOINTS):
         if name[-1].isdigit() and not name.startswith("spine") and "thumb" not in name:
-            pose[j, 2] = -degrees["left_fingers"] if name.startswith("left") else degrees["right_fingers"]
+            pose[j, 2] = -fingers[0] if name.startswith("left") else fingers[1]
     for name, angles in degrees.items():
-        if name not in _FINGERS:
-            pose[SMPLX_JOINTS.index(name)] = angles
+        pose[SMPLX_JOINTS.index(name)] = angles
     return np.radians(pose)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
 from smplxpp.body import BodyModel
@@ -27,32 +28,34 @@ class Person:
 
     Attributes:
         tpose: V vertices, M faces; parts share no vertices.
-        weights: (V, 55) authored skinning weights.
-        vertex_part, face_part: (V,), (M,) indices into `PART_NAMES`.
-        vertex_label: (V,) indices into `LABEL_NAMES`; eyes, teeth and tongue are "other".
-        betas: (20,) of the body.
+        weights: authored skinning weights.
+        vertex_part, face_part: indices into `PART_NAMES`.
+        vertex_label: indices into `LABEL_NAMES`; eyes, teeth and tongue are "other".
+        betas: shape of the body.
         body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
         face: landmarks on the T-pose, for the colours.
     """
 
     tpose: TriangleMesh
-    weights: np.ndarray
-    vertex_part: np.ndarray
-    face_part: np.ndarray
-    vertex_label: np.ndarray
-    betas: np.ndarray
+    weights: Float[np.ndarray, "V 55"]
+    vertex_part: UInt8[np.ndarray, " V"]
+    face_part: UInt8[np.ndarray, " M"]
+    vertex_label: UInt8[np.ndarray, " V"]
+    betas: Float[np.ndarray, " 20"]
     body: BodyModel
     face: textures.FaceMarks
 
-    def posed(self, params: BodyParams) -> np.ndarray:
-        """(T, V, 3): linear blend skinning of every layer by the body's joints."""
+    def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
+        """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
         posed = self.body.forward(params)
         rest = np.repeat(self.tpose.vertices[None], len(params), axis=0)
         rest[:, : self.body.vertex_count] = posed.rest_vertices
-        return skin(rest, self.weights, posed.posed_from_rest)
+        return skin(rest, self.weights, posed.posed_from_rest), posed.posed_from_rest
 
-    def colors(self, points: np.ndarray, part: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """(P, 3) uint8 colours of points on the T-pose, with the part and the label of each."""
+    def colors(
+        self, points: Float[np.ndarray, "P 3"], part: UInt8[np.ndarray, " P"], label: UInt8[np.ndarray, " P"]
+    ) -> UInt8[np.ndarray, "P 3"]:
+        """Return the colours of points on the T-pose, with the part and the label of each."""
         joints = self.body.joint_regressor @ self.tpose.vertices[: self.body.vertex_count]
         joint = dict(zip(self.body.joint_names, joints, strict=True))
         out = np.zeros((len(points), 3))
@@ -75,6 +78,6 @@ class Person:
         return np.clip(out, 0, 255).astype(np.uint8)
 
 
-def face_marks(landmarks: np.ndarray) -> textures.FaceMarks:
-    """From (51, 3) landmarks in dlib's order from 17."""
+def face_marks(landmarks: Float[np.ndarray, "51 3"]) -> textures.FaceMarks:
+    """Pick what is painted from landmarks in dlib's order from 17."""
     return textures.FaceMarks(brows=landmarks[:10], eyes=landmarks[19:31], lips=landmarks[31:43])

@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
 from smplxpp.body import load_body
@@ -48,8 +49,8 @@ def load_person(topology_file: Path) -> Person:
     )
 
 
-def face_landmarks() -> np.ndarray:
-    """(51, 3) face landmarks on the open body's T-pose at the person's shape; dlib's order from 17."""
+def face_landmarks() -> Float[np.ndarray, "51 3"]:
+    """Return the face landmarks on the open body's T-pose at the person's shape; dlib's order from 17."""
     with (
         resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path,
         np.load(path, allow_pickle=False) as data,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipelines.synth.cloth_mesh import diffuse, smooth
 from smplxpp.core.camera import Camera
@@ -52,20 +53,20 @@ class SimulatedScan:
 
     Attributes:
         mesh: N vertices.
-        face, barycentric: (N,), (N, 3) the layers' face and the point on it.
+        face, barycentric: the layers' face and the point on it.
     """
 
     mesh: TriangleMesh
-    face: np.ndarray
-    barycentric: np.ndarray
+    face: Int[np.ndarray, " N"]
+    barycentric: Float[np.ndarray, "N 3"]
 
 
-def simulate_scan(layers: TriangleMesh, sheets: list[np.ndarray], config: ScanConfig) -> SimulatedScan:
+def simulate_scan(layers: TriangleMesh, sheets: list[Bool[np.ndarray, " M"]], config: ScanConfig) -> SimulatedScan:
     """Scan `layers`, standing on the plane of its lowest vertex.
 
     Args:
         layers: closed parts and open sheets, outward.
-        sheets: face masks (M,) of the open sheets, one a sheet.
+        sheets: face masks of the open sheets, one a sheet.
     """
     solid = concatenate_meshes([layers, *(_inner_side(layers, mask, config.sheet_thickness) for mask in sheets)])
     cameras = _cameras(layers, config)
@@ -88,8 +89,8 @@ def simulate_scan(layers: TriangleMesh, sheets: list[np.ndarray], config: ScanCo
     return SimulatedScan(surface.with_vertices(noisy), face, barycentric)
 
 
-def _inner_side(layers: TriangleMesh, mask: np.ndarray, thickness: float) -> TriangleMesh:
-    """The back of a sheet, moved inwards, and the rim that joins it to the front."""
+def _inner_side(layers: TriangleMesh, mask: Bool[np.ndarray, " M"], thickness: float) -> TriangleMesh:
+    """Make the back of a sheet, moved inwards, and the rim that joins it to the front."""
     sheet = layers.submesh(mask)[0]
     n = sheet.vertex_count
     back = sheet.vertices - thickness * sheet.vertex_normals
@@ -110,8 +111,10 @@ def _cameras(mesh: TriangleMesh, config: ScanConfig) -> list[Camera]:
     ]
 
 
-def _depth_images(mesh: TriangleMesh, cameras: list[Camera]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Depth of every view, and (M,) which faces own a pixel."""
+def _depth_images(
+    mesh: TriangleMesh, cameras: list[Camera]
+) -> tuple[list[Float32[np.ndarray, "H W"]], Bool[np.ndarray, " M"]]:
+    """Return the depth of every view, and which faces own a pixel."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     depths = []
     for camera in cameras:
@@ -121,11 +124,12 @@ def _depth_images(mesh: TriangleMesh, cameras: list[Camera]) -> tuple[list[np.nd
     return depths, seen
 
 
-def _grid(mesh: TriangleMesh, cell: float) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """(G, 3) grid points with x fastest, a few cells beyond the mesh, and the counts along x, y, z."""
+def _grid(mesh: TriangleMesh, cell: float) -> tuple[Float[np.ndarray, "G 3"], tuple[int, int, int]]:
+    """Return grid points with x fastest, a few cells beyond the mesh, and the counts along x, y, z."""
     low, high = mesh.vertices.min(axis=0) - 4 * cell, mesh.vertices.max(axis=0) + 4 * cell
-    size = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
-    points = np.empty((size[2], size[1], size[0], 3))
+    nx, ny, nz = (int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
+    size = (nx, ny, nz)
+    points = np.empty((nz, ny, nx, 3))
     for axis in range(3):
         shape = [1, 1, 1]
         shape[2 - axis] = size[axis]
@@ -134,9 +138,13 @@ def _grid(mesh: TriangleMesh, cell: float) -> tuple[np.ndarray, tuple[int, int, 
 
 
 def _level_set(
-    mesh: TriangleMesh, seen: np.ndarray, grid: np.ndarray, views: tuple[list, list], config: ScanConfig
-) -> np.ndarray:
-    """(G,) distance to the nearest surface within a band; negative in what the cameras take for solid.
+    mesh: TriangleMesh,
+    seen: Bool[np.ndarray, " M"],
+    grid: Float[np.ndarray, "G 3"],
+    views: tuple[list[Camera], list[Float32[np.ndarray, "H W"]]],
+    config: ScanConfig,
+) -> Float[np.ndarray, " G"]:
+    """Return the distance to the nearest surface within a band; negative in what the cameras take for solid.
 
     Near a seen surface its own normal decides the side. Elsewhere a point is free when some camera sees clearly past
     it, or when it is below the floor; what no camera sees is solid: that makes the webs.
@@ -159,8 +167,8 @@ def _level_set(
     return level
 
 
-def _near_vertices(mesh: TriangleMesh, grid: np.ndarray, cell: float) -> np.ndarray:
-    """(G,) bool: grid points within about three cells of a face's corner or centre."""
+def _near_vertices(mesh: TriangleMesh, grid: Float[np.ndarray, "G 3"], cell: float) -> Bool[np.ndarray, " G"]:
+    """Tell the grid points within about three cells of a face's corner or centre."""
     low = grid[0]
     size = np.round((grid[-1] - low) / cell).astype(int) + 1
     hit = np.zeros(size[::-1], dtype=bool)
@@ -176,7 +184,7 @@ def _near_vertices(mesh: TriangleMesh, grid: np.ndarray, cell: float) -> np.ndar
 
 
 def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
-    """The component of most area, outward."""
+    """Return the component of most area, outward."""
     component = face_components(mesh.faces)
     areas = np.bincount(component, mesh.face_areas)
     kept = mesh.submesh(component == np.argmax(areas))[0]
@@ -185,7 +193,7 @@ def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
-    """`config.faces` faces of about equal size (shortest edges collapse first), smaller ones on the head."""
+    """Reduce to `config.faces` faces of about equal size (shortest edges collapse first), smaller ones on the head."""
     floor = mesh.vertices[:, 1].min()
     # Simplify in a space that is stretched above `detail_above`, then undo the stretch.
     height = np.linspace(-0.1, 2.5, 2601)
@@ -201,16 +209,18 @@ def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
     return TriangleMesh(np.stack([points[:, 0] / wide, y + floor, points[:, 2] / wide], axis=1), faces)
 
 
-def _shown_points(layers: TriangleMesh, seen: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closest seen face of the layers and the barycentric coordinates of the closest point on it."""
+def _shown_points(
+    layers: TriangleMesh, seen: Bool[np.ndarray, " M"], points: Float[np.ndarray, "N 3"]
+) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """Return the closest seen face of the layers and the barycentric coordinates of the closest point on it."""
     candidates = np.flatnonzero(seen)
     _, face, closest = igl.point_mesh_squared_distance(points, layers.vertices, layers.faces[candidates])
     face = candidates[face]
     return face, barycentric_coordinates(closest, layers.triangles[face])
 
 
-def merge_islands(mesh: TriangleMesh, part: np.ndarray, *, smallest: int = 30) -> np.ndarray:
-    """(N,) part of each vertex, where pieces of fewer than `smallest` vertices take the part that lies around them.
+def merge_islands(mesh: TriangleMesh, part: UInt8[np.ndarray, " N"], *, smallest: int = 30) -> UInt8[np.ndarray, " N"]:
+    """Return each vertex's part, where pieces of fewer than `smallest` vertices take the part that lies around them.
 
     Where layers touch, the closest one to a noisy vertex is a matter of chance.
     """

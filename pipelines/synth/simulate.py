@@ -6,25 +6,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from pipelines.synth.cloth_model import Fabric, build_cloth
 from pipelines.synth.cloth_solver import ClothSolver, SolverConfig, Tick
 from pipelines.synth.contact import body_contacts, sheet_contacts
-from pipelines.synth.hair_lag import HairLag
 from pipelines.synth.motion import Performance
 from pipelines.synth.noise import ramp
 from pipelines.synth.person import PART_NAMES, Person
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.skinning import skin
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """Steps in time and distances.
+    """Steps in time, distances and materials of a simulation.
 
     Attributes:
         fps: of the frames.
@@ -51,15 +51,15 @@ class Take:
 
     Attributes:
         params: exact parameters; she stands on the floor, y = 0.
-        vertices: (T, V, 3) all layers.
-        skinned: (T, V, 3) the same by linear blend skinning alone.
-        attachment: (V,) how much a vertex follows skinning: 1 wholly, 0 free cloth.
+        vertices: all layers.
+        skinned: the same by linear blend skinning alone.
+        attachment: how much a vertex follows skinning: 1 wholly, 0 free cloth.
     """
 
     params: BodyParams
-    vertices: np.ndarray
-    skinned: np.ndarray
-    attachment: np.ndarray
+    vertices: Float[np.ndarray, "T V 3"]
+    skinned: Float[np.ndarray, "T V 3"]
+    attachment: Float[np.ndarray, " V"]
 
 
 def simulate(
@@ -91,8 +91,8 @@ def simulate(
     return Take(replace(params, fps=config.fps), np.stack(states), skinned, attachment(person))
 
 
-def attachment(person: Person) -> np.ndarray:
-    """(V,) 1 where a layer follows the body exactly, 0 where it is free.
+def attachment(person: Person) -> Float[np.ndarray, " V"]:
+    """Return how much each vertex follows the body: 1 exactly, 0 where it is free.
 
     Clothes hold on where they are worn tight and something carries them: the skirt at the waist, the shirt on the
     shoulders and the upper sleeves. Tight is told by the distance to the skin in the T-pose.
@@ -125,7 +125,12 @@ class _Garment:
     """One piece of clothing: its particles among all vertices, and their solver."""
 
     def __init__(
-        self, person: Person, part: int, hold: np.ndarray, start: np.ndarray, config: SimulationConfig
+        self,
+        person: Person,
+        part: int,
+        hold: Float[np.ndarray, " V"],
+        start: Float[np.ndarray, "V 3"],
+        config: SimulationConfig,
     ) -> None:
         skinned = TriangleMesh(start, person.tpose.faces)
         rest, self.vertices = skinned.submesh(person.face_part == part)
@@ -136,7 +141,43 @@ class _Garment:
 
     @property
     def mesh(self) -> TriangleMesh:
+        """The garment as it is now."""
         return self.solver.model.rest.with_vertices(self.solver.position)
+
+
+class HairLag:
+    """The rotation by which hair trails behind its head: a damped rotational spring.
+
+    `w' = -stiffness a - damping w - gain (head's angular acceleration)`, `a' = w`, with `a` the lag as a rotation
+    vector in the world; semi-implicit steps.
+
+    Args:
+        head: world_from_head at the start, at rest.
+    """
+
+    STIFFNESS, DAMPING, GAIN, LARGEST = 260.0, 9.0, 0.55, np.radians(9.0)
+
+    def __init__(self, head: Float[np.ndarray, "3 3"]) -> None:
+        self._head, self._spin = head, np.zeros(3)
+        self._angle, self._rate = np.zeros(3), np.zeros(3)
+
+    def advance(self, head: Float[np.ndarray, "3 3"], seconds: float) -> None:
+        """Follow the head to `head` within `seconds`."""
+        spin = rotvec_from_matrix(head @ self._head.T) / seconds
+        push = self.GAIN * (spin - self._spin)
+        self._rate += -push - seconds * (self.STIFFNESS * self._angle + self.DAMPING * self._rate)
+        self._angle = self._angle + seconds * self._rate
+        length = np.linalg.norm(self._angle)
+        if length > self.LARGEST:
+            self._angle *= self.LARGEST / length
+        self._head, self._spin = head, spin
+
+    def applied(
+        self, points: Float[np.ndarray, "N 3"], looseness: Float[np.ndarray, " N"], pivot: Float[np.ndarray, " 3"]
+    ) -> Float[np.ndarray, "N 3"]:
+        """Turn points of the hair about `pivot` by their share `looseness` of the lag."""
+        turned = matrix_from_rotvec(looseness[:, None] * self._angle)
+        return pivot + np.einsum("nij,nj->ni", turned, points - pivot)
 
 
 class _Stage:
@@ -157,17 +198,15 @@ class _Stage:
             _Garment(person, part, hold=hold, start=self._layers, config=config) for part in (LOWER, UPPER)
         )
 
-    def standing(self, times: np.ndarray) -> tuple[BodyParams, np.ndarray, np.ndarray]:
-        """Parameters with the lowest vertex at y = 0, all layers skinned (T, V, 3), the joints' transforms."""
-        person = self.person
+    def standing(
+        self, times: Float[np.ndarray, " T"]
+    ) -> tuple[BodyParams, Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
+        """Return parameters with the lowest vertex at y = 0, all layers skinned, the joints' transforms."""
         params = self.performance.at(times)
-        posed = person.body.forward(params)
-        rest = np.repeat(person.tpose.vertices[None], len(params), axis=0)
-        rest[:, : person.body.vertex_count] = posed.rest_vertices
-        layers = skin(rest, person.weights, posed.posed_from_rest)
+        layers, posed_from_rest = self.person.posed(params)
         up = np.round(-layers[..., 1].min(axis=1), 5)
         layers[..., 1] += up[:, None]
-        transforms = posed.posed_from_rest.copy()
+        transforms = posed_from_rest.copy()
         transforms[:, :, 1, 3] += up[:, None]
         return replace(params, transl=np.stack([0 * up, up, 0 * up], axis=1)), layers, transforms
 
@@ -194,28 +233,28 @@ class _Stage:
         self._pivot = self._head_joint(transforms[0])
         self._layers = after
 
-    def layers(self) -> np.ndarray:
-        """(V, 3) all layers as they are now."""
+    def layers(self) -> Float[np.ndarray, "V 3"]:
+        """Return all layers as they are now."""
         out = self._layers.copy()
         for garment in (self.skirt, self.shirt):
             out[garment.vertices] = garment.solver.position
         out[self.hair] = self.lag.applied(out[self.hair], self._looseness, self._pivot)
         return out
 
-    def _head_joint(self, transforms: np.ndarray) -> np.ndarray:
-        """(3,) where the head's joint is: the hair's pivot."""
+    def _head_joint(self, transforms: Float[np.ndarray, "55 4 4"]) -> Float[np.ndarray, " 3"]:
+        """Return where the head's joint is: the hair's pivot."""
         body = self.person.body
         rest = body.joint_regressor[self._head] @ self.person.tpose.vertices[: body.vertex_count]
         return transforms[self._head, :3, :3] @ rest + transforms[self._head, :3, 3]
 
-    def _hair_looseness(self) -> np.ndarray:
-        """(H,) 0 on the crown, 1 at the tips."""
+    def _hair_looseness(self) -> Float[np.ndarray, " H"]:
+        """Return 0 on the crown, 1 at the tips."""
         y = self.person.tpose.vertices[self.hair, 1]
         return ramp(y, y.max() - 0.10, y.min() + 0.02)
 
 
-def _contact_faces(person: Person) -> np.ndarray:
-    """Faces of the skin below the head: what cloth can touch."""
+def _contact_faces(person: Person) -> Int[np.ndarray, "F 3"]:
+    """Return the faces of the skin below the head: what cloth can touch."""
     body = person.body
     rest = person.tpose.vertices[: body.vertex_count]
     joint = body.joint_regressor @ rest

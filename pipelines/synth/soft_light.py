@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
@@ -36,8 +37,8 @@ class LightConfig:
     slack: float = 0.004
 
 
-def vertex_light(mesh: TriangleMesh, config: LightConfig) -> np.ndarray:
-    """(2, N) irradiance over pi at each vertex, on its outer and its inner side; 1 is an open vertex's mean.
+def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray, "2 N"]:
+    """Return the irradiance over pi at each vertex, on its outer and its inner side; 1 is an open vertex's mean.
 
     `E(n) = 1/pi integral of L(w) V(w) max(n . w, 0) dw`, with V from depth images along `w`.
     """
@@ -47,7 +48,7 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> np.ndarray:
     normals = mesh.vertex_normals
     lifted = [mesh.vertices + side * config.lift * normals for side in (1.0, -1.0)]
 
-    def from_one(direction: np.ndarray) -> np.ndarray:
+    def from_one(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "2 N"]:
         camera = Camera.orthographic_view(
             center=0.5 * (low + high), direction=direction, half_extent=radius, size=config.resolution
         )
@@ -65,8 +66,8 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> np.ndarray:
     return total * (4.0 / config.directions)
 
 
-def bounced(light: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-    """Colour (P, 3) of surfaces of linear `albedo` (P, 3) in `light` (P,), with light that bounces among them.
+def bounced(light: Float64[np.ndarray, " P"], albedo: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 3"]:
+    """Return the colour of surfaces of linear `albedo` in `light`, with light that bounces among them.
 
     What is not open sees surfaces of the same albedo and the same light: `E = a + (1 - a) albedo E`, so
     `E = a / (1 - (1 - a) albedo)`, with `a` the open share.
@@ -76,8 +77,10 @@ def bounced(light: np.ndarray, albedo: np.ndarray) -> np.ndarray:
     return albedo * light[:, None] / (1.0 - (1.0 - share) * albedo)
 
 
-def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray, slack: float) -> np.ndarray:
-    """(P,) share of the four pixels around each point, bilinear, whose depth does not hide it."""
+def _visible(
+    camera: Camera, depth: Float32[np.ndarray, "H W"], points: Float64[np.ndarray, "P 3"], slack: float
+) -> Float64[np.ndarray, " P"]:
+    """Return the share of the four pixels around each point, bilinear, whose depth does not hide it."""
     x, y, z = camera.screen_from_world(points).T[:3]
     x, y = x - 0.5, y - 0.5
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from pipelines.synth.noise import ramp, smooth_noise
 from smplxpp.core.mesh import row_lengths
@@ -16,21 +17,23 @@ SHOE, SOLE = (124, 74, 46), (232, 226, 214)
 SHIRT, STRIPE = (240, 236, 226), (44, 62, 110)
 PLAID = ((150, 34, 44), (28, 60, 66), (236, 204, 120))
 
+Color = tuple[int, int, int]
 
-def mix(a, b, t: np.ndarray) -> np.ndarray:
-    """(N, 3) colours between `a` (t = 0) and `b` (t = 1)."""
+
+def mix(a: Color, b: Color, t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
+    """Mix colours between `a` (t = 0) and `b` (t = 1)."""
     t = np.asarray(t, dtype=float)[:, None]
     return (1 - t) * np.asarray(a, dtype=float) + t * np.asarray(b, dtype=float)
 
 
-def band(x: np.ndarray, *, period: float, width: float, edge: float = 0.006) -> np.ndarray:
-    """(N,) 1 within `width` metres about every multiple of `period`, 0 between, soft over `edge`."""
+def band(x: Float[np.ndarray, " N"], *, period: float, width: float, edge: float = 0.006) -> Float[np.ndarray, " N"]:
+    """Return 1 within `width` metres about every multiple of `period`, 0 between, soft over `edge`."""
     distance = np.abs((x + 0.5 * period) % period - 0.5 * period)
     return ramp(distance, 0.5 * (width + edge), 0.5 * (width - edge))
 
 
-def shirt_colors(points: np.ndarray, shoulder: np.ndarray) -> np.ndarray:
-    """Stripes around torso and sleeves, in an uneven knit."""
+def shirt_colors(points: Float[np.ndarray, "N 3"], shoulder: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
+    """Paint stripes around torso and sleeves, in an uneven knit."""
     x, y, _ = points.T
     start = shoulder[0] + 0.03
     on_sleeve = (np.abs(x) > start) & (y > shoulder[1] - 0.13)
@@ -39,8 +42,8 @@ def shirt_colors(points: np.ndarray, shoulder: np.ndarray) -> np.ndarray:
     return colors * (1.0 + 0.045 * _weave(points, seed=11))[:, None]
 
 
-def skirt_colors(points: np.ndarray, centre_z: float) -> np.ndarray:
-    """A plaid: broad dark bands and thin light lines, around and along."""
+def skirt_colors(points: Float[np.ndarray, "N 3"], centre_z: float) -> Float[np.ndarray, "N 3"]:
+    """Paint a plaid: broad dark bands and thin light lines, around and along."""
     x, y, z = points.T
     around = np.arctan2(x, z - centre_z) * 0.21  # about metres on the skirt
     period = 2 * np.pi * 0.21 / 12
@@ -54,20 +57,20 @@ def skirt_colors(points: np.ndarray, centre_z: float) -> np.ndarray:
     return colors * (1.0 + 0.09 * _weave(points, seed=12))[:, None]
 
 
-def hair_colors(points: np.ndarray, seed: int) -> np.ndarray:
-    """Brown with lighter streaks along the fall."""
+def hair_colors(points: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:
+    """Paint brown with lighter streaks along the fall."""
     locks = smooth_noise(points, scale=(0.007, 0.3, 0.007), seed=seed)
     strands = smooth_noise(points, scale=(0.0009, 0.12, 0.0009), seed=seed + 1)
     return mix(HAIR, HAIR_LIGHT, np.clip(0.3 + 0.22 * locks + 0.2 * strands, 0, 1))
 
 
-def shoe_colors(points: np.ndarray, floor: float) -> np.ndarray:
-    """Leather over a light sole."""
+def shoe_colors(points: Float[np.ndarray, "N 3"], floor: float) -> Float[np.ndarray, "N 3"]:
+    """Paint leather over a light sole."""
     return mix(SOLE, SHOE, ramp(points[:, 1], floor + 0.010, floor + 0.016))
 
 
-def skin_colors(points: np.ndarray, face: FaceMarks, seed: int) -> np.ndarray:
-    """Skin with warm patches and fine mottling; on the face cheeks, lips, brows and lashes."""
+def skin_colors(points: Float[np.ndarray, "N 3"], face: FaceMarks, seed: int) -> Float[np.ndarray, "N 3"]:
+    """Paint skin with warm patches and fine mottling; on the face cheeks, lips, brows and lashes."""
     warmth = smooth_noise(points, scale=(0.04, 0.04, 0.04), seed=seed)
     mottling = smooth_noise(points, scale=(0.003, 0.003, 0.003), seed=seed + 1)
     pores = smooth_noise(points, scale=(0.0005, 0.0005, 0.0005), seed=seed + 2)
@@ -80,20 +83,22 @@ def skin_colors(points: np.ndarray, face: FaceMarks, seed: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class FaceMarks:
-    """Landmarks on the T-pose in dlib's order: brows (10, 3), eyes (12, 3), outline of the lips (12, 3)."""
+    """Landmarks on the T-pose in dlib's order; of the lips their outline."""
 
-    brows: np.ndarray
-    eyes: np.ndarray
-    lips: np.ndarray
+    brows: Float[np.ndarray, "10 3"]
+    eyes: Float[np.ndarray, "12 3"]
+    lips: Float[np.ndarray, "12 3"]
 
-    def in_front(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool: points on the front of the face."""
+    def in_front(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+        """Tell the points on the front of the face."""
         low, high = self.lips.min(axis=0), self.brows.max(axis=0)
         x, y, z = points.T
         return (y > low[1] - 0.02) & (y < high[1] + 0.02) & (z > low[2] - 0.045) & (np.abs(x) < 0.075)
 
 
-def _face_colors(colors: np.ndarray, points: np.ndarray, face: FaceMarks, seed: int) -> np.ndarray:
+def _face_colors(
+    colors: Float[np.ndarray, "N 3"], points: Float[np.ndarray, "N 3"], face: FaceMarks, seed: int
+) -> Float[np.ndarray, "N 3"]:
     """Paint the face's features over the skin; all are drawn in the frontal plane."""
     x, y, _ = points.T
     mirrored = np.stack([np.abs(x), y], axis=1)
@@ -134,23 +139,23 @@ def _face_colors(colors: np.ndarray, points: np.ndarray, face: FaceMarks, seed: 
 _SLANT = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _off_curve(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """(N,) about the distance of points (N, 2) from a flat curve (L, 2) with ascending x."""
+def _off_curve(points: Float[np.ndarray, "N 2"], curve: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, " N"]:
+    """Return about the distance of points from a flat curve with ascending x."""
     x, y = points.T
     beside = np.maximum(np.maximum(curve[0, 0] - x, x - curve[-1, 0]), 0.0)
     return np.hypot(y - np.interp(x, curve[:, 0], curve[:, 1]), beside)
 
 
-def _weave(points: np.ndarray, *, seed: int) -> np.ndarray:
-    """(N,) of about unit size: threads along and across, uneven, so that no moire shows from afar."""
+def _weave(points: Float[np.ndarray, "N 3"], *, seed: int) -> Float[np.ndarray, " N"]:
+    """Return noise of about unit size: threads along and across, uneven, so that no moire shows from afar."""
     along = smooth_noise(points, scale=(0.0006, 0.010, 0.0006), seed=seed)
     across = smooth_noise(points, scale=(0.010, 0.0006, 0.010), seed=seed + 1)
     patches = smooth_noise(points, scale=(0.02, 0.02, 0.02), seed=seed + 2)
     return 0.6 * along + 0.6 * across + 0.5 * patches
 
 
-def eye_colors(offsets: np.ndarray) -> np.ndarray:
-    """White, iris and pupil by the distance from the eye's axis, +z; `offsets` (N, 3) from its centre."""
+def eye_colors(offsets: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Paint white, iris and pupil by the distance from the eye's axis, +z; `offsets` are from its centre."""
     radius, angle = np.hypot(offsets[:, 0], offsets[:, 1]), np.arctan2(offsets[:, 1], offsets[:, 0])
     fibres = 0.5 + 0.25 * np.sin(23 * angle) + 0.25 * np.sin(37 * angle + 900 * radius)
     colors = mix_rows(mix(IRIS, IRIS_LIGHT, fibres), PUPIL, 0.6 * ramp(radius, 0.0048, 0.0058))
@@ -158,5 +163,8 @@ def eye_colors(offsets: np.ndarray) -> np.ndarray:
     return mix_rows(colors, PUPIL, ramp(radius, 0.003, 0.0022))
 
 
-def mix_rows(colors: np.ndarray, other: tuple, t: np.ndarray) -> np.ndarray:
+def mix_rows(
+    colors: Float[np.ndarray, "N 3"], other: tuple[int, int, int], t: Float[np.ndarray, " N"]
+) -> Float[np.ndarray, "N 3"]:
+    """Mix each colour with one other, `t` of it."""
     return colors + np.asarray(t, dtype=float)[:, None] * (np.asarray(other, dtype=float) - colors)

@@ -1,17 +1,23 @@
-"""What a camera sees of one frame: image, antialiased mask, labels, normals."""
+"""What a camera sees of one frame: image, antialiased mask, labels, normals; and which skin it never sees."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import igl
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 
 from pipelines.figures.colors import linear_from_srgb, srgb8_from_linear
-from pipelines.synth.person import Person
+from pipelines.synth.person import PART_NAMES, Person
 from pipelines.synth.soft_light import bounced
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import MeshMaps, rasterize_mesh
+
+# How far from a garment's border its cover is taken for lasting (a skirt's hem swings), and how far skin may lie below.
+_FROM_BORDER = {"upper": 0.035, "lower": 0.13}
+_BELOW = 0.09
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,26 +26,48 @@ class LitFrame:
 
     Attributes:
         mesh: all layers' vertices with the faces that are shown.
-        face: (M,) index of each shown face among the person's.
-        light: (2, V) of the outer and the inner side, from `vertex_light`.
+        face: index of each shown face among the person's.
+        light: of the outer and the inner side, from `vertex_light`.
     """
 
     mesh: TriangleMesh
-    face: np.ndarray
-    light: np.ndarray
+    face: Int[np.ndarray, " M"]
+    light: Float[np.ndarray, "2 V"]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """Pixels of one camera: image (H, W, 3) on black, mask (H, W), labels (H, W), all uint8."""
+class RenderedView:
+    """Pixels of one camera, the image on black."""
 
-    image: np.ndarray
-    mask: np.ndarray
-    labels: np.ndarray
+    image: UInt8[np.ndarray, "H W 3"]
+    mask: UInt8[np.ndarray, "H W"]
+    labels: UInt8[np.ndarray, "H W"]
 
 
-def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersampling: int) -> View:
-    """Colours averaged over `supersampling`^2 samples a pixel in linear light; labels from one sample at its centre."""
+def hidden_faces(person: Person, vertices: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " M"]:
+    """Tell the faces of skin well inside a garment in one frame.
+
+    They are left out of the pictures, so that no thin cloth lets them show through.
+    """
+    count = person.body.vertex_count
+    covered = np.zeros(count, dtype=bool)
+    layers = TriangleMesh(vertices, person.tpose.faces)
+    for name, margin in _FROM_BORDER.items():
+        cloth = layers.submesh(person.face_part == PART_NAMES.index(name))[0]
+        squared, face, closest = igl.point_mesh_squared_distance(vertices[:count], cloth.vertices, cloth.faces)
+        inside = np.einsum("vi,vi->v", vertices[:count] - closest, cloth.face_normals[face]) < 0
+        border = cloth.vertices[np.unique(cloth.border_edges)]
+        away = np.sqrt(igl.point_mesh_squared_distance(closest, border, np.arange(len(border))[:, None])[0]) > margin
+        covered |= inside & away & (squared < _BELOW**2)
+    outer = person.body.part_labels == person.body.part_label_names.index("body")
+    hidden = np.zeros(person.tpose.face_count, dtype=bool)
+    body = np.flatnonzero(person.face_part == PART_NAMES.index("body"))
+    hidden[body] = (covered & outer)[person.tpose.faces[body]].all(axis=1)
+    return hidden
+
+
+def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersampling: int) -> RenderedView:
+    """Average colours over `supersampling`^2 samples a pixel in linear light; labels are those at its centre."""
     s = supersampling
     K = camera.K.copy()
     K[:2] *= s
@@ -53,11 +81,11 @@ def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersamplin
     alpha = count[..., 0] / s**2
     srgb = srgb8_from_linear(linear).astype(np.float64)
     image = np.round(srgb * alpha[..., None]).astype(np.uint8)
-    return View(image, np.round(255 * alpha).astype(np.uint8), label_map(person, frame, camera))
+    return RenderedView(image, np.round(255 * alpha).astype(np.uint8), label_map(person, frame, camera))
 
 
-def label_map(person: Person, frame: LitFrame, camera: Camera) -> np.ndarray:
-    """(H, W) uint8 label of what is at each pixel's centre; 0 where nothing is."""
+def label_map(person: Person, frame: LitFrame, camera: Camera) -> UInt8[np.ndarray, "H W"]:
+    """Return the label of what is at each pixel's centre; 0 where nothing is."""
     maps = rasterize_mesh(frame.mesh, camera)
     hit = np.flatnonzero(maps.face_id.ravel() >= 0)
     out = np.zeros(camera.height * camera.width, np.uint8)
@@ -65,8 +93,8 @@ def label_map(person: Person, frame: LitFrame, camera: Camera) -> np.ndarray:
     return out.reshape(camera.height, camera.width)
 
 
-def normal_map(frame: LitFrame, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float64 smooth unit normals in the world, facing the camera, at pixel centres; zero on background."""
+def normal_map(frame: LitFrame, camera: Camera) -> Float64[np.ndarray, "H W 3"]:
+    """Return smooth unit normals in the world, facing the camera, at pixel centres; zero on background."""
     maps = rasterize_mesh(frame.mesh, camera)
     normal = maps.interpolate(frame.mesh.faces, frame.mesh.vertex_normals)
     hit = maps.mask
@@ -77,15 +105,15 @@ def normal_map(frame: LitFrame, camera: Camera) -> np.ndarray:
     return normal
 
 
-def _pooled(x: np.ndarray, s: int) -> np.ndarray:
-    """Sums over s x s blocks of (s H, s W, D)."""
-    return sum(x[i::s, j::s] for i in range(s) for j in range(s))
+def _pooled(x: Float32[np.ndarray, "H W D"], s: int) -> Float32[np.ndarray, "h w D"]:
+    """Sum over blocks of s x s pixels."""
+    return sum((x[i::s, j::s] for i in range(s) for j in range(s)), np.zeros((), x.dtype))
 
 
 def _surface(
-    person: Person, frame: LitFrame, maps: MeshMaps, pixels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Corners (P, 3), barycentric coordinates (P, 3), part (P,) and label (P,) at flat pixel indices."""
+    person: Person, frame: LitFrame, maps: MeshMaps, pixels: Int[np.ndarray, " P"]
+) -> tuple[Int[np.ndarray, "P 3"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, " P"], UInt8[np.ndarray, " P"]]:
+    """Return corners, barycentric coordinates, part and label at flat pixel indices."""
     shown = maps.face_id.ravel()[pixels]
     bary = maps.barycentric.reshape(-1, 3)[pixels].astype(np.float64)
     corners = frame.mesh.faces[shown]
@@ -93,8 +121,10 @@ def _surface(
     return corners, bary, person.face_part[frame.face[shown]], person.vertex_label[nearest]
 
 
-def _shaded(person: Person, frame: LitFrame, camera: Camera, maps: MeshMaps, pixels: np.ndarray) -> np.ndarray:
-    """(P, 3) linear colours."""
+def _shaded(
+    person: Person, frame: LitFrame, camera: Camera, maps: MeshMaps, pixels: Int[np.ndarray, " P"]
+) -> Float64[np.ndarray, "P 3"]:
+    """Return the linear colours at flat pixel indices."""
     corners, bary, part, label = _surface(person, frame, maps, pixels)
     # Single precision: textures are sums of many sines.
     canonical = np.einsum("pk,pkx->px", bary, person.tpose.vertices[corners]).astype(np.float32)
@@ -108,6 +138,6 @@ def _shaded(person: Person, frame: LitFrame, camera: Camera, maps: MeshMaps, pix
     return bounced(light, albedo)
 
 
-def _back_faces(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
-    """(M,) bool: faces that turn their inner side to a pinhole camera."""
+def _back_faces(mesh: TriangleMesh, camera: Camera) -> Bool[np.ndarray, " M"]:
+    """Tell the faces that turn their inner side to a pinhole camera."""
     return np.einsum("mi,mi->m", mesh.face_cross, mesh.face_centers - camera.position) > 0.0

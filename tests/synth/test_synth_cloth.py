@@ -8,7 +8,7 @@ import pytest
 from pipelines.synth.cloth_model import ClothModel, Fabric, build_cloth, color_edges
 from pipelines.synth.cloth_solver import ClothSolver, SolverConfig, Tick
 from pipelines.synth.contact import body_contacts, depths, sheet_contacts
-from pipelines.synth.hair_lag import HairLag
+from pipelines.synth.simulate import HairLag
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec
 

@@ -2,38 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from pipelines.captures.check.diagnosis import Diagnosis, diagnose
 from pipelines.captures.check.findings import Finding
 from pipelines.captures.check.mistakes import Mistake, Sample
-from pipelines.captures.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, summary
+from pipelines.captures.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, SilhouetteFit, summary
 from pipelines.captures.check.views import ViewCheck
 from smplxpp.core.camera import Camera
+from smplxpp.core.spread import spread
 
 # A frame does not fit by itself if it is bad in this share of its cameras. Single frames and cameras are to blame if
 # they are this much worse than the median.
 _MOST, _WORSE = 0.6, 2.5
 _SAMPLE_CAMERAS, _SAMPLE_FRAMES = 4, 3
 
+Key = TypeVar("Key", bound=Hashable)
 Sampler = Callable[[str, int], Sample | None]
 
 
 def by_camera(views: Iterable[ViewCheck]) -> dict[str, FitSummary]:
-    """Figures of each camera that sees the body."""
+    """Return the figures of each camera that sees the body."""
     return _summaries(views, lambda view: view.camera)
 
 
 def by_frame(views: Iterable[ViewCheck]) -> dict[int, FitSummary]:
-    """Figures of each frame in which the body is seen."""
+    """Return the figures of each frame in which the body is seen."""
     return _summaries(views, lambda view: view.frame)
 
 
 def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], sampler: Sampler) -> Iterator[Finding]:
-    """Single frames that do not fit, single cameras that do not, or all: with the mistake that would explain it.
+    """Find single frames that do not fit, single cameras that do not, or all: with the mistake that explains it.
 
     Args:
         views: all that were looked at.
@@ -61,8 +63,8 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
         yield _loose(doubtful, rest, cameras, sampler)
 
 
-def _outliers(fits: Mapping[Any, FitSummary]) -> list[Any]:
-    """Bad ones that are much worse than most: with rough parameters all are, and none is to blame."""
+def _outliers(fits: Mapping[Key, FitSummary]) -> list[Key]:
+    """Return the bad ones that are much worse than most: with rough parameters all are, and none is to blame."""
     if not fits:
         return []
     usual = float(np.median([fit.outside for fit in fits.values()]))
@@ -74,7 +76,7 @@ def _outliers(fits: Mapping[Any, FitSummary]) -> list[Any]:
 
 
 def blind_cameras(views: Iterable[ViewCheck]) -> Iterator[Finding]:
-    """Cameras whose every mask is empty, and into which the body does not project either."""
+    """Find cameras whose every mask is empty, and into which the body does not project either."""
     blind: dict[str, bool] = {}
     for view in views:
         nobody = view.mask_share is not None and view.mask_share < MIN_SHARE and not view.fit and not view.findings
@@ -88,8 +90,10 @@ def _everywhere(
 ) -> Finding:
     chosen = spread(bad, _SAMPLE_CAMERAS)
     result = diagnose(_samples(views, chosen, sampler))
+    fit = summary(view.fit for view in views if view.fit)
+    assert fit is not None  # bad cameras have views with figures
     which = "any camera" if len(bad) == len(cameras) else f"{len(bad)} of {len(cameras)} cameras"
-    words = f"the body does not fit the masks of {which} ({_figures(summary(v.fit for v in views if v.fit))})"
+    words = f"the body does not fit the masks of {which} ({_figures(fit)})"
     words, advice = _explained(words, result)
     return Finding("calibration", words, advice=advice)
 
@@ -105,7 +109,7 @@ def _one_camera(
         Mistake(
             f"its images are those of camera {other.name}",
             f"exchange the folders, or the calibrations, of {name} and {other.name}",
-            camera=lambda _, other=other: other,
+            camera=_replaced_by(other),
         )
         for other in rig.values()
         if other.name != name and (other.width, other.height) == (rig[name].width, rig[name].height)
@@ -113,6 +117,11 @@ def _one_camera(
     words = f"camera {name}: the body does not fit its masks ({_figures(fit)})"
     words, advice = _explained(words, diagnose(_samples(views, [name], sampler), swaps))
     return Finding("calibration-camera", words, name, advice=advice)
+
+
+def _replaced_by(other: Camera) -> Callable[[Camera], Camera]:
+    """Make the correction that takes another camera's calibration."""
+    return lambda _: other
 
 
 def _loose(
@@ -126,7 +135,7 @@ def _loose(
 
 
 def _explained(words: str, result: Diagnosis | None) -> tuple[str, str]:
-    """Words and advice; the diagnosis goes first where there is one."""
+    """Return words and advice; the diagnosis goes first where there is one."""
     if result is None:
         return words, ""
     after = f"{result.after.outside:.0%} outside, overlap {result.after.iou:.2f}"
@@ -134,7 +143,7 @@ def _explained(words: str, result: Diagnosis | None) -> tuple[str, str]:
 
 
 def _samples(views: Sequence[ViewCheck], cameras: Sequence[str], sampler: Sampler) -> list[Sample]:
-    """A few views of each camera to try corrections on."""
+    """Pick a few views of each camera to try corrections on."""
     found = []
     for name in cameras:
         frames = [view.frame for view in views if view.camera == name and view.fit is not None]
@@ -142,21 +151,14 @@ def _samples(views: Sequence[ViewCheck], cameras: Sequence[str], sampler: Sample
     return [sample for sample in found if sample is not None]
 
 
-def spread(items: Sequence, count: int) -> list:
-    """At most `count` of the items, evenly spread, the first and the last among them."""
-    if not len(items):
-        return []
-    chosen = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
-    return [items[k] for k in chosen]
-
-
 def _figures(s: FitSummary) -> str:
     return f"{s.outside:.0%} of it outside of them, overlap {s.iou:.2f}"
 
 
-def _summaries(views: Iterable[ViewCheck], key: Callable[[ViewCheck], str | int]) -> dict:
-    groups: dict[str | int, list] = {}
+def _summaries(views: Iterable[ViewCheck], key: Callable[[ViewCheck], Key]) -> dict[Key, FitSummary]:
+    groups: dict[Key, list[SilhouetteFit]] = {}
     for view in views:
         if view.fit is not None:
             groups.setdefault(key(view), []).append(view.fit)
-    return {name: summary(fits) for name, fits in groups.items()}
+    summaries = {name: summary(fits) for name, fits in groups.items()}
+    return {name: fit for name, fit in summaries.items() if fit is not None}

@@ -12,8 +12,9 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from pipelines.captures.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings, spread
+from pipelines.captures.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings
 from pipelines.captures.check.files import missing_findings, split_findings
 from pipelines.captures.check.findings import Finding
 from pipelines.captures.check.mistakes import Sample
@@ -25,6 +26,7 @@ from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core.spread import spread
 
 Progress = Callable[[int, int], None]
 # Frames before and after that are tried where images and parameters may not be of one clock.
@@ -58,16 +60,16 @@ class CaptureCheck:
         small: the same at the size of the comparison.
         findings: what is wrong; empty for a sound capture.
         views: all views that were opened.
-        vertices: gives those of the posed body in a frame, (V, 3), or None.
-        faces: (F, 3) of the body.
+        vertices: gives those of the posed body in a frame, or None.
+        faces: the body's triangles.
     """
 
     capture: Capture
     small: Capture
     findings: tuple[Finding, ...]
     views: tuple[ViewCheck, ...]
-    vertices: Callable[[int], np.ndarray | None]
-    faces: np.ndarray
+    vertices: Callable[[int], Float[np.ndarray, "V 3"] | None]
+    faces: Int[np.ndarray, "F 3"]
 
     @property
     def failed(self) -> bool:
@@ -80,11 +82,11 @@ class CaptureCheck:
         return tuple(dict.fromkeys(view.frame for view in self.views))
 
     def cameras(self) -> dict[str, FitSummary]:
-        """Body against masks, by camera."""
+        """Return the body's fit into the masks by camera."""
         return by_camera(self.views)
 
     def frame_fits(self) -> dict[int, FitSummary]:
-        """Body against masks, by frame."""
+        """Return the body's fit into the masks by frame."""
         return by_frame(self.views)
 
 
@@ -135,17 +137,17 @@ class _Poser:
     def __init__(self, body: BodyModel, params: dict[int, BodyParams]) -> None:
         self.body, self.params = body, params
         self.findings: list[Finding] = []
-        self._posed: OrderedDict[int, np.ndarray | None] = OrderedDict()
+        self._posed: OrderedDict[int, Float[np.ndarray, "V 3"] | None] = OrderedDict()
 
-    def vertices(self, frame: int) -> np.ndarray | None:
-        """(V, 3), None without usable parameters. The last few are kept."""
+    def vertices(self, frame: int) -> Float[np.ndarray, "V 3"] | None:
+        """Pose the body as in a frame; None without usable parameters. The last few are kept."""
         if frame not in self._posed:
             self._posed[frame] = self._pose(frame)
             if len(self._posed) > _KEPT:
                 self._posed.popitem(last=False)
         return self._posed[frame]
 
-    def _pose(self, frame: int) -> np.ndarray | None:
+    def _pose(self, frame: int) -> Float[np.ndarray, "V 3"] | None:
         if frame not in self.params:
             return None
         try:
@@ -156,15 +158,17 @@ class _Poser:
 
 
 def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | None:
+    """Return the view to try corrections on; None where the body or the mask is missing."""
     vertices = poser.vertices(frame)
-    if vertices is None:
+    mask = small.mask(camera, frame)
+    if vertices is None or mask is None:
         return None
     p = poser.params[frame]
     root = poser.body.rest_joints(p)[0, 0]
     neighbours = {k: poser.vertices(frame + k) for k in _SHIFTS}
     return Sample(
         camera=small.cameras[camera],
-        mask=small.mask(camera, frame) > OPAQUE,
+        mask=mask > OPAQUE,
         vertices=vertices,
         faces=poser.body.faces,
         transl=p.transl[0],
@@ -187,7 +191,7 @@ def _chosen_frames(capture: Capture, config: CheckConfig) -> list[int]:
 
 
 def _scale(capture: Capture, size: int) -> float:
-    """Of a whole number to one where there is anything to reduce: reduced images are then means over areas."""
+    """Return a scale of one to a whole number, so that reduced images are means over areas; 1 for small ones."""
     longest = max((max(camera.width, camera.height) for camera in capture.cameras.values()), default=1)
     return 1.0 / max(1, math.ceil(longest / size))
 
@@ -206,7 +210,7 @@ def _plain_background(views: Sequence[ViewCheck]) -> list[Finding]:
 
 
 def _relative(finding: Finding, root: Path) -> Finding:
-    """With file names from the capture's folder on."""
+    """Return the finding with file names from the capture's folder on."""
     return Finding(
         finding.kind, finding.message.replace(f"{root}{os.sep}", ""), finding.camera, finding.frame, finding.advice
     )

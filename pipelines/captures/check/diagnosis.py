@@ -31,7 +31,7 @@ class Diagnosis:
 
 
 def diagnose(samples: Sequence[Sample], extra: Sequence[Mistake] = ()) -> Diagnosis | None:
-    """The correction that brings the body into the masks; None where none does.
+    """Find the correction that brings the body into the masks; None where none does.
 
     Args:
         samples: views that do not fit.
@@ -55,7 +55,7 @@ def _explains(before: SilhouetteFit, after: SilhouetteFit) -> bool:
 
 
 def _score(samples: Sequence[Sample], mistake: Mistake) -> SilhouetteFit:
-    """Mean figures over the samples that the correction applies to, which have to be half of them."""
+    """Return mean figures over the samples that the correction applies to, which have to be half of them."""
     fits = []
     for sample in samples:
         vertices = mistake.body(sample)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Int
 
 from pipelines.captures.check.findings import Finding
 from smplxpp.capture import Capture, Problem, find_problems
@@ -25,7 +26,7 @@ _KINDS = (
 
 
 def missing_findings(capture: Capture) -> list[Finding]:
-    """Cameras without images, gaps, images without masks, frames without parameters or with broken ones."""
+    """Find cameras without images, gaps, images without masks, frames without parameters or with broken ones."""
     found = [_classified(problem) for problem in find_problems(capture, decode=False)]
     if capture.recording.params is None:
         found.append(Finding("params-none", "no body parameters: calibration and masks cannot be held against a body"))
@@ -40,7 +41,7 @@ def _classified(problem: Problem) -> Finding:
 
 
 def split_findings(capture: Capture) -> Iterator[Finding]:
-    """Splits that hold nothing to train or to test on, and what no split holds."""
+    """Find splits that hold nothing to train or to test on, and what no split holds."""
     splits, images = capture.splits, capture.presence()
     seen_cameras = {name for name, has in zip(capture.cameras, images, strict=True) if has.any()}
     seen_frames = {frame for frame, has in zip(capture.frames, images.T, strict=True) if has.any()}
@@ -62,8 +63,8 @@ def split_findings(capture: Capture) -> Iterator[Finding]:
         yield Finding("split-leftover", f"frames that no split holds: {in_ranges(left)}")
 
 
-def in_ranges(numbers: np.ndarray) -> str:
-    """Ascending numbers in words: `0-3, 7, 9-10`; "" for none."""
+def in_ranges(numbers: Int[np.ndarray, " N"]) -> str:
+    """Write ascending numbers in words: `0-3, 7, 9-10`; "" for none."""
     if not len(numbers):
         return ""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)

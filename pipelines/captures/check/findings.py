@@ -108,7 +108,7 @@ class Finding:
         return self.advice or KINDS[self.kind][2]
 
     def as_dict(self) -> dict[str, object]:
-        """As JSON values."""
+        """Return the finding as JSON values."""
         return {
             "kind": self.kind,
             "area": self.area,
@@ -120,8 +120,8 @@ class Finding:
         }
 
 
-def of_unreadable(error: InputError, camera: str | None, frame: int | None) -> Finding:
-    """The finding of a file that a reader refused."""
+def unreadable_finding(error: InputError, camera: str | None, frame: int | None) -> Finding:
+    """Make the finding of a file that a reader refused."""
     if "whole image" in error.expected or "existing file" in error.expected:
         kind = "file-damaged"
     else:
@@ -130,7 +130,7 @@ def of_unreadable(error: InputError, camera: str | None, frame: int | None) -> F
 
 
 def grouped(findings: Iterable[Finding]) -> list[tuple[Finding, ...]]:
-    """Findings of one kind and one remedy together: by area, failures first within one."""
+    """Put findings of one kind and one remedy together: by area, failures first within one."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
         groups.setdefault((finding.kind, finding.remedy), []).append(finding)

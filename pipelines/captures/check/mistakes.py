@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from smplxpp.core.camera import Camera
 
@@ -20,20 +21,27 @@ class Sample:
 
     Attributes:
         camera: as calibrated, of the mask's size.
-        mask: (H, W) bool.
-        vertices: (V, 3) of the posed body. faces: (F, 3).
-        transl: (3,) the body's translation. pivot_shift: (3,) what a turn about the origin, instead of about the root
-            joint, moves the body by.
+        mask: the pixels that show the person.
+        vertices, faces: the posed body.
+        transl: the body's translation.
+        pivot_shift: what a turn about the origin, instead of about the root joint, moves the body by.
         neighbours: vertices of frames k later, by k.
     """
 
     camera: Camera
-    mask: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-    transl: np.ndarray
-    pivot_shift: np.ndarray
-    neighbours: Mapping[int, np.ndarray] = field(default_factory=dict)
+    mask: Bool[np.ndarray, "H W"]
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    transl: Float[np.ndarray, " 3"]
+    pivot_shift: Float[np.ndarray, " 3"]
+    neighbours: Mapping[int, Float[np.ndarray, "V 3"]] = field(default_factory=dict)
+
+
+CameraCorrection = Callable[[Camera], Camera]
+PoseChange = Callable[
+    [Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]], tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]
+]
+BodyCorrection = Callable[[Sample], Float[np.ndarray, "V 3"] | None]
 
 
 @dataclass(frozen=True)
@@ -47,12 +55,12 @@ class Mistake:
 
     words: str
     advice: str
-    camera: Callable[[Camera], Camera] = lambda camera: camera
-    body: Callable[[Sample], np.ndarray | None] = lambda sample: sample.vertices
+    camera: CameraCorrection = lambda camera: camera
+    body: BodyCorrection = lambda sample: sample.vertices
 
 
-def _posed(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Callable[[Camera], Camera]:
-    """A camera whose R and t are changed."""
+def _posed(change: PoseChange) -> CameraCorrection:
+    """Make the correction that changes a camera's R and t."""
 
     def apply(camera: Camera) -> Camera:
         pose = np.eye(4)
@@ -62,33 +70,53 @@ def _posed(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarr
     return apply
 
 
-def _with_K(change: Callable[[Camera], np.ndarray]) -> Callable[[Camera], Camera]:
+def _with_K(change: Callable[[Camera], Float[np.ndarray, "3 3"]]) -> CameraCorrection:
     return lambda camera: replace(camera, K=change(camera))
 
 
-def _swapped_K(camera: Camera) -> np.ndarray:
+def _swapped_K(camera: Camera) -> Float[np.ndarray, "3 3"]:
     K = camera.K.copy()
     K[[0, 1], [0, 1]] = camera.K[[1, 0], [1, 0]]
     K[:2, 2] = camera.K[1::-1, 2]
     return K
 
 
-def _swapped_center(camera: Camera) -> np.ndarray:
+def _swapped_center(camera: Camera) -> Float[np.ndarray, "3 3"]:
     K = camera.K.copy()
     K[:2, 2] = camera.K[1::-1, 2]
     return K
 
 
-def _mirrored(camera: Camera) -> np.ndarray:
+def _mirrored(camera: Camera) -> Float[np.ndarray, "3 3"]:
     return np.array([[-1.0, 0, camera.width], [0, 1, 0], [0, 0, 1]]) @ camera.K
 
 
-def _turned_image(camera: Camera) -> np.ndarray:
+def _turned_image(camera: Camera) -> Float[np.ndarray, "3 3"]:
     return np.array([[-1.0, 0, camera.width], [0, -1.0, camera.height], [0, 0, 1]]) @ camera.K
 
 
-def _scaled_transl(scale: float) -> Callable[[Sample], np.ndarray]:
+def _scaled_transl(scale: float) -> BodyCorrection:
     return lambda sample: sample.vertices + (scale - 1.0) * sample.transl
+
+
+def _turned_body(rotation: Float[np.ndarray, "3 3"]) -> BodyCorrection:
+    return lambda sample: sample.vertices @ rotation.T
+
+
+def _later_body(frames: int) -> BodyCorrection:
+    return lambda sample: sample.neighbours.get(frames)
+
+
+def _signed_axes(signs: tuple[float, float, float]) -> CameraCorrection:
+    return _posed(lambda R, t: (np.diag(signs) @ R, np.diag(signs) @ t))
+
+
+def _scaled_T(scale: float) -> CameraCorrection:
+    return _posed(lambda R, t: (R, scale * t))
+
+
+def _scaled_K(scale: float) -> CameraCorrection:
+    return _with_K(lambda camera: np.diag([scale, scale, 1.0]) @ camera.K)
 
 
 _POSES = tuple(
@@ -101,7 +129,7 @@ _POSES = tuple(
     )
 )
 _AXES = tuple(
-    Mistake(words, advice, _posed(lambda R, t, signs=signs: (np.diag(signs) @ R, np.diag(signs) @ t)))
+    Mistake(words, advice, _signed_axes(signs))
     for words, advice, signs in (
         (
             "the camera looks along -z (OpenGL's and Blender's axes)",
@@ -116,7 +144,7 @@ _AXES = tuple(
     )
 )
 _UPS = tuple(
-    Mistake(words, advice, body=lambda sample, rotation=rotation: sample.vertices @ rotation.T)
+    Mistake(words, advice, body=_turned_body(rotation))
     for words, advice, rotation in (
         ("the parameters are in a world with z up", "convert them: `smplxpp params convert --up z`", _Y_UP_FROM_Z_UP),
         ("the cameras are in a world with z up", "turn the cameras' world so that y is up", _Y_UP_FROM_Z_UP.T),
@@ -133,7 +161,7 @@ SINGLE: tuple[Mistake, ...] = (
     *_UPS,
     Mistake("T has the wrong sign", "negate T", _posed(lambda R, t: (R, -t))),
     *(
-        Mistake(f"T is in {unit}", "write T in metres", _posed(lambda R, t, scale=scale: (R, scale * t)))
+        Mistake(f"T is in {unit}", "write T in metres", _scaled_T(scale))
         for unit, scale in (("millimetres", 1e-3), ("centimetres", 1e-2), ("kilometres", 1e3))
     ),
     *(
@@ -146,7 +174,7 @@ SINGLE: tuple[Mistake, ...] = (
         Mistake(
             f"K is of images {size} as large",
             "give K for the size of the images",
-            _with_K(lambda camera, scale=scale: np.diag([scale, scale, 1.0]) @ camera.K),
+            _scaled_K(scale),
         )
         for size, scale in (("twice", 0.5), ("four times", 0.25), ("half", 2.0), ("a quarter", 4.0))
     ),
@@ -161,7 +189,7 @@ SINGLE: tuple[Mistake, ...] = (
 
 
 def _both(*mistakes: Mistake) -> Mistake:
-    """Corrections one after the other; at most one of them is of the body."""
+    """Join corrections, one after the other; at most one of them is of the body."""
 
     def camera(original: Camera) -> Camera:
         for mistake in mistakes:
@@ -181,13 +209,13 @@ COMBINED: tuple[Mistake, ...] = (
 
 
 def shifts(samples: Sequence[Sample]) -> tuple[Mistake, ...]:
-    """Images that show another frame's pose, as far as the samples know their neighbours."""
+    """Return the mistakes of images that show another frame's pose, as far as the samples know their neighbours."""
     known = {k for sample in samples for k in sample.neighbours}
     return tuple(
         Mistake(
             f"the images show the pose {abs(k)} frame{'s' if abs(k) > 1 else ''} {'later' if k > 0 else 'earlier'}",
             "number images and parameters by one clock",
-            body=lambda sample, k=k: sample.neighbours.get(k),
+            body=_later_body(k),
         )
         for k in sorted(known, key=lambda k: (abs(k), k))
     )

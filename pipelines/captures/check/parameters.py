@@ -27,7 +27,7 @@ _UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (100.0, "hectometres"))
 
 
 def read_parameters(capture: Capture) -> dict[int, BodyParams]:
-    """The parameters of every frame whose parameters can be read."""
+    """Read the parameters of every frame whose parameters can be read."""
     found = {}
     for frame in capture.frames:
         try:
@@ -40,7 +40,7 @@ def read_parameters(capture: Capture) -> dict[int, BodyParams]:
 
 
 def parameter_findings(capture: Capture, params: dict[int, BodyParams], body: BodyModel) -> list[Finding]:
-    """Shapes, expressions and angles out of range, other units, jumps."""
+    """Find shapes, expressions and angles out of range, other units, jumps."""
     found: list[Finding] = []
     for frame, p in params.items():
         found += _out_of_range(frame, p, body)

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 from scipy import ndimage
 
-from pipelines.captures.check.calibration import spread
 from pipelines.captures.check.check import CaptureCheck
 from pipelines.captures.check.silhouettes import body_silhouette
 from pipelines.captures.check.views import OPAQUE, ViewCheck
 from pipelines.figures import caption, contact_sheet, row
 from smplxpp.core.errors import InputError
+from smplxpp.core.spread import spread
 
 BODY_COLOR, MASK_COLOR = (255, 60, 140), (0, 210, 255)
 _CELL_HEIGHT, _CAPTION_WIDTH = 300, 190
 _MOST_CAMERAS, _MOST_FRAMES = 24, 4
 
 
-def draw_strips(check: CaptureCheck) -> dict[str, np.ndarray]:
-    """For each camera a few frames beside each other, (H, W, 3) uint8; of many cameras some, evenly spread."""
+def draw_strips(check: CaptureCheck) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
+    """Draw for each camera a few frames beside each other; of many cameras some, evenly spread."""
     frames = spread(check.frames, _MOST_FRAMES)
     known = {(view.camera, view.frame): view for view in check.views}
     strips = {}
@@ -32,19 +33,19 @@ def draw_strips(check: CaptureCheck) -> dict[str, np.ndarray]:
     return strips
 
 
-def contact_sheet_of(strips: dict[str, np.ndarray]) -> np.ndarray:
-    """All strips in one picture, several beside each other where there are many."""
+def contact_sheet_of(strips: dict[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "H W 3"]:
+    """Put all strips into one picture, several beside each other where there are many."""
     return contact_sheet(list(strips.values()), columns=max(1, round(len(strips) ** 0.5 / 2)), gap=8)
 
 
-def _widened(cell: np.ndarray) -> np.ndarray:
-    """On white, wide enough for the caption."""
+def _widened(cell: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H w 3"]:
+    """Put a cell on white, wide enough for its caption."""
     missing = max(0, _CAPTION_WIDTH - cell.shape[1])
     return np.pad(cell, ((0, 0), (missing // 2, missing - missing // 2), (0, 0)), constant_values=255)
 
 
-def _cell(check: CaptureCheck, camera: str, frame: int) -> np.ndarray:
-    """One view at the sheet's height."""
+def _cell(check: CaptureCheck, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw one view with both outlines at the sheet's height."""
     small, full = check.small, check.small.cameras[camera]
     try:
         image = np.array(small.image(camera, frame))

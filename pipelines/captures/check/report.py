@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.captures.check.calibration import spread
 from pipelines.captures.check.check import CaptureCheck
 from pipelines.captures.check.findings import AREAS, grouped
 from pipelines.captures.check.pictures import BODY_COLOR, MASK_COLOR, contact_sheet_of, draw_strips
@@ -18,12 +17,13 @@ from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Sectio
 from pipelines.runs.digests import versions
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.json_values import jsonable
+from smplxpp.core.spread import spread
 
-SHOWN_MESSAGES = 12
+SHOWN_MESSAGES, SHOWN_FRAMES = 12, 200
 
 
 def check_as_dict(check: CaptureCheck) -> dict[str, Any]:
-    """Everything as JSON values."""
+    """Return everything that was found as JSON values."""
     capture = check.capture
     images, masks = capture.presence(), capture.presence("mask")
     fits, splits = check.cameras(), capture.splits
@@ -136,10 +136,10 @@ def _frame_section(check: CaptureCheck) -> Section:
     fits = check.frame_fits()
     rows = tuple(
         (frame, fit.views, 100 * fit.outside, 100 * fit.worst, fit.iou, fit.bad, fit.verdict)
-        for frame, fit in (fits.items() if len(fits) <= 200 else spread(list(fits.items()), 200))
+        for frame, fit in spread(list(fits.items()), SHOWN_FRAMES)
     )
     header = ("frame", "views", "outside, median %", "outside, worst %", "overlap", "bad views", "verdict")
-    curves = ()
+    curves: tuple[Curve, ...] = ()
     if len(fits) > 1:
         numbers = np.array(list(fits))
         lines = {

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from smplxpp.core.camera import Camera
 from smplxpp.raster import rasterize_triangles
@@ -53,17 +54,19 @@ class FitSummary:
 
     @property
     def verdict(self) -> Verdict:
-        """As of one view with these medians."""
+        """What the figures of one view with these medians would say."""
         return SilhouetteFit(self.outside, self.iou).verdict
 
 
-def body_silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: pixels whose centres the body covers."""
+def body_silhouette(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], camera: Camera
+) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels whose centres the body covers."""
     return rasterize_triangles(vertices, faces, camera, threads=1).mask
 
 
-def compare_silhouettes(body: np.ndarray, mask: np.ndarray) -> SilhouetteFit | None:
-    """Both (H, W) bool; None where neither shows anything worth speaking of."""
+def compare_silhouettes(body: Bool[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]) -> SilhouetteFit | None:
+    """Hold the body against the mask; None where neither shows anything worth speaking of."""
     least = MIN_SHARE * mask.size
     covered, shown = int(body.sum()), int(mask.sum())
     if covered < least:
@@ -73,7 +76,7 @@ def compare_silhouettes(body: np.ndarray, mask: np.ndarray) -> SilhouetteFit | N
 
 
 def summary(fits: Iterable[SilhouetteFit]) -> FitSummary | None:
-    """Of several views; None for none."""
+    """Summarise the figures of several views; None for none."""
     figures = np.array([(fit.outside, fit.iou, fit.verdict == "bad") for fit in fits], dtype=np.float64)
     if not len(figures):
         return None

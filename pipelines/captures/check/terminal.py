@@ -73,7 +73,7 @@ def _camera_table(content: dict) -> Table:
 
 
 def _frame_table(content: dict) -> Table:
-    """The frames that do not fit well, worst first."""
+    """List the frames that do not fit well, worst first."""
     table = _table(("frame",), ("bad views", "outside", "worst", "overlap"), ("fit",))
     doubtful = [(frame, fit) for frame, fit in content["frame_fits"].items() if fit["verdict"] != "good"]
     doubtful.sort(key=lambda item: -item[1]["outside"])

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 from scipy import ndimage
 
-from pipelines.captures.check.findings import Finding, of_unreadable
+from pipelines.captures.check.findings import Finding, unreadable_finding
 from pipelines.captures.check.silhouettes import MIN_SHARE, SilhouetteFit, body_silhouette, compare_silhouettes
 from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
@@ -41,7 +41,7 @@ class ViewCheck:
     Attributes:
         mask_share: share of the image that the mask covers; None without a usable mask.
         fit: None without a body, without a usable mask, or where there is nobody.
-        plain: (3,) the plain colour that a photograph is on, else None.
+        plain: the plain colour that a photograph is on, else None.
     """
 
     camera: str
@@ -52,25 +52,30 @@ class ViewCheck:
     plain: tuple[int, int, int] | None = None
 
 
-def check_view(capture: Capture, camera: str, frame: int, body: tuple[np.ndarray, np.ndarray] | None) -> ViewCheck:
+def check_view(
+    capture: Capture,
+    camera: str,
+    frame: int,
+    body: tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]] | None,
+) -> ViewCheck:
     """Open everything of one view.
 
     Args:
         capture: at the size at which silhouettes are compared.
         camera, frame: with an image.
-        body: vertices (V, 3) of the posed body and its faces (F, 3); None where there are no parameters.
+        body: vertices and faces of the posed body; None where there are no parameters.
     """
     reader = capture.reader(camera)
     findings: list[Finding] = []
 
-    def opened(kind: str, read: Callable[[Path], Any]) -> Any:
+    def opened(kind: str, read: Callable[[Path], np.ndarray]) -> np.ndarray | None:
         path = capture.file(camera, frame, kind)
         if path is None:
             return None
         try:
             return read(path)
         except InputError as error:
-            findings.append(of_unreadable(error, camera, frame))
+            findings.append(unreadable_finding(error, camera, frame))
             return None
 
     image = opened("image", reader.color)
@@ -102,8 +107,8 @@ def check_view(capture: Capture, camera: str, frame: int, body: tuple[np.ndarray
     return ViewCheck(camera, frame, tuple(findings), float(mask.mean()), fit, plain)
 
 
-def _wrong_mask(mask: np.ndarray, silhouette: np.ndarray | None) -> tuple[str, str] | None:
-    """Kind and words of a mask that cannot be one of the person."""
+def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W"] | None) -> tuple[str, str] | None:
+    """Return kind and words of a mask that cannot be one of the person, else None."""
     share = float(mask.mean())
     if share > _FULL:
         return "mask-full", f"covers {share:.1%} of the image"
@@ -112,8 +117,9 @@ def _wrong_mask(mask: np.ndarray, silhouette: np.ndarray | None) -> tuple[str, s
         # Without a body nobody can say whether the camera sees the person.
         seen = visible is not None and visible > 2 * MIN_SHARE
         return ("mask-empty", f"is empty, but the body covers {visible:.1%} of the image") if seen else None
-    if silhouette is not None and visible > MIN_SHARE:
+    if silhouette is not None and visible is not None and visible > MIN_SHARE:
         fit, inverse = compare_silhouettes(silhouette, mask), compare_silhouettes(silhouette, ~mask)
+        assert fit is not None and inverse is not None  # the body is large enough to say something
         inverted = fit.outside > _INVERTED_OUTSIDE and inverse.iou > _INVERTED_IOU
     else:
         rim = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
@@ -121,8 +127,10 @@ def _wrong_mask(mask: np.ndarray, silhouette: np.ndarray | None) -> tuple[str, s
     return ("mask-inverted", "covers the background, not the person") if inverted else None
 
 
-def _against_background(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray) -> Iterator[tuple[str, str]]:
-    """Kind and words of an image that is not on the colour (3,) of 255 outside its mask."""
+def _against_background(
+    image: UInt8[np.ndarray, "H W 3"], alpha: UInt8[np.ndarray, "H W"], colour: Float[np.ndarray, " 3"]
+) -> Iterator[tuple[str, str]]:
+    """Yield kind and words where an image is not on the colour (of 255) outside its mask."""
     outside = _outside(image, alpha)
     if not len(outside):
         return
@@ -137,14 +145,15 @@ def _against_background(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray
         yield "mask-mismatch", f"shows something outside its mask, {shown / max(area, 1):.0%} of the mask's area"
 
 
-def _outside(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(N, 3) int16 colours well outside the mask, of every `_STEP`-th pixel each way."""
+def _outside(image: UInt8[np.ndarray, "H W 3"], alpha: UInt8[np.ndarray, "H W"]) -> Int16[np.ndarray, "N 3"]:
+    """Return the colours well outside the mask, of every `_STEP`-th pixel each way."""
     rows = ndimage.maximum_filter1d(alpha[::_STEP], 1 + 2 * _EDGE, axis=1)[:, ::_STEP]
     near = ndimage.maximum_filter1d(rows, 1 + 2 * (_EDGE // _STEP + 1), axis=0)
     return image[::_STEP, ::_STEP][near == 0].astype(np.int16)
 
 
-def _plain_colour(image: np.ndarray, alpha: np.ndarray) -> tuple[int, int, int] | None:
+def _plain_colour(image: UInt8[np.ndarray, "H W 3"], alpha: UInt8[np.ndarray, "H W"]) -> tuple[int, int, int] | None:
+    """Return the one colour that lies outside the mask, None where there are several."""
     outside = _outside(image, alpha)
     if len(outside) * _STEP**2 < MIN_SHARE * alpha.size:
         return None

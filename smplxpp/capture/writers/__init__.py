@@ -1,1 +1,1 @@
-"""Files of a capture, written: cameras, images, arrays."""
+"""Files of a capture, written: description, cameras, images, arrays."""

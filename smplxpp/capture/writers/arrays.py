@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float
 
 from smplxpp.core.array_file import write_arrays
+from smplxpp.core.atomic import atomic_path
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 # Coordinates of truth meshes are rounded to this many metres (0.06 mm): they compress better.
 QUANTUM = 2.0**-14
 
 
-def rounded(vertices: Float64[np.ndarray, "V 3"]) -> Float64[np.ndarray, "V 3"]:
-    """Coordinates as they are stored: multiples of `QUANTUM`."""
+def rounded(vertices: Float[np.ndarray, "*V 3"]) -> Float[np.ndarray, "*V 3"]:
+    """Return coordinates as they are stored: multiples of `QUANTUM`."""
     return np.round(vertices / QUANTUM) * QUANTUM
 
 
 def save_compact(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write an npz file packed with LZMA, columns stored one after the other: two thirds of deflate's size."""
+    """Write an npz file packed with LZMA, columns one after the other: two thirds of deflate; np.load reads it."""
     write_arrays(path, {name: np.asfortranarray(value) for name, value in arrays.items()}, packing=zipfile.ZIP_LZMA)
+
+
+def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
+    """Write parameters so that row n is frame n; NaN where a frame has none, which spoils that frame alone."""
+    joined = BodyParams.concatenate(list(params.values()))
+    rows = np.array(list(params))
+    arrays: dict[str, np.ndarray] = {"flat_hand_mean": np.array(joined.flat_hand_mean, dtype=bool)}
+    for name in ARRAY_NAMES:
+        values = getattr(joined, name)
+        arrays[name] = np.full((rows.max() + 1, values.shape[1]), np.nan)
+        arrays[name][rows] = values
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # numpy: the names might be `allow_pickle`

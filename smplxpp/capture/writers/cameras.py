@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,31 +20,38 @@ _CONVENTION = (
     "OpenCV: x_cam = R @ x_world + T, x right, y down, z forward; u = fx*x/z + cx in [0,w], pixel (i,j) has its centre "
     "at (j+0.5, i+0.5); no distortion; world y up, metres"
 )
-
-
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 
 
 def write_cameras_json(path: Path, rig: list[RigCamera]) -> None:
-    """Cameras in OpenCV's form, with kind and split."""
+    """Write cameras in OpenCV's form, with kind and split."""
     entries = [
-        {
-            "name": item.camera.name,
-            "w": item.camera.width,
-            "h": item.camera.height,
-            "K": item.camera.K.tolist(),
-            "R": item.camera.cam_from_world[:3, :3].tolist(),
-            "T": item.camera.cam_from_world[:3, 3].tolist(),
-            "kind": item.kind,
-            "split": "novel" if item.novel else "train",
-        }
+        {**camera_entry(item.camera, item.camera.name), "kind": item.kind, "split": "novel" if item.novel else "train"}
         for item in rig
     ]
     atomic_write_text(path, json.dumps({"convention": _CONVENTION, "cameras": entries}, indent=1) + "\n")
 
 
+def write_plain_cameras_json(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write cameras by name in OpenCV's form, and nothing else about them."""
+    entries = [camera_entry(camera, name) for name, camera in cameras.items()]
+    atomic_write_text(path, json.dumps({"cameras": entries}, indent=1) + "\n")
+
+
+def camera_entry(camera: Camera, name: str) -> dict[str, object]:
+    """Return one camera as JSON values."""
+    return {
+        "name": name,
+        "w": camera.width,
+        "h": camera.height,
+        "K": camera.K.tolist(),
+        "R": camera.cam_from_world[:3, :3].tolist(),
+        "T": camera.cam_from_world[:3, 3].tolist(),
+    }
+
+
 def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
-    """ActorsHQ's calibration: camera-to-world, intrinsics in units of the image's size."""
+    """Write ActorsHQ's calibration: camera-to-world, intrinsics in units of the image's size."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_CSV_FIELDS)
@@ -58,7 +66,7 @@ def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
 
 
 def write_actorshq_scene(folder: Path, boxes: Float[np.ndarray, "T 2 3"], fps: float) -> None:
-    """`aabbs.csv` and `scene.json` beside the scale folders; `boxes` (T, 2, 3) corners of each frame's bounds."""
+    """Write `aabbs.csv` and `scene.json` beside the scale folders; `boxes` are the corners of each frame's bounds."""
     corners = [f"aabb_{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
     rows = [",".join(["frame_number", *corners])]
     rows += [",".join([str(frame), *(f"{value:.6g}" for value in box.ravel())]) for frame, box in enumerate(boxes)]

@@ -13,19 +13,33 @@ from PIL import Image
 
 from smplxpp.core.atomic import atomic_write_bytes
 
+# kind of file -> folder, and what stands before the frame's number in a file's name.
+VIEW_FOLDERS = {
+    "image": ("rgbs", "rgb"),
+    "mask": ("masks", "mask"),
+    "label": ("labels", "label"),
+    "normal": ("normals", "normal"),
+}
+JPEG_SUFFIXES = (".jpg", ".jpeg")
 # Components of normals keep 12 bits of 16: the rest would be noise that does not compress.
 _NORMAL_STEP = 16
 
 
+def view_path(root: Path, kind: str, camera: str, frame: int, suffix: str) -> Path:
+    """Return the place of a view's file: `kind` is a key of `VIEW_FOLDERS`, `suffix` starts with a dot."""
+    folder, tag = VIEW_FOLDERS[kind]
+    return root / folder / camera / f"{camera}_{tag}{frame:06d}{suffix}"
+
+
 def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], *, quality: int) -> None:
-    """Write an sRGB image."""
+    """Write sRGB as a small JPEG file."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=quality, optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
 
 
 def write_gray_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:
-    """Write a mask or a label map."""
+    """Write a mask or labels as an 8-bit PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
@@ -38,8 +52,26 @@ def write_normal_png(path: Path, normals: Float[np.ndarray, "H W 3"]) -> None:
     atomic_write_bytes(path, png16(value.astype(np.uint16)))
 
 
+def normal_codes(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
+    """Return all 16 bits of unit normals, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
+    codes = np.clip(np.round((normals + 1.0) * 32767.5), 1, 65535)
+    return np.where(normals.any(axis=2, keepdims=True), codes, 0).astype(np.uint16)
+
+
+def encoded_image(image: UInt8[np.ndarray, "H W *D"] | UInt16[np.ndarray, "H W 3"], suffix: str, quality: int) -> bytes:
+    """Return a file's bytes: a JPEG without subsampling where the suffix is one's, else a PNG of 8 or 16 bits."""
+    if image.dtype == np.uint16:
+        return png16(image)
+    buffer = io.BytesIO()
+    if suffix in JPEG_SUFFIXES:
+        Image.fromarray(image).save(buffer, "JPEG", quality=quality, subsampling=0)
+    else:
+        Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 def png16(image: UInt16[np.ndarray, "H W 3"]) -> bytes:
-    """Encode a 16-bit RGB PNG (Pillow writes none); every row has the `Up` filter."""
+    """Return a 16-bit RGB PNG's bytes (Pillow writes none); every row with the `Up` filter."""
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(height, -1)
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
