@@ -22,7 +22,7 @@ import tyro
 
 from avatar.gaussians.quaternions import matrix_from_quat
 from avatar.render import rasterize
-from avatar.render.native import STAGES, View, Workspace
+from avatar.render.native import STAGES, CameraCall, Workspace
 from avatar.render.reference import rasterize_reference
 from avatar.render.settings import RasterSettings
 from benchmarks.gaussian_scene import BenchmarkScene, body_scene
@@ -82,7 +82,9 @@ class Job:
     def __init__(self, scene: BenchmarkScene, level: str | None = None):
         size = (scene.height, scene.width)
         self.scene, self.workspace = scene, Workspace(level)
-        self.view = View(scene.gaussians, (scene.viewmat, scene.K, None), RasterSettings(scene.width, scene.height))
+        self.view = CameraCall(
+            scene.gaussians, (scene.viewmat, scene.K, None), RasterSettings(scene.width, scene.height)
+        )
         count, channels = scene.features.shape
         self.image = torch.empty(*size, channels)
         self.outputs = (self.image, torch.empty(*size, 1), torch.empty(count, 2), torch.empty(count, 2))

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.baselines.uv_atlas import cylinder_atlas
 from avatar.gaussians.binding import BoundGaussians
-from avatar.models.networks.layers import ConvLayer
+from avatar.models.networks.stylegan2_layers import ConvLayer
 from avatar.rig.rig import Motion, Rig
 from smplxpp.core.validation import require_at_least
 

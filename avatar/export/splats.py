@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from avatar.export.ply_header import PlyLayout, read_ply_layout
@@ -28,7 +28,7 @@ _REST_COUNTS = (0, 9, 24, 45)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Splats:
-    """N Gaussians in the world as the file holds them; float32 arrays.
+    """N Gaussians in the world as the file holds them; the arrays are kept as float32.
 
     Attributes:
         means: metres.
@@ -43,13 +43,13 @@ class Splats:
         InputError: arrays that do not fit each other, NaN or infinity, a quaternion of length 0.
     """
 
-    means: Float32[np.ndarray, "N 3"]
-    normals: Float32[np.ndarray, "N 3"]
-    f_dc: Float32[np.ndarray, "N 3"]
-    f_rest: Float32[np.ndarray, "N K 3"]
-    opacity_logits: Float32[np.ndarray, " N"]
-    log_scales: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
+    means: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
+    f_dc: Float[np.ndarray, "N 3"]
+    f_rest: Float[np.ndarray, "N K 3"]
+    opacity_logits: Float[np.ndarray, " N"]
+    log_scales: Float[np.ndarray, "N 3"]
+    quats: Float[np.ndarray, "N 4"]
 
     def __post_init__(self) -> None:
         for f in fields(self):

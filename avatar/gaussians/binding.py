@@ -85,7 +85,7 @@ class BoundGaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the harmonics, 0 to 3."""
+        """The degree of the harmonics, 0 to 3."""
         return int((self.sh.shape[1] + 1) ** 0.5) - 1
 
     @property
@@ -117,7 +117,7 @@ class BoundGaussians:
         return self._with({name: value[index] for name, value in self.tensors.items()})
 
     def _with(self, tensors: Mapping[str, Tensor]) -> BoundGaussians:
-        """Gaussians of the same mesh with these tensors, all of them."""
+        """Make Gaussians of the same mesh with these tensors, all of them."""
         return BoundGaussians(**tensors, face_count=self.face_count, topology=self.topology)
 
     def check_topology(self, faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"], subject: str = "mesh") -> None:
@@ -151,7 +151,7 @@ class WorldGaussians:
 
 
 def topology_digest(faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"]) -> str:
-    """SHA-256 of the faces as little-endian int64."""
+    """Return the SHA-256 of the faces as little-endian int64."""
     array = faces.cpu().numpy() if isinstance(faces, Tensor) else np.asarray(faces)
     return hashlib.sha256(np.ascontiguousarray(array, dtype="<i8").tobytes()).hexdigest()
 
@@ -159,7 +159,7 @@ def topology_digest(faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"]) -> str:
 def world_from_local(
     bound: BoundGaussians, vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]
 ) -> WorldGaussians:
-    """Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
+    """Put Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
 
     Args:
         bound: the local attributes.
@@ -170,7 +170,7 @@ def world_from_local(
 
 
 def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """Gaussians in the world, with gradients to their attributes and to the vertices.
+    """Put Gaussians into the world, with gradients to their attributes and to the vertices.
 
     `u_w = u v1 + v v2 + (1 - u - v) v3 + R (gamma [1, 0, 0] + du)`, `r_w = R r`, `s_w = e s` with
     `s = [THICKNESS, exp, exp]`, and `normal = R r [1, 0, 0]` (TaoAvatar; offsets are metres, scales are edges).
@@ -196,7 +196,7 @@ def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGau
 
 
 def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """`world_from_frames` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
+    """Do as `world_from_frames` in plain torch: the native kernel's oracle, and the way for other types and devices."""
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
     weights = corner_weights(bound.barycentric)

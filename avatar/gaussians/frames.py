@@ -36,12 +36,12 @@ class TriangleFrames:
 
     @property
     def face_count(self) -> int:
-        """Number of triangles, F."""
+        """The number of triangles, F."""
         return self.lengths.shape[-1]
 
 
 def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]) -> TriangleFrames:
-    """Frames of triangles, differentiable in the vertices.
+    """Return the frames of triangles, differentiable in the vertices.
 
     `n = normalize((v2 - v1) x (v3 - v1))`, `q = normalize((v2 + v3) / 2 - v1)`, `R = [n, q, n x q]`, and e the mean
     edge length: TaoAvatar's equations with an outward unit normal for counter-clockwise faces (the printed one points
@@ -93,7 +93,7 @@ def triangle_frames_reference(
     Float[Tensor, "*B F"],
     Int64[Tensor, ""],
 ]:
-    """The tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
+    """Return the tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
 
     The oracle of the native kernel, and the way for other types and devices.
     """

@@ -61,7 +61,7 @@ class SamplingConfig:
 
 
 def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> BoundGaussians:
-    """Gaussians on the faces of a template, float32, lying flat, coloured as it is.
+    """Place Gaussians on the faces of a template, float32, lying flat, coloured as it is.
 
     Every region (head, rest) gets its count in proportion to area or faces, hidden faces less. Samples are stratified
     along the faces' order and follow a low-discrepancy sequence inside each face. Tangential scales start at

@@ -135,7 +135,7 @@ def view_colors_reference(
     means: Float[Tensor, "N 3"],
     camera_positions: Float[Tensor, "C 3"],
 ) -> Float[Tensor, "C N 3"]:
-    """`view_colors` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
+    """Do as `view_colors` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
     directions = torch.nn.functional.normalize(means - camera_positions[:, None], dim=-1)
     rotations = frames.rotations[bound.face_index]
     # R^T d: the sum runs over rows.

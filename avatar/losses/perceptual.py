@@ -136,7 +136,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
         return total
 
     def features(self, x: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) in [-1, 1] -> activations of the five layers."""
+        """Return the activations of the five layers for images (B, 3, H, W) in [-1, 1]."""
         conv1, conv2, conv3, conv4, conv5 = self.convs
         first = F.relu(self._reduced(conv1((x - self.shift) / self.scale)))
         second = F.relu(conv2(self._reduced(F.max_pool2d(first, 3, stride=1))))

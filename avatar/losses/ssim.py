@@ -79,7 +79,7 @@ def ssim_reference(
     mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None,
     padding: str = "zero",
 ) -> Float[Tensor, ""]:
-    """`ssim` in plain torch, in the images' own precision and on their device."""
+    """Do as `ssim` in plain torch, in the images' own precision and on their device."""
     value = ssim_map_reference(x, y, padding=padding)
     check_images(x, y, mask)
     return mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
@@ -88,7 +88,7 @@ def ssim_reference(
 def ssim_map_reference(
     x: Float[Tensor, "*B H W C"], y: Float[Tensor, "*B H W C"], *, padding: str = "zero"
 ) -> Float[Tensor, "*B h w C"]:
-    """`ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
+    """Do as `ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
     batched = x.dim() == 4
     x, y, _ = _checked(x, y, None, padding)
     C = x.shape[-1]
@@ -212,7 +212,7 @@ def _inner(value: Tensor, border: int) -> Tensor:
 
 
 def _checked(x: Tensor, y: Tensor, mask: Tensor | None, padding: str) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Contiguous images with a batch axis, and the mask in their type."""
+    """Return contiguous images with a batch axis, and the mask in their type."""
     if padding not in _BORDER:
         raise InputError("padding of SSIM", expected="'zero' or 'valid'", received=repr(padding))
     check_images(x, y, mask, least=1 if padding == "zero" else WINDOW)

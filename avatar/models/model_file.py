@@ -13,8 +13,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
+from avatar.models.config_dict import config_from_dict, config_to_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.networks.config import config_from_dict, config_to_dict
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig

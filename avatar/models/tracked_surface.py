@@ -71,7 +71,7 @@ class TrackedAvatar(nn.Module):
         self.gaussians = LearnedGaussians(gaussians)
         self.cage = ControlCage(rig, count)
         self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
-        """(K, 3) metres, of the frame that is being followed."""
+        """Displacements (K, 3), metres, in the frame that is being followed."""
         self.to(rig.device)
 
     def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:

@@ -114,7 +114,7 @@ def rasterize(
 
 
 def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[..., tuple[Tensor, Tensor, RasterMeta]]:
-    """The backend's function, imported when it is first needed."""
+    """Return the backend's function, imported when it is first needed."""
     if name is not None and name not in BACKENDS:
         raise InputError("backend", expected=f"None or one of {', '.join(BACKENDS)}", received=repr(name))
     if name == "reference":
@@ -145,7 +145,7 @@ def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[...
 
 
 def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Features with the Gaussians' z as one more channel, and the background with 0 there."""
+    """Return features with the Gaussians' z as one more channel, and the background with 0 there."""
     features, depths = tensors["features"], camera_depths(tensors["means"], tensors["viewmats"])
     cameras = len(depths)
     if cameras == 1 and features.ndim == 2:
@@ -158,7 +158,7 @@ def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -
 def _draw_nothing(
     tensors: dict[str, Tensor], background: Tensor | None, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, RasterMeta]:
-    """The background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
+    """Return the background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
     cameras, count, features = len(tensors["viewmats"]), len(tensors["means"]), tensors["features"]
     nothing = torch.stack([tensor.sum() for tensor in tensors.values()]).sum() * 0
     image = nothing.expand(cameras, settings.height, settings.width, features.shape[-1])
@@ -170,6 +170,6 @@ def _draw_nothing(
 
 
 def _divide(blended: Tensor, alpha: Tensor) -> Tensor:
-    """`blended / alpha`, and 0 with gradient 0 where alpha is 0."""
+    """Return `blended / alpha`, and 0 with gradient 0 where alpha is 0."""
     seen = alpha > 0
     return torch.where(seen, blended / torch.where(seen, alpha, 1.0), 0.0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.render.memory import pooled_empty
-from avatar.render.native import View, Workspace
+from avatar.render.native import CameraCall, Workspace
 from avatar.render.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
 
@@ -135,11 +135,11 @@ class _Rasterize(torch.autograd.Function):
         return (*grads, grad_viewmats, None, grad_background, None)
 
 
-def _views(inputs: _Inputs, settings: RasterSettings) -> list[View]:
+def _views(inputs: _Inputs, settings: RasterSettings) -> list[CameraCall]:
     """Return what the library needs to know of each camera."""
     means, quats, scales, opacities, features, viewmats, Ks, background = inputs
     return [
-        View(
+        CameraCall(
             (means, quats, scales, opacities, features if features.ndim == 2 else features[camera]),
             (viewmats[camera], Ks[camera], None if background is None else background[camera]),
             settings,

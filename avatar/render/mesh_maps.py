@@ -143,7 +143,7 @@ def _tiny(values: Tensor) -> float:
 
 
 def _view(vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Face ids, barycentrics and depth of one camera, the last two with gradients to the vertices."""
+    """Return face ids, barycentrics and depth of one camera, the last two with gradients to the vertices."""
     face_id = torch.from_numpy(seen.face_id).to(vertices.device)
     if is_native(vertices):
         return face_id, *BarycentricFunction.apply(vertices, faces, seen, camera)

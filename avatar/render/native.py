@@ -38,8 +38,8 @@ class _Gradients(ctypes.Structure):
     _fields_ += [("accumulate", ctypes.c_int32), ("accumulate_features", ctypes.c_int32)]
 
 
-class View:
-    """One camera's call: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
+class CameraCall:
+    """The call of the library for one camera: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Workspace:
         if getattr(self, "_handle", None):
             _POOL.give_back(self._library, self._handle)
 
-    def forward(self, view: View, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
+    def forward(self, view: CameraCall, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
         """Write image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N)."""
         with self._lock:
             failed = self._library.gaussian_forward(
@@ -85,7 +85,7 @@ class Workspace:
 
     def backward(
         self,
-        view: View,
+        view: CameraCall,
         radii: Tensor,
         grad_image: Tensor | None,
         grad_alpha: Tensor | None,

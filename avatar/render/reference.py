@@ -119,7 +119,7 @@ def _project(
 
 
 def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -> Tensor:
-    """(M, 2, 3) derivative of the pixel by the point in camera space, at `centers` clamped to a widened frustum."""
+    """Return the (M, 2, 3) derivative of pixels by points in camera space, at `centers` clamped to a wider frustum."""
     size = centers.new_tensor([settings.width, settings.height])
     focal, principal = K.diagonal()[:2], K[:2, 2]
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
@@ -152,7 +152,7 @@ def _render_view(
 def _blend_block(
     splats: _Splats, opacities: Tensor, features: Tensor, box: tuple[int, int, int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Blends a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
+    """Blend a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
     left, top, right, bottom = box
     low, high = splats.means2d.new_tensor([left, top]), splats.means2d.new_tensor([right, bottom])
     reaching = ((splats.means2d + splats.radii > low) & (splats.means2d - splats.radii < high)).all(-1)

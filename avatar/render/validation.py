@@ -101,7 +101,7 @@ def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
 
 
 def _check_shape(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | str, ...]) -> dict[str, int]:
-    """Sizes of the axes that `shape` names by a letter; the others must be as given."""
+    """Return the sizes of the axes that `shape` names by a letter; the others must be as given."""
     received = tuple(tensors[name].shape)
     if len(received) != len(shape) or any(
         not isinstance(want, str) and want != got for want, got in zip(shape, received, strict=True)
@@ -125,7 +125,7 @@ def _check_dtype_and_device(given: Mapping[str, Tensor]) -> None:
 
 
 def _suspects(values: Mapping[str, Tensor]) -> list[str]:
-    """Arguments that a quick look cannot clear.
+    """Return the arguments that a quick look cannot clear.
 
     A sum is finite unless a term is not (or it overflows, which the exact look then clears), and is several times
     cheaper than `isfinite`; minimum and maximum hand a NaN on.

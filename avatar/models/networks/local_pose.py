@@ -7,7 +7,7 @@ from jaxtyping import Bool
 
 from smplxpp.template.template import Template
 
-CARRIES = 0.05
+MIN_SKIN_WEIGHT = 0.05
 """Skin weight from which a joint carries a vertex."""
 BODY_JOINTS = 21
 """Joints in theta: 1 to 21 of the skeleton."""
@@ -23,7 +23,7 @@ def seen_joints(template: Template, steps: int) -> Bool[np.ndarray, "V 21"]:
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True
-    seen = template.weights.dense() > CARRIES
+    seen = template.weights.dense() > MIN_SKIN_WEIGHT
     for _ in range(steps):
         seen = seen @ near
     return seen[:, 1 : BODY_JOINTS + 1]

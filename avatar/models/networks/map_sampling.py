@@ -1,4 +1,4 @@
-"""Front and back maps of a body in its canonical pose: their cameras, and Gaussians looked up in them."""
+"""Gaussians looked up in the front and back maps of a body in its canonical pose."""
 
 from __future__ import annotations
 

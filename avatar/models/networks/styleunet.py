@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.models.networks.layers import (
+from avatar.models.networks.stylegan2_layers import (
     GAIN,
     SLOPE,
     ConvLayer,
@@ -28,7 +28,7 @@ from avatar.models.networks.layers import (
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
-STYLE_RATE = 0.01
+STYLE_LR_MULTIPLIER = 0.01
 """Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""
 
 
@@ -242,7 +242,8 @@ class StyleUNet(nn.Module):
         self.config = config
         self.register_buffer("style_seed", torch.ones(config.style_size), persistent=False)
         self.mapping = nn.ModuleList(
-            EqualizedLinear(config.style_size, config.style_size, rate=STYLE_RATE) for _ in range(config.style_layers)
+            EqualizedLinear(config.style_size, config.style_size, lr_multiplier=STYLE_LR_MULTIPLIER)
+            for _ in range(config.style_layers)
         )
         self.encoder = Encoder(config)
         self.merge = Merge(config)

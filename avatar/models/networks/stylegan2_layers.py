@@ -76,17 +76,17 @@ class FirFilter(nn.Module):
 class EqualizedLinear(nn.Module):
     """`y = r (W x / sqrt(fan in) + b)` with W ~ N(0, 1 / r^2): r is the layer's learning-rate multiplier."""
 
-    def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, rate: float = 1.0) -> None:
+    def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, lr_multiplier: float = 1.0) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs) / rate)
+        self.weight = nn.Parameter(torch.randn(outputs, inputs) / lr_multiplier)
         self.bias = nn.Parameter(torch.full((outputs,), bias))
-        self.rate = rate
+        self.lr_multiplier = lr_multiplier
         self.scale = 1.0 / math.sqrt(inputs)
 
     def forward(self, x: Float[Tensor, "*B I"]) -> Float[Tensor, "*B O"]:
         """Apply the layer."""
         y = F.linear(x * self.scale, self.weight, self.bias)
-        return y if self.rate == 1.0 else self.rate * y
+        return y if self.lr_multiplier == 1.0 else self.lr_multiplier * y
 
 
 class _EqualizedConv(nn.Module):
