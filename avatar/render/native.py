@@ -39,7 +39,7 @@ class _Gradients(ctypes.Structure):
 
 
 class CameraCall:
-    """The call of the library for one camera: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
+    """One camera's call: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
 
     def __init__(
         self,

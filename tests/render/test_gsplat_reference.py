@@ -27,7 +27,7 @@ from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import C0, coefficient_count, sh_basis, view_colors
 from avatar.render.gsplat_backend import SUPPORTED
 from avatar.render.map_frame import MapFrame
-from avatar.render.reference import rasterize_reference
+from avatar.render.reference import _project, rasterize_reference
 from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from smplxpp.core.camera import Camera
 from tests.gaussians.bound_scenes import random_bound, sphere
@@ -162,8 +162,6 @@ def _arguments(scene: Scene) -> tuple[Tensor | None, ...]:
 
 def _conic_difference(scene: Scene, camera: int, settings: RasterSettings, conics: Tensor) -> Tensor:
     """Largest difference between our conics of the visible Gaussians and `conics`, as a share of the largest entry."""
-    from avatar.render.reference import _project
-
     gaussians = (scene.means, scene.quats, scene.scales, scene.opacities)
     ours = _project(*gaussians, scene.viewmats[camera], scene.Ks[camera], settings)
     return ((ours.conics - conics[ours.index]).abs() / ours.conics.abs().amax(1, keepdim=True)).max()
