@@ -135,8 +135,8 @@ class ShiftTolerantLPIPS(PerceptualDistance):
             total = total + torch.einsum("c,bchw->b", weight, difference) / (f.shape[2] * f.shape[3])
         return total
 
-    def features(self, x: Tensor) -> list[Tensor]:
-        """Return the activations of the five layers for images (B, 3, H, W) in [-1, 1]."""
+    def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Return the activations of the five layers for images in [-1, 1]."""
         conv1, conv2, conv3, conv4, conv5 = self.convs
         first = F.relu(self._reduced(conv1((x - self.shift) / self.scale)))
         second = F.relu(conv2(self._reduced(F.max_pool2d(first, 3, stride=1))))
