@@ -20,9 +20,10 @@ from pathlib import Path
 import torch
 import tyro
 
+from avatar.gaussians.quaternions import matrix_from_quat
 from avatar.render import rasterize
-from avatar.render.native import STAGES, View, Workspace
-from avatar.render.reference import rasterize_reference, rotation_from_quat
+from avatar.render.native import STAGES, CameraCall, Workspace
+from avatar.render.reference import rasterize_reference
 from avatar.render.settings import RasterSettings
 from benchmarks.gaussian_scene import BenchmarkScene, body_scene
 from benchmarks.machine import store_results
@@ -81,7 +82,9 @@ class Job:
     def __init__(self, scene: BenchmarkScene, level: str | None = None):
         size = (scene.height, scene.width)
         self.scene, self.workspace = scene, Workspace(level)
-        self.view = View(scene.gaussians, (scene.viewmat, scene.K, None), RasterSettings(scene.width, scene.height))
+        self.view = CameraCall(
+            scene.gaussians, (scene.viewmat, scene.K, None), RasterSettings(scene.width, scene.height)
+        )
         count, channels = scene.features.shape
         self.image = torch.empty(*size, channels)
         self.outputs = (self.image, torch.empty(*size, 1), torch.empty(count, 2), torch.empty(count, 2))
@@ -280,7 +283,7 @@ def project_for_peer(scene: BenchmarkScene) -> dict[str, torch.Tensor]:
     z = centers[:, 2]
     focal = K.diagonal()[:2]
     J = torch.cat([torch.diag_embed(focal / z[:, None]), (-focal * centers[:, :2] / z[:, None] ** 2)[..., None]], -1)
-    half = J @ view[:3, :3] @ (rotation_from_quat(scene.quats) * scene.scales[:, None])
+    half = J @ view[:3, :3] @ (matrix_from_quat(scene.quats) * scene.scales[:, None])
     covariances = half @ half.mT + 0.3 * torch.eye(2)
     inverse = torch.linalg.inv(covariances)
     conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1)

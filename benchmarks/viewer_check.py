@@ -37,6 +37,7 @@ from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
+from avatar.losses.psnr import psnr_from_mse
 from avatar.render import rasterize
 from benchmarks.build import FIXTURE
 from benchmarks.machine import store_results
@@ -229,8 +230,8 @@ def compare(ours: np.ndarray, theirs: np.ndarray, alpha: np.ndarray) -> dict[str
     error = ours - theirs
     inside = error[alpha > 0.5]
     return {
-        "psnr_silhouette": round(-10.0 * float(np.log10((inside**2).mean())), 2),
-        "psnr_picture": round(-10.0 * float(np.log10((error**2).mean())), 2),
+        "psnr_silhouette": round(psnr_from_mse(float((inside**2).mean())), 2),
+        "psnr_picture": round(psnr_from_mse(float((error**2).mean())), 2),
         "mean_steps": round(255.0 * float(np.abs(inside).mean()), 2),
         "p99_steps": round(255.0 * float(np.quantile(np.abs(inside), 0.99)), 2),
     }

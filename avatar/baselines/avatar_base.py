@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, corner_weights, world_from_frames
@@ -28,27 +29,31 @@ class Baseline(nn.Module, ABC):
     """An avatar that learns from photographs alone (an `AvatarModel`).
 
     Attributes:
-        rig: of the template. gaussians: on it.
+        rig: that of the template. gaussians: those on it.
     """
 
     rig: Rig
     gaussians: LearnedGaussians
 
     @abstractmethod
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The avatar in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the avatar as cameras with these centres, metres, see it."""
 
     @abstractmethod
     def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
-        """What is learned beside the attributes of the Gaussians; `lr` is that of networks."""
+        """Return what is learned beside the attributes of the Gaussians; `lr` is that of networks."""
 
 
 class ResidualBaseline(Baseline):
     """`x = LBS(R (u + du) + ...)`: residuals of position, scale, rotation and colour on a skinned template.
 
     Args:
-        frames: that have a code. code_size: of each.
+        frames: those that have a code. code_size: length of each code.
     """
+
+    corner_weights: Tensor
+    canonical_from_local: Tensor
+    points: Tensor
 
     def __init__(self, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int], *, code_size: int) -> None:
         super().__init__()
@@ -65,11 +70,11 @@ class ResidualBaseline(Baseline):
         self.register_buffer("points", points, persistent=False)
 
     @abstractmethod
-    def residuals(self, motion: Motion, code: Tensor) -> Tensor:
-        """(N, 12) outputs in the order of `RESIDUALS`; `code` (code_size,) of the frame."""
+    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+        """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
 
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The avatar in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the avatar as cameras with these centres, metres, see it."""
         code = self.codes([motion.frame if motion.frame in self.codes.row else None])[0]
         position, log_scales, quats, colour = self.residuals(motion, code).split((3, 2, 4, 3), dim=-1)
         bound = self.gaussians()
@@ -86,6 +91,6 @@ class ResidualBaseline(Baseline):
         return PosedAvatar(vertices, world, view_colors(bound, frames, world.means.detach(), camera_centers), bound)
 
     def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
-        """Networks and codes."""
+        """Return networks and codes as one group."""
         own = {name: p for name, p in self.named_parameters() if not name.startswith("gaussians.")}
         return [ParameterGroup("networks", own, lr, lr_final_factor)]

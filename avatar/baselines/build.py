@@ -16,9 +16,9 @@ _KINDS = {PointMLPConfig: PointMLPAvatar, UVUNetConfig: UVUNetAvatar, TexturedMe
 
 
 def make_baseline(config: BaselineConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> Baseline:
-    """An untrained baseline of the configuration's kind.
+    """Make an untrained baseline of the configuration's kind.
 
     Args:
-        rig: of any template. gaussians: fitted on it. frames: that have a code.
+        rig: that of any template. gaussians: those fitted on it. frames: those that have a code.
     """
     return _KINDS[type(config)](config, rig, gaussians, frames)

@@ -13,7 +13,7 @@ from smplxpp.template.template import Template
 
 
 def outer_template(template: Template) -> Template:
-    """The faces that views from outside see in the T-pose, with one label for all.
+    """Return the faces that views from outside see in the T-pose, with one label for all.
 
     What is under clothes is gone, so that body and clothes are one outer surface, as the implicit templates of
     Animatable Gaussians (Li et al. 2024) are; unlike theirs it is not welded where clothes end, and its skinning

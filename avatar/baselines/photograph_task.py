@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
-from smplxpp.core.errors import InputError
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask, Preview
+from avatar.training.engine.processes import Distributed
+from smplxpp.core.validation import require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,31 +20,42 @@ class PhotographConfig(PhotometricConfig):
     """Choices of a baseline's training.
 
     Attributes:
-        null_share: of the poses that are shown with the null code.
+        null_share: share of the poses that are shown with the null code.
     """
 
     null_share: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 <= self.null_share <= 1.0:
-            raise InputError("baseline: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+        require_between("baseline: null_share", self.null_share, 0.0, 1.0)
 
 
 class PhotographTask(PhotometricTask):
     """`L_rec` of a baseline's renderings against photographs."""
 
-    def __init__(self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, **options: Any) -> None:
+    config: PhotographConfig
+
+    def __init__(
+        self,
+        sequence: AvatarSequence,
+        model: Baseline,
+        config: PhotographConfig,
+        *,
+        perceptual: PerceptualDistance | None = None,
+        distributed: Distributed | None = None,
+        preview: Preview = lambda images: None,
+    ) -> None:
         groups = model.groups(config.lr, config.lr_final_factor)
-        super().__init__(sequence, model, config, groups, **options)
+        super().__init__(
+            sequence, model, config, groups, perceptual=perceptual, distributed=distributed, preview=preview
+        )
         for group in groups:
             # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
             for value in group.parameters.values():
                 value.requires_grad_(True)
-        self.config = config
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Of one frame."""
+        """Return the loss of one frame, and its terms as numbers."""
         views = self.views(item)
         motion = self.sequence.motion(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:

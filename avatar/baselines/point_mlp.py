@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, cat, nn
 
 from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
@@ -24,11 +25,11 @@ from smplxpp.core.validation import require_at_least
 
 @dataclass(frozen=True)
 class PointMLPConfig:
-    """Sizes.
+    """Sizes of the position MLP.
 
     Attributes:
-        frequencies: bands of the positional encoding. code_size: of a frame's code.
-        width, hidden_layers: of the network; one more layer gives the residuals.
+        frequencies: number of bands of the positional encoding. code_size: length of a frame's code.
+        width, hidden_layers: sizes of the network; one more layer gives the residuals.
     """
 
     frequencies: int = 6
@@ -46,8 +47,10 @@ class PointMLPAvatar(ResidualBaseline):
     """`residuals_i = MLP(phi(u_i), theta, z_t)`, u_i the Gaussian in the T-pose; they start at zero.
 
     Args:
-        config: sizes. rig: of the template. gaussians: on it. frames: that have a code.
+        config: sizes. rig: that of the template. gaussians: those on it. frames: those that have a code.
     """
+
+    encodings: Tensor
 
     def __init__(self, config: PointMLPConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:
         super().__init__(rig, gaussians, frames, code_size=config.code_size)
@@ -65,8 +68,8 @@ class PointMLPAvatar(ResidualBaseline):
         nn.init.zeros_(self.last.bias)
         self.to(rig.device)
 
-    def residuals(self, motion: Motion, code: Tensor) -> Tensor:
-        """(N, 12)."""
+    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+        """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
         x = F.relu(self.of_point(self.encodings) + self.of_frame(cat([motion.pose, code])))
         for layer in self.hidden:
             x = F.relu(layer(x))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -34,10 +35,11 @@ OPACITY = 0.99
 
 @dataclass(frozen=True)
 class TexturedMeshConfig:
-    """What it is made of.
+    """What a textured mesh is made of.
 
     Attributes:
-        field: of the mesh's motion. sampling: of the texels; opacity and view dependence are not taken from it.
+        field: that of the mesh's motion.
+        sampling: that of the texels; opacity and view dependence are not taken from it.
     """
 
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
@@ -48,7 +50,7 @@ class TexturedMeshAvatar(Baseline):
     """A student without blend shapes whose Gaussians are texels: only their colours learn.
 
     Args:
-        config: sizes. rig: of the template. frames: that have a code.
+        config: sizes. rig: that of the template. frames: those that have a code.
         gaussians: texels near one of these start with its colour.
     """
 
@@ -60,25 +62,27 @@ class TexturedMeshAvatar(Baseline):
         self.student = Student(StudentConfig(field=config.field), rig, texels, tuple(frames))
 
     @property
-    def gaussians(self) -> LearnedGaussians:
+    def gaussians(self) -> LearnedGaussians:  # type: ignore[override]  # a part of the student here
         """The texels."""
         return self.student.gaussians
 
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The mesh in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the mesh as cameras with these centres, metres, see it."""
         return self.student(motion, camera_centers)
 
     def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
-        """Field, codes and texture."""
+        """Return field, codes and texture as a group each."""
+        field, codes = self.student.field, self.student.codes
+        assert field is not None and codes is not None  # the configuration has a field
         return [
-            ParameterGroup("field", dict(self.student.field.named_parameters()), lr, lr_final_factor),
-            ParameterGroup("codes", {"codes": self.student.codes.codes}, lr, lr_final_factor),
+            ParameterGroup("field", dict(field.named_parameters()), lr, lr_final_factor),
+            ParameterGroup("codes", {"codes": codes.codes}, lr, lr_final_factor),
             ParameterGroup("texture", {"dc": self.gaussians.dc}, LearningRates().dc, lr_final_factor),
         ]
 
 
 def _nearest_colors(rig: Rig, texels: BoundGaussians, gaussians: BoundGaussians) -> Tensor:
-    """(N, 3) colours of the nearest Gaussians in the T-pose."""
+    """Return the (N, 3) colours of the nearest Gaussians in the T-pose."""
     triangles = rig.template.mesh.triangles
 
     def places(bound: BoundGaussians) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64, Int, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.template.template import Template
@@ -23,18 +24,20 @@ class Atlas:
 
     Attributes:
         size: texels a side.
-        pixels: (N, 2) column and row of each point, texel centres at +0.5.
-        anchor: (size, size) the point that stands for a texel, -1 where there is none near.
-        chart: (N,) chart of each point.
+        pixels: column and row of each point, texel centres at +0.5.
+        anchor: the point that stands for a texel, -1 where there is none near.
+        chart: the chart of each point.
     """
 
     size: int
-    pixels: np.ndarray
-    anchor: np.ndarray
-    chart: np.ndarray
+    pixels: Float64[np.ndarray, "N 2"]
+    anchor: Int64[np.ndarray, "S S"]
+    chart: Int64[np.ndarray, " N"]
 
 
-def cylinder_atlas(template: Template, points: np.ndarray, faces: np.ndarray, *, size: int) -> Atlas:
+def cylinder_atlas(
+    template: Template, points: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, " N"], *, size: int
+) -> Atlas:
     """Unwrap points on the template's faces in the T-pose.
 
     A chart is what follows one body joint most, part by part. Its axis is the direction of its largest extent; u is the
@@ -42,7 +45,7 @@ def cylinder_atlas(template: Template, points: np.ndarray, faces: np.ndarray, *,
     inside one another (a tongue in a mouth) have charts of their own as far as the body labels them.
 
     Args:
-        points: (N, 3) in the T-pose, metres. faces: (N,) each on one of these.
+        points: in the T-pose, metres. faces: each point lies on one of these.
         size: texels a side.
     """
     chart = _charts(template)[template.faces[faces, 0]]
@@ -61,7 +64,7 @@ def cylinder_atlas(template: Template, points: np.ndarray, faces: np.ndarray, *,
 
 
 def _charts(template: Template) -> np.ndarray:
-    """(V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
+    """Return the (V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
     joint = np.argmax(template.weights.dense(), axis=1)
     while (beyond := joint >= BODY_JOINTS).any():
         joint = np.where(beyond, template.body.parents[joint], joint)
@@ -70,7 +73,7 @@ def _charts(template: Template) -> np.ndarray:
 
 
 def _unrolled(points: np.ndarray) -> np.ndarray:
-    """(n, 2) metres along the circumference and along the axis of (n, 3) points; the seam lies at the back."""
+    """Return (n, 2) metres along the circumference and along the axis of (n, 3) points; the seam lies at the back."""
     centred = points - points.mean(axis=0)
     axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
     towards = np.eye(3)[1] if abs(axis[2]) > 0.7 else np.eye(3)[2]
@@ -89,7 +92,7 @@ def _by_chart(reduce: np.ufunc, values: np.ndarray, chart: np.ndarray) -> np.nda
 
 
 def _packed(extent: np.ndarray, size: int) -> tuple[np.ndarray, float]:
-    """(K, 2) corners of K charts in texels, and the largest density, texels a metre, at which they all fit."""
+    """Return (K, 2) corners of K charts in texels, and the largest density, texels a metre, at which they all fit."""
     low, high = 0.0, size / max(extent.max(), 1e-6)
     corners = _rows(np.ceil(low * extent) + 2 * GUTTER, size)
     for _ in range(20):
@@ -99,11 +102,12 @@ def _packed(extent: np.ndarray, size: int) -> tuple[np.ndarray, float]:
             high = middle
         else:
             low, corners = middle, placed
+    assert corners is not None  # boxes of gutters alone fit
     return corners, low
 
 
 def _rows(boxes: np.ndarray, size: int) -> np.ndarray | None:
-    """(K, 2) corners of (K, 2) boxes put in rows, the highest first; None if they do not fit."""
+    """Return (K, 2) corners of (K, 2) boxes put in rows, the highest first; None if they do not fit."""
     corners = np.zeros_like(boxes)
     left = top = height = 0.0
     # Each box goes beside the one before it: a loop over charts, not over vertices.

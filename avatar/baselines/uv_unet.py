@@ -14,24 +14,25 @@ from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.baselines.uv_atlas import cylinder_atlas
 from avatar.gaussians.binding import BoundGaussians
-from avatar.models.networks.layers import ConvLayer
+from avatar.models.networks.stylegan2_layers import ConvLayer
 from avatar.rig.rig import Motion, Rig
 from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)
 class UVUNetConfig:
-    """Sizes.
+    """Sizes of the UV U-Net.
 
     Attributes:
         size: texels of the maps, a side. features: channels of the person's learned map.
-        channels: of the U-Net's scales, the finest first; each next one has half the side.
-        code_size: of a frame's code, which joins every texel.
+        channels: those of the U-Net's scales, the finest first; each next one has half the side.
+        code_size: length of a frame's code, which joins every texel.
     """
 
     size: int = 128
@@ -47,7 +48,7 @@ class UVUNetConfig:
 
 
 class UNet(nn.Module):
-    """(1, inputs, S, S) -> (1, outputs, S, S), zero at first; S is divisible by 2 for every scale but the first."""
+    """Maps to maps of the same side, zero at first; S is divisible by 2 for every scale but the first."""
 
     def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
@@ -57,9 +58,11 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(ConvLayer(fine + coarse, fine) for fine, coarse in reversed(pairs))
         self.last = nn.Conv2d(channels[0], outputs, 1)
         nn.init.zeros_(self.last.weight)
+        assert self.last.bias is not None
         nn.init.zeros_(self.last.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "1 I S S"]) -> Float[Tensor, "1 O S S"]:
+        """Apply the network."""
         scales = [self.first(x)]
         for layer in self.down:
             scales.append(layer(scales[-1]))
@@ -73,9 +76,14 @@ class UVUNetAvatar(ResidualBaseline):
     """`residual map = UNet(position map + learned features + z_t)`, looked up bilinearly at each Gaussian.
 
     Args:
-        config: sizes. rig: of the template, the naked one in the published form. gaussians: on it.
-        frames: that have a code.
+        config: sizes. rig: that of the template, the naked one in the published form. gaussians: those on it.
+        frames: those that have a code.
     """
+
+    texels: Tensor
+    texel_corners: Tensor
+    texel_weights: Tensor
+    grid: Tensor
 
     def __init__(self, config: UVUNetConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:
         super().__init__(rig, gaussians, frames, code_size=config.code_size)
@@ -96,8 +104,8 @@ class UVUNetAvatar(ResidualBaseline):
         self.network = UNet(3 + config.features + config.code_size, config.channels, RESIDUALS)
         self.to(rig.device)
 
-    def position_map(self, motion: Motion) -> Tensor:
-        """(1, 3, S, S) posed points without the root's motion, metres; 0 between the charts. A constant."""
+    def position_map(self, motion: Motion) -> Float[Tensor, "1 3 S S"]:
+        """Return posed points without the root's motion, metres, 0 between the charts; a constant for gradients."""
         with torch.no_grad():
             to_root = motion.root_from_world
             vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
@@ -105,8 +113,8 @@ class UVUNetAvatar(ResidualBaseline):
             out = vertices.new_zeros(self.config.size**2, 3).index_copy(0, self.texels, seen)
             return out.T.reshape(1, 3, self.config.size, self.config.size)
 
-    def residuals(self, motion: Motion, code: Tensor) -> Tensor:
-        """(N, 12)."""
+    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+        """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
         of_frame = code[None, :, None, None].expand(-1, -1, self.config.size, self.config.size)
         maps = self.network(torch.cat([self.position_map(motion), self.person, of_frame], dim=1))
         return F.grid_sample(maps, self.grid, align_corners=False)[0, :, 0].T

@@ -32,7 +32,7 @@ _MAX_HEADER = 1 << 20
 
 @dataclass(frozen=True)
 class PlyLayout:
-    """Where the vertices are.
+    """Where the vertices of a file are.
 
     Attributes:
         start: their first byte.
@@ -46,7 +46,7 @@ class PlyLayout:
 
 
 def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
-    """The layout of element `vertex`, wherever it stands among elements without lists.
+    """Return the layout of element `vertex`, wherever it stands among elements without lists.
 
     Args:
         data: the file from its beginning.
@@ -56,7 +56,8 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
         InputError: no PLY, a text PLY, a header that is cut, wrong or without vertices.
     """
     lines, start = _header_lines(data, subject)
-    order, elements = "", []
+    order = ""
+    elements: list[tuple[str, int, list[tuple[str, str] | None]]] = []
     for line in lines[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
@@ -67,8 +68,8 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
                 raise InputError(
                     subject, expected="a binary PLY", received="a text PLY", remedy="save it as binary little endian"
                 )
-            case ["element", name, count] if count.isdecimal():
-                elements.append((name, int(count), []))
+            case ["element", name, digits] if digits.isdecimal():
+                elements.append((name, int(digits), []))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1][2].append((name, _TYPES[kind]))
             case ["property", "list", _, _, _] if elements:
@@ -78,12 +79,13 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
     if not order:
         raise _bad_header(subject, "no format")
     for name, count, properties in elements:
-        names = [p[0] for p in properties if p]
-        if None in properties:
+        fields = [p for p in properties if p is not None]
+        names = [field for field, _ in fields]
+        if len(fields) < len(properties):
             raise _bad_header(subject, f"lists in element {name!r}, at or before the vertices")
         if len(set(names)) < len(names):
             raise _bad_header(subject, f"a property twice in element {name!r}")
-        dtype = np.dtype([(n, order + kind) for n, kind in properties])
+        dtype = np.dtype([(n, order + kind) for n, kind in fields])
         if name == "vertex":
             return PlyLayout(start, count, dtype)
         start += count * dtype.itemsize
@@ -91,7 +93,7 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
 
 
 def _header_lines(data: bytes, subject: str) -> tuple[list[str], int]:
-    """Lines before `end_header`, and where the numbers start."""
+    """Return the lines before `end_header`, and where the numbers start."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r"):
         raise InputError(subject, expected="a PLY file", received=f"a file that starts with {data[:4]!r}")
     end = data.find(b"end_header", 0, _MAX_HEADER)

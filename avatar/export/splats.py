@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from avatar.export.ply_header import PlyLayout, read_ply_layout
@@ -27,34 +28,34 @@ _REST_COUNTS = (0, 9, 24, 45)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Splats:
-    """N Gaussians in the world as the file holds them; float32 arrays.
+    """N Gaussians in the world as the file holds them; the arrays are kept as float32.
 
     Attributes:
-        means: (N, 3) metres.
-        normals: (N, 3) unit, or 0 where unknown.
-        f_dc: (N, 3) coefficients of degree 0: the colour without view dependence is `0.5 + C0 f_dc`.
-        f_rest: (N, K, 3) coefficients of degree 1 and up in the world's axes; K = 0, 3, 8 or 15.
-        opacity_logits: (N,) before the sigmoid.
-        log_scales: (N, 3) logarithms of the standard deviations in metres.
-        quats: (N, 4) wxyz, any length but zero.
+        means: metres.
+        normals: unit, or 0 where unknown.
+        f_dc: coefficients of degree 0: the colour without view dependence is `0.5 + C0 f_dc`.
+        f_rest: coefficients of degree 1 and up in the world's axes; K = 0, 3, 8 or 15.
+        opacity_logits: before the sigmoid.
+        log_scales: logarithms of the standard deviations in metres.
+        quats: wxyz, any length but zero.
 
     Raises:
         InputError: arrays that do not fit each other, NaN or infinity, a quaternion of length 0.
     """
 
-    means: np.ndarray
-    normals: np.ndarray
-    f_dc: np.ndarray
-    f_rest: np.ndarray
-    opacity_logits: np.ndarray
-    log_scales: np.ndarray
-    quats: np.ndarray
+    means: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
+    f_dc: Float[np.ndarray, "N 3"]
+    f_rest: Float[np.ndarray, "N K 3"]
+    opacity_logits: Float[np.ndarray, " N"]
+    log_scales: Float[np.ndarray, "N 3"]
+    quats: Float[np.ndarray, "N 4"]
 
     def __post_init__(self) -> None:
         for f in fields(self):
             object.__setattr__(self, f.name, np.ascontiguousarray(getattr(self, f.name), dtype=np.float32))
         N, K = len(self.means), self.f_rest.shape[1] if self.f_rest.ndim == 3 else -1
-        shapes = {
+        shapes: dict[str, tuple[int, ...]] = {
             "means": (N, 3),
             "normals": (N, 3),
             "f_dc": (N, 3),
@@ -81,16 +82,16 @@ class Splats:
         return len(self.means)
 
 
-def posed_splats(bound: BoundGaussians, vertices: Tensor, faces: Tensor) -> Splats:
-    """Bound Gaussians as world-space splats of one pose, the colours' harmonics turned into the world.
+def posed_splats(bound: BoundGaussians, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Splats:
+    """Return bound Gaussians as world-space splats of one pose, the colours' harmonics turned into the world.
 
     Viewers evaluate colours in the world's axes, ours live in the triangles' frames: `rotate_sh` takes each Gaussian's
     coefficients there. `f_dc = (dc - 0.5) / C0`. Computed in float64, kept in float32.
 
     Args:
         bound: the local attributes.
-        vertices: (V, 3) of the posed mesh, metres.
-        faces: (F, 3) int64.
+        vertices: of the posed mesh, metres.
+        faces: of the mesh that they are bound to.
     """
     with torch.no_grad():
         bound = bound.to(dtype=torch.float64)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from avatar.gaussians.frames import TriangleFrames, triangle_frames
@@ -23,15 +25,15 @@ class BoundGaussians:
     """N Gaussians in the frames of their triangles (`TriangleFrames`); make variants with `dataclasses.replace`.
 
     Attributes:
-        face_index: (N,) int64 the triangle.
-        barycentric: (N, 2) weights u of the first corner and v of the second; 1 - u - v is the third's.
-        normal_offset: (N,) gamma, metres along the triangle's normal.
-        offset: (N, 3) metres in the triangle's frame: (normal, median, their cross product).
-        log_scales: (N, 2) logarithms of the two tangential standard deviations, in mean edge lengths.
-        quats: (N, 4) wxyz, any length but zero: from the Gaussian's axes to the triangle's frame.
-        opacity_logits: (N,) opacities before the sigmoid.
-        dc: (N, 3) colour that does not depend on the view, in sRGB as the images.
-        sh: (N, K, 3) real spherical harmonics of degree 1 and up in the triangle's frame; K = 0, 3, 8 or 15.
+        face_index: the triangle.
+        barycentric: weights u of the first corner and v of the second; 1 - u - v is the third's.
+        normal_offset: gamma, metres along the triangle's normal.
+        offset: metres in the triangle's frame: (normal, median, their cross product).
+        log_scales: logarithms of the two tangential standard deviations, in mean edge lengths.
+        quats: wxyz, any length but zero: from the Gaussian's axes to the triangle's frame.
+        opacity_logits: opacities before the sigmoid.
+        dc: colour that does not depend on the view, in sRGB as the images.
+        sh: real spherical harmonics of degree 1 and up in the triangle's frame; K = 0, 3, 8 or 15.
         face_count: triangles of the mesh.
         topology: digest of the mesh's faces, see `topology_digest`.
 
@@ -39,21 +41,21 @@ class BoundGaussians:
         InputError: tensors that do not fit each other, or triangles out of range (looked at on the CPU only).
     """
 
-    face_index: Tensor
-    barycentric: Tensor
-    normal_offset: Tensor
-    offset: Tensor
-    log_scales: Tensor
-    quats: Tensor
-    opacity_logits: Tensor
-    dc: Tensor
-    sh: Tensor
+    face_index: Int64[Tensor, " N"]
+    barycentric: Float[Tensor, "N 2"]
+    normal_offset: Float[Tensor, " N"]
+    offset: Float[Tensor, "N 3"]
+    log_scales: Float[Tensor, "N 2"]
+    quats: Float[Tensor, "N 4"]
+    opacity_logits: Float[Tensor, " N"]
+    dc: Float[Tensor, "N 3"]
+    sh: Float[Tensor, "N K 3"]
     face_count: int
     topology: str
 
     def __post_init__(self) -> None:
         N, K = len(self.face_index), self.sh.shape[1] if self.sh.ndim == 3 else -1
-        shapes = {
+        shapes: dict[str, tuple[int, ...]] = {
             "face_index": (N,),
             "barycentric": (N, 2),
             "normal_offset": (N,),
@@ -83,6 +85,7 @@ class BoundGaussians:
 
     @property
     def sh_degree(self) -> int:
+        """The degree of the harmonics, 0 to 3."""
         return int((self.sh.shape[1] + 1) ** 0.5) - 1
 
     @property
@@ -91,13 +94,13 @@ class BoundGaussians:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("face_count", "topology")}
 
     @property
-    def opacities(self) -> Tensor:
-        """(N,) in (0, 1)."""
+    def opacities(self) -> Float[Tensor, " N"]:
+        """The opacities, in (0, 1)."""
         return torch.sigmoid(self.opacity_logits)
 
     @property
-    def scales(self) -> Tensor:
-        """(N, 3) standard deviations in mean edge lengths: `[THICKNESS, exp, exp]`."""
+    def scales(self) -> Float[Tensor, "N 3"]:
+        """The standard deviations in mean edge lengths: `[THICKNESS, exp, exp]`."""
         tangential = torch.exp(self.log_scales)
         return torch.cat([torch.full_like(tangential[:, :1], THICKNESS), tangential], 1)
 
@@ -107,13 +110,17 @@ class BoundGaussians:
             name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
             for name, value in self.tensors.items()
         }
-        return replace(self, **moved)
+        return self._with(moved)
 
-    def select(self, index: Tensor) -> BoundGaussians:
+    def select(self, index: Bool[Tensor, " N"] | Int[Tensor, " M"]) -> BoundGaussians:
         """The Gaussians of a mask or index tensor, in its order."""
-        return replace(self, **{name: value[index] for name, value in self.tensors.items()})
+        return self._with({name: value[index] for name, value in self.tensors.items()})
 
-    def check_topology(self, faces: np.ndarray | Tensor, subject: str = "mesh") -> None:
+    def _with(self, tensors: Mapping[str, Tensor]) -> BoundGaussians:
+        """Make Gaussians of the same mesh with these tensors, all of them."""
+        return BoundGaussians(**tensors, face_count=self.face_count, topology=self.topology)
+
+    def check_topology(self, faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"], subject: str = "mesh") -> None:
         """Raise InputError unless `faces` are those that the Gaussians were bound to."""
         if len(faces) != self.face_count or topology_digest(faces) != self.topology:
             raise InputError(
@@ -129,39 +136,41 @@ class WorldGaussians:
     """N Gaussians in the world, in a pose.
 
     Attributes:
-        means: (..., N, 3) metres.
-        quats: (..., N, 4) wxyz, as long as the local ones: from the Gaussian's axes to the world.
-        scales: (..., N, 3) standard deviations, metres.
-        opacities: (N,) in (0, 1).
-        normals: (..., N, 3) unit: the first axis.
+        means: metres.
+        quats: wxyz, as long as the local ones: from the Gaussian's axes to the world.
+        scales: standard deviations, metres.
+        opacities: in (0, 1).
+        normals: unit: the first axis.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    normals: Tensor
+    means: Float[Tensor, "*B N 3"]
+    quats: Float[Tensor, "*B N 4"]
+    scales: Float[Tensor, "*B N 3"]
+    opacities: Float[Tensor, " N"]
+    normals: Float[Tensor, "*B N 3"]
 
 
-def topology_digest(faces: np.ndarray | Tensor) -> str:
-    """SHA-256 of the (F, 3) faces as little-endian int64."""
+def topology_digest(faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"]) -> str:
+    """Return the SHA-256 of the faces as little-endian int64."""
     array = faces.cpu().numpy() if isinstance(faces, Tensor) else np.asarray(faces)
     return hashlib.sha256(np.ascontiguousarray(array, dtype="<i8").tobytes()).hexdigest()
 
 
-def world_from_local(bound: BoundGaussians, vertices: Tensor, faces: Tensor) -> WorldGaussians:
-    """Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
+def world_from_local(
+    bound: BoundGaussians, vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]
+) -> WorldGaussians:
+    """Put Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
 
     Args:
         bound: the local attributes.
-        vertices: (..., V, 3) of the posed mesh, metres.
-        faces: (F, 3) int64.
+        vertices: of the posed mesh, metres.
+        faces: of the mesh that they are bound to.
     """
     return world_from_frames(bound, triangle_frames(vertices, faces))
 
 
 def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """Gaussians in the world, with gradients to their attributes and to the vertices.
+    """Put Gaussians into the world, with gradients to their attributes and to the vertices.
 
     `u_w = u v1 + v v2 + (1 - u - v) v3 + R (gamma [1, 0, 0] + du)`, `r_w = R r`, `s_w = e s` with
     `s = [THICKNESS, exp, exp]`, and `normal = R r [1, 0, 0]` (TaoAvatar; offsets are metres, scales are edges).
@@ -187,7 +196,7 @@ def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGau
 
 
 def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """`world_from_frames` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
+    """Do as `world_from_frames` in plain torch: the native kernel's oracle, and the way for other types and devices."""
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
     weights = corner_weights(bound.barycentric)
@@ -199,19 +208,19 @@ def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -
     return WorldGaussians(means, quats, scales, bound.opacities, _first_axes(quats))
 
 
-def corner_weights(barycentric: Tensor) -> Tensor:
-    """(N, 3) weights of the corners of a triangle from the (N, 2) of the first two."""
+def corner_weights(barycentric: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """The weights of all corners of a triangle from those of the first two."""
     u, v = barycentric.unbind(-1)
     return torch.stack([u, v, 1.0 - u - v], dim=-1)
 
 
-def on_triangles(corners: Tensor, barycentric: Tensor) -> Tensor:
-    """(N, 3, C) values at the corners of triangles -> (N, C) at points in them."""
+def on_triangles(corners: Float[Tensor, "N 3 C"], barycentric: Float[Tensor, "N 2"]) -> Float[Tensor, "N C"]:
+    """Interpolate values at the corners of triangles to points in them."""
     return (corner_weights(barycentric)[..., None] * corners).sum(1)
 
 
 def _first_axes(quats: Tensor) -> Tensor:
-    """The x axes turned by quaternions of any length: (..., 4) -> (..., 3) unit."""
+    """The unit x axes turned by quaternions of any length: (..., 4) -> (..., 3)."""
     w, x, y, z = quats.unbind(-1)
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     axes = torch.stack([ww + xx - yy - zz, 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
@@ -27,12 +28,12 @@ def save_bound(bound: BoundGaussians, path: str | Path) -> None:
     atomic_write_bytes(path, save(tensors, metadata=metadata))
 
 
-def load_bound(path: str | Path, *, faces: np.ndarray | None = None) -> BoundGaussians:
+def load_bound(path: str | Path, *, faces: Int[np.ndarray, "F 3"] | None = None) -> BoundGaussians:
     """Read what `save_bound` wrote, bit for bit.
 
     Args:
         path: the file.
-        faces: (F, 3) of the template it is to be used with, checked when given.
+        faces: of the template it is to be used with, checked when given.
 
     Raises:
         InputError: a missing, damaged or foreign file, numbers that are not finite, or Gaussians of another mesh.

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from avatar.gaussians.native_kernels import FramesFunction, is_native
@@ -21,25 +22,26 @@ class TriangleFrames:
     """Frames of F triangles, for any number of leading batch axes.
 
     Attributes:
-        corners: (..., F, 3, 3) corner k of each triangle in [..., k, :], metres.
-        rotations: (..., F, 3, 3) world from local; the columns are the normal, the direction from the first corner to
+        corners: corner k of each triangle in [..., k, :], metres.
+        rotations: world from local; the columns are the normal, the direction from the first corner to
             the middle of the opposite edge, and their cross product.
-        quats: (..., F, 4) the same rotations, wxyz of length 1.
-        lengths: (..., F) mean edge length, metres.
+        quats: the same rotations, wxyz of length 1.
+        lengths: mean edge length, metres.
     """
 
-    corners: Tensor
-    rotations: Tensor
-    quats: Tensor
-    lengths: Tensor
+    corners: Float[Tensor, "*B F 3 3"]
+    rotations: Float[Tensor, "*B F 3 3"]
+    quats: Float[Tensor, "*B F 4"]
+    lengths: Float[Tensor, "*B F"]
 
     @property
     def face_count(self) -> int:
+        """The number of triangles, F."""
         return self.lengths.shape[-1]
 
 
-def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
-    """Frames of triangles, differentiable in the vertices.
+def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]) -> TriangleFrames:
+    """Return the frames of triangles, differentiable in the vertices.
 
     `n = normalize((v2 - v1) x (v3 - v1))`, `q = normalize((v2 + v3) / 2 - v1)`, `R = [n, q, n x q]`, and e the mean
     edge length: TaoAvatar's equations with an outward unit normal for counter-clockwise faces (the printed one points
@@ -49,8 +51,8 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     with a GeometryWarning; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes through the native library.
 
     Args:
-        vertices: (..., V, 3) floating point, metres.
-        faces: (F, 3) int64 on the same device.
+        vertices: metres.
+        faces: on the same device.
 
     Raises:
         InputError: other shapes or types, indices out of range.
@@ -82,8 +84,16 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     return TriangleFrames(*arrays)
 
 
-def triangle_frames_reference(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
+def triangle_frames_reference(
+    vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]
+) -> tuple[
+    Float[Tensor, "*B F 3 3"],
+    Float[Tensor, "*B F 3 3"],
+    Float[Tensor, "*B F 4"],
+    Float[Tensor, "*B F"],
+    Int64[Tensor, ""],
+]:
+    """Return the tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
 
     The oracle of the native kernel, and the way for other types and devices.
     """

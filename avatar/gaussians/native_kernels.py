@@ -6,6 +6,7 @@ The torch formulas in `frames`, `binding` and `spherical_harmonics` are what the
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,12 +22,13 @@ _FRAMES = ("corners", "rotations", "frame_quats", "lengths")
 class _Binding(ctypes.Structure):
     """SmplxppBinding of binding.cpp."""
 
-    _fields_ = [(name, ctypes.c_void_p) for name in ("face", *_LOCAL, *_FRAMES)] + [
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("face", *_LOCAL, *_FRAMES)),
         ("N", ctypes.c_int64),
         ("F", ctypes.c_int64),
         ("B", ctypes.c_int64),
         ("thickness", ctypes.c_float),
-    ]
+    )
 
 
 class _BindingGradients(ctypes.Structure):
@@ -41,7 +43,7 @@ def is_native(*tensors: Tensor) -> bool:
 
 
 class FramesFunction(torch.autograd.Function):
-    """(..., V, 3) vertices, (F, 3) faces -> tensors of `TriangleFrames`, and how many have no area."""
+    """Takes (..., V, 3) vertices and (F, 3) faces to the tensors of `TriangleFrames`, and how many have no area."""
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
@@ -68,10 +70,10 @@ class FramesFunction(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor, None]:
         vertices, faces, rotations = ctx.saved_tensors
         batch, V = vertices.shape[:-2], vertices.shape[-2]
-        gradients = _contiguous(gradients[:4])
+        given = _contiguous(gradients[:4])
         out = torch.zeros_like(vertices)
         native_library().smplxpp_frames_backward(
-            *map(_pointer, (vertices, faces, rotations, *gradients)),
+            *map(_pointer, (vertices, faces, rotations, *given)),
             *map(ctypes.c_int64, (batch.numel(), V, len(faces))),
             _pointer(out),
             _threads(),
@@ -80,11 +82,11 @@ class FramesFunction(torch.autograd.Function):
 
 
 class WorldFunction(torch.autograd.Function):
-    """Local attributes and frames, in the order of `_LOCAL` and `_FRAMES` -> means, quats, scales, normals."""
+    """Takes local attributes and frames, in the order of `_LOCAL` and `_FRAMES`, to means, quats, scales, normals."""
 
     @staticmethod
-    def forward(ctx: Any, thickness: float, face: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        face, inputs = face.contiguous(), _contiguous(inputs)
+    def forward(ctx: Any, thickness: float, face: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        face, inputs = face.contiguous(), tuple(t.contiguous() for t in inputs)
         lengths = inputs[-1]
         batch = lengths.shape[:-1]
         out = [lengths.new_empty((*batch, len(face), width)) for width in (3, 4, 3, 3)]
@@ -100,25 +102,25 @@ class WorldFunction(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         face, *inputs = ctx.saved_tensors
-        gradients = _contiguous(gradients)
+        given = _contiguous(gradients)
         wanted = ctx.needs_input_grad[2:]
         # The kernel writes gradients of Gaussians and adds to those of faces.
         local = [torch.empty_like(t) if want else None for t, want in zip(inputs, wanted, strict=True)][: len(_LOCAL)]
         frames = [torch.zeros_like(t) if want else None for t, want in zip(inputs, wanted, strict=True)][len(_LOCAL) :]
         native_library().smplxpp_world_backward(
             ctypes.byref(_binding(ctx.thickness, face, inputs)),
-            ctypes.byref(_BindingGradients(*map(_pointer, (*gradients, *local, *frames)))),
+            ctypes.byref(_BindingGradients(*map(_pointer, (*given, *local, *frames)))),
             _threads(),
         )
         return None, None, *local, *frames
 
 
 class ColorsFunction(torch.autograd.Function):
-    """Faces of the Gaussians, rotations of the faces, dc, sh, means, camera positions -> (C, N, 3) colours."""
+    """Takes faces of the Gaussians, rotations of the faces, dc, sh, means, camera positions to (C, N, 3) colours."""
 
     @staticmethod
     def forward(ctx: Any, face: Tensor, *inputs: Tensor) -> Tensor:
-        face, inputs = face.contiguous(), _contiguous(inputs)
+        face, inputs = face.contiguous(), tuple(t.contiguous() for t in inputs)
         sh, cameras = inputs[2], inputs[4]
         out = sh.new_empty((len(cameras), len(face), 3))
         native_library().smplxpp_colors_forward(
@@ -155,7 +157,7 @@ class ColorsFunction(torch.autograd.Function):
         return None, to_rotations, to_dc, to_sh, to_means, None if to_cameras is None else to_cameras.sum(0)
 
 
-def _binding(thickness: float, face: Tensor, inputs: list[Tensor]) -> _Binding:
+def _binding(thickness: float, face: Tensor, inputs: Sequence[Tensor]) -> _Binding:
     lengths = inputs[-1]
     sizes = (len(face), lengths.shape[-1], lengths.shape[:-1].numel())
     return _Binding(*map(_pointer, (face, *inputs)), *sizes, thickness)

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def quat_from_matrix(matrix: Tensor) -> Tensor:
-    """Unit quaternions of rotation matrices.
+def quat_from_matrix(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4"]:
+    """Return unit quaternions wxyz of rotation matrices; their sign is free.
 
     `4 q q^T` is linear in the matrix. The row of its largest diagonal entry, normalised, is q: that entry is at least
     1, so that neither the value nor the gradient has a weak spot (Shepperd 1978, without the branches).
-
-    Args:
-        matrix: (..., 3, 3) rotations.
-
-    Returns:
-        (..., 4) wxyz of length 1; the sign is free.
     """
     a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
     wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
@@ -29,8 +24,8 @@ def quat_from_matrix(matrix: Tensor) -> Tensor:
     return row / row.norm(dim=-1, keepdim=True)
 
 
-def matrix_from_quat(quat: Tensor) -> Tensor:
-    """Rotation matrices of quaternions of any length but zero: (..., 4) wxyz -> (..., 3, 3)."""
+def matrix_from_quat(quat: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
+    """Return the rotation matrices of quaternions wxyz of any length but zero."""
     w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -40,8 +35,8 @@ def matrix_from_quat(quat: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product: first turn by `b`, then by `a`; (..., 4) each, broadcast."""
+def multiply_quats(a: Float[Tensor, "*#B 4"], b: Float[Tensor, "*#B 4"]) -> Float[Tensor, "*B 4"]:
+    """Return the Hamilton product of quaternions wxyz: first turn by `b`, then by `a`."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

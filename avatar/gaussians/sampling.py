@@ -7,12 +7,14 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
 from avatar.gaussians.spherical_harmonics import coefficient_count
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
 from smplxpp.raster import outer_visible_faces
 from smplxpp.template.template import Template
 
@@ -48,21 +50,18 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         coefficient_count(self.sh_degree)
-        checks = {
-            "count": (self.count >= 1, "at least 1"),
-            "head_share": (self.head_share is None or 0.0 <= self.head_share <= 1.0, "None or a number in [0, 1]"),
-            "spread_by": (self.spread_by in ("area", "face"), "'area' or 'face'"),
-            "hidden_density": (0.0 <= self.hidden_density <= 1.0, "a number in [0, 1]"),
-            "touch": (0.0 < self.touch < np.inf, "a positive number"),
-            "opacity": (0.0 < self.opacity < 1.0, "a number inside (0, 1)"),
-        }
-        for name, (fits, expected) in checks.items():
-            if not fits:
-                raise InputError(f"sampling: {name}", expected=expected, received=repr(getattr(self, name)))
+        require_at_least("sampling: count", self.count, 1)
+        if self.head_share is not None:
+            require_between("sampling: head_share", self.head_share, 0.0, 1.0)
+        require_choice("sampling: spread_by", self.spread_by, ("area", "face"))
+        require_between("sampling: hidden_density", self.hidden_density, 0.0, 1.0)
+        require_positive("sampling: touch", self.touch)
+        if not 0.0 < self.opacity < 1.0:
+            raise InputError("sampling: opacity", expected="a number inside (0, 1)", received=repr(self.opacity))
 
 
 def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> BoundGaussians:
-    """Gaussians on the faces of a template, float32, lying flat, coloured as it is.
+    """Place Gaussians on the faces of a template, float32, lying flat, coloured as it is.
 
     Every region (head, rest) gets its count in proportion to area or faces, hidden faces less. Samples are stratified
     along the faces' order and follow a low-discrepancy sequence inside each face. Tangential scales start at
@@ -97,8 +96,8 @@ def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> 
     return _initial(template, face[order], barycentric[order], density, config)
 
 
-def head_faces(template: Template) -> np.ndarray:
-    """(F,) bool: faces that follow the joint "head" and what hangs on it (jaw, eyes) by more than half their weight.
+def head_faces(template: Template) -> Bool[np.ndarray, " F"]:
+    """Mark the faces that follow the joint "head" and what hangs on it (jaw, eyes) by more than half their weight.
 
     Raises:
         InputError: no joint of that name.
@@ -119,15 +118,15 @@ def head_faces(template: Template) -> np.ndarray:
     return weight[template.faces].mean(1) > 0.5
 
 
-def seen_faces(mesh: TriangleMesh) -> np.ndarray:
-    """(F,) bool: faces that views from outside see, and their neighbours, as small faces may own no pixel."""
+def seen_faces(mesh: TriangleMesh) -> Bool[np.ndarray, " F"]:
+    """Mark the faces that views from outside see, and their neighbours, as small faces may own no pixel."""
     touched = np.zeros(mesh.vertex_count, dtype=bool)
     touched[mesh.faces[outer_visible_faces(mesh)]] = True
     return touched[mesh.faces].any(1)
 
 
 def _stratified(weights: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(count,) faces in proportion to `weights`, and (count, 2) barycentric u, v uniform inside them."""
+    """Draw (count,) faces in proportion to `weights`, and (count, 2) barycentric u, v uniform inside them."""
     cumulative = np.cumsum(weights)
     share = (np.arange(count) + rng.random(count)) * (cumulative[-1] / count)
     face = np.searchsorted(cumulative, share, side="right")

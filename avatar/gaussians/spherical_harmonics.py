@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
@@ -22,7 +23,7 @@ MAX_DEGREE = 3
 
 
 def coefficient_count(degree: int) -> int:
-    """Coefficients of degrees 1 to `degree`: 0, 3, 8, 15.
+    """Return the number of coefficients of degrees 1 to `degree`: 0, 3, 8, 15.
 
     Raises:
         InputError: a degree outside 0 to 3.
@@ -32,18 +33,15 @@ def coefficient_count(degree: int) -> int:
     return (degree + 1) ** 2 - 1
 
 
-def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Harmonics of degrees 1 to `degree` at unit directions, in 3DGS's order and with its signs.
+def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K"]:
+    """Return the harmonics of degrees 1 to `degree` at unit directions, in 3DGS's order and with its signs.
 
     Order m = -l..l in every degree; Condon-Shortley phase, so that degree 1 is `C1 (-y, z, -x)` (Sloan 2008, appendix
     A2). Degree 0 is not among them: its colour is a plain number.
 
     Args:
-        directions: (..., 3) unit.
-        degree: 0 to 3.
-
-    Returns:
-        (..., K), K = (degree + 1)^2 - 1.
+        directions: of length 1.
+        degree: 0 to 3; K is `(degree + 1)^2 - 1`.
     """
     coefficient_count(degree)
     x, y, z = directions.unbind(-1)
@@ -72,13 +70,15 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, -1) if terms else x.new_zeros((*x.shape, 0))
 
 
-def sh_color(dc: Tensor, sh: Tensor, directions: Tensor) -> Tensor:
-    """Colours seen along unit directions: `max(0, dc + sum_k sh_k Y_k(d))`.
+def sh_color(
+    dc: Float[Tensor, "*#B 3"], sh: Float[Tensor, "*#B K 3"], directions: Float[Tensor, "*#B 3"]
+) -> Float[Tensor, "*B 3"]:
+    """Return the colours seen along unit directions: `max(0, dc + sum_k sh_k Y_k(d))`.
 
     3DGS's colour is the same with `dc = 0.5 + C0 f_dc`.
 
     Args:
-        dc: (..., 3). sh: (..., K, 3). directions: (..., 3), in the frame of the coefficients; all broadcast.
+        directions: in the frame of the coefficients.
     """
     degree = int((sh.shape[-2] + 1) ** 0.5) - 1
     if not degree:
@@ -87,22 +87,31 @@ def sh_color(dc: Tensor, sh: Tensor, directions: Tensor) -> Tensor:
     return (dc + (basis[..., None] * sh).sum(-2)).clamp_min(0.0)
 
 
-def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, camera_positions: Tensor) -> Tensor:
-    """Colours of Gaussians as C cameras see them: `SH(sh, R^-1 d) + dc`, not below 0, R the triangle's rotation.
+def view_colors(
+    bound: BoundGaussians,
+    frames: TriangleFrames,
+    means: Float[Tensor, "N 3"],
+    camera_positions: Float[Tensor, "C 3"],
+) -> Float[Tensor, "C N 3"]:
+    """Return colours as C cameras see them: `SH(sh, R^-1 d) + dc`, not below 0, R the triangle's rotation.
 
     Args:
         bound: N Gaussians.
-        frames: (F) frames of one pose.
-        means: (N, 3) world, as `world_from_frames` gives them.
-        camera_positions: (C, 3) centres of projection in the world.
+        frames: of one pose.
+        means: in the world, as `world_from_frames` gives them.
+        camera_positions: centres of projection in the world, metres.
 
     Returns:
-        (C, N, 3), with gradients to the colours, the means, the frames and the positions.
+        Colours with gradients to the colours, the means, the frames and the positions.
 
     Raises:
         InputError: shapes (those of batches of poses too), types or devices that do not fit.
     """
-    expected = {"rotations": (bound.face_count, 3, 3), "means": (len(bound), 3), "camera positions": (None, 3)}
+    expected: dict[str, tuple[int | None, ...]] = {
+        "rotations": (bound.face_count, 3, 3),
+        "means": (len(bound), 3),
+        "camera positions": (None, 3),
+    }
     received = {"rotations": frames.rotations, "means": means, "camera positions": camera_positions}
     for name, shape in expected.items():
         value = tuple(received[name].shape)
@@ -121,9 +130,12 @@ def view_colors(bound: BoundGaussians, frames: TriangleFrames, means: Tensor, ca
 
 
 def view_colors_reference(
-    bound: BoundGaussians, frames: TriangleFrames, means: Tensor, camera_positions: Tensor
-) -> Tensor:
-    """`view_colors` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
+    bound: BoundGaussians,
+    frames: TriangleFrames,
+    means: Float[Tensor, "N 3"],
+    camera_positions: Float[Tensor, "C 3"],
+) -> Float[Tensor, "C N 3"]:
+    """Do as `view_colors` in plain torch: the oracle of the native kernel, and the way for other types and devices."""
     directions = torch.nn.functional.normalize(means - camera_positions[:, None], dim=-1)
     rotations = frames.rotations[bound.face_index]
     # R^T d: the sum runs over rows.
@@ -131,14 +143,14 @@ def view_colors_reference(
     return sh_color(bound.dc, bound.sh, local)
 
 
-def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
-    """Coefficients after a turn of the function: `sum_k out_k Y_k(R d) = sum_k sh_k Y_k(d)` for every direction.
+def rotate_sh(sh: Float[Tensor, "N K 3"], rotations: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N K 3"]:
+    """Return coefficients after a turn of the function: `sum_k out_k Y_k(R d) = sum_k sh_k Y_k(d)` for every direction.
 
     A rotation mixes harmonics of one degree among themselves. Their new coefficients are found from values at fixed
     directions by least squares, which is exact: the turned function is in the span.
 
     Args:
-        sh: (N, K, 3). rotations: (N, 3, 3), a rotation for each Gaussian.
+        rotations: one for each Gaussian.
     """
     degree = int((sh.shape[-2] + 1) ** 0.5) - 1
     if not degree:
@@ -151,7 +163,7 @@ def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
 
 @cache
 def _samples(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (S, 3) spread over the sphere, and (K, S) that takes values there to coefficients."""
+    """Return directions (S, 3) spread over the sphere, and (K, S) that takes values there to coefficients."""
     k = np.arange(32) + 0.5
     z = 1.0 - 2.0 * k / len(k)
     angle, radius = np.pi * (1.0 + 5.0**0.5) * k, np.sqrt(1.0 - z * z)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from smplxpp.core.errors import InputError
 
 
 def check_images(x: Tensor, y: Tensor, mask: Tensor | None = None, *, least: int = 1) -> None:
-    """Two floating-point images (H, W, C) or (B, H, W, C) of one shape, type and device, and weights for their pixels.
+    """Require two float images (H, W, C) or (B, H, W, C) of one shape, type and device, and weights for their pixels.
 
     Raises:
         InputError: anything else; images under `least` pixels a side; a mask that is neither (H, W) nor one an image.
@@ -37,8 +38,8 @@ def check_images(x: Tensor, y: Tensor, mask: Tensor | None = None, *, least: int
         )
 
 
-def total_weight(mask: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Sum of the weights that a mask gives to images (..., H, W, C) of `shape`, channels not counted.
+def total_weight(mask: Shaped[Tensor, "... H W"], shape: tuple[int, ...]) -> Shaped[Tensor, ""]:
+    """Return the sum of the weights that a mask gives to images (..., H, W, C) of `shape`, channels not counted.
 
     Raises:
         InputError: there is none.
@@ -49,8 +50,10 @@ def total_weight(mask: Tensor, shape: tuple[int, ...]) -> Tensor:
     return total
 
 
-def mean(value: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean of (..., H, W, C), or `sum(mask value) / (C sum(mask))` with `mask` (H, W) or (B, H, W)."""
+def mean(
+    value: Float[Tensor, "*B H W C"], mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None
+) -> Float[Tensor, ""]:
+    """Return the mean, or `sum(mask value) / (C sum(mask))` with a mask, one for each image or for all."""
     if mask is None:
         return value.mean()
     weight = mask.to(value.dtype)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians, on_triangles
@@ -23,7 +24,7 @@ class DisplacementLoss:
     output of 1 of the teacher, so that the loss is one between maps and does not depend on the unit of length.
 
     Args:
-        rig: of the template. frame, size: of the teacher's maps. unit: metres.
+        rig: that of the template. frame, size: those of the teacher's maps. unit: metres.
     """
 
     def __init__(self, rig: Rig, frame: MapFrame, size: int, unit: float) -> None:
@@ -31,18 +32,18 @@ class DisplacementLoss:
         self.mask = self.maps.mask
         self.unit = unit
 
-    def __call__(self, displacements: Tensor, teacher: Tensor) -> Tensor:
-        """Scalar, with gradients to the displacements.
+    def __call__(self, displacements: Float[Tensor, "V 3"], teacher: Float[Tensor, "2 S S 3"]) -> Float[Tensor, ""]:
+        """Return the loss, with gradients to the displacements.
 
         Args:
-            displacements: (V, 3) metres. teacher: (2, size, size, 3) metres.
+            displacements: metres. teacher: its maps, metres.
         """
         difference = (self.maps.interpolate(displacements) - teacher).abs().sum(-1)
         return difference[self.mask].mean() / self.unit
 
 
-def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) -> Tensor:
-    """(N, 3) labels of the Gaussians, `e = c + sin(tau v)` interpolated from their triangles' corners.
+def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) -> Float[Tensor, "N 3"]:
+    """Return the labels of the Gaussians, `e = c + sin(tau v)` interpolated from their triangles' corners.
 
     Args:
         tau: radians a metre; v are the corners in the T-pose, c their semantic colours in [0, 1].

@@ -14,9 +14,15 @@ from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.validation import require_choice
+
+log = logging.getLogger(__name__)
+
+MetricName = Literal["st-lpips", "lpips", "none"]
 
 MIN_SIZE = 32
 """Pixels: the coarsest features of a smaller image vanish."""
@@ -37,19 +43,16 @@ class PerceptualDistance(nn.Module, ABC):
     """Distance between features of two images; differentiable in the images, its own weights are fixed.
 
     Attributes:
-        name: of the metric, to be printed with its values.
+        name: the metric's, to be printed with its values.
     """
 
     name: str
 
-    def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Distance of each pair.
+    def forward(self, image: Float[Tensor, "B H W 3"], reference: Float[Tensor, "B H W 3"]) -> Float[Tensor, " B"]:
+        """Return the distance of each pair, 0 for equal images.
 
         Args:
-            image, reference: (B, H, W, 3) in [0, 1], at least 32 pixels a side.
-
-        Returns:
-            (B,), 0 for equal images.
+            image, reference: in [0, 1], at least 32 pixels a side.
 
         Raises:
             InputError: images of another or of different shapes, or too small.
@@ -64,8 +67,8 @@ class PerceptualDistance(nn.Module, ABC):
         return self.distance(x, y)
 
     @abstractmethod
-    def distance(self, x: Tensor, y: Tensor) -> Tensor:
-        """(B, 3, H, W) images in [-1, 1] -> (B,)."""
+    def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
+        """Return the distance of each pair of images in [-1, 1]."""
 
 
 class ShiftTolerantLPIPS(PerceptualDistance):
@@ -76,6 +79,9 @@ class ShiftTolerantLPIPS(PerceptualDistance):
     """
 
     name = "ST-LPIPS"
+    shift: Tensor
+    scale: Tensor
+    binomial: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -96,7 +102,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
 
     @staticmethod
     def from_weights(stored: Mapping[str, Tensor]) -> ShiftTolerantLPIPS:
-        """With the weights of the authors' file.
+        """Make the metric with the weights of the authors' file.
 
         Raises:
             InputError: weights of another network.
@@ -110,25 +116,27 @@ class ShiftTolerantLPIPS(PerceptualDistance):
             )
             state[f"layer_weights.{k}"] = stored.get(f"lin{k}.model.1.weight")
         for name, value in metric.state_dict().items():
-            if state[name] is None or state[name].numel() != value.numel():
+            given = state[name]
+            if given is None or given.numel() != value.numel():
                 raise InputError(
                     "ST-LPIPS weights",
                     expected=f"{name} of shape {tuple(value.shape)}",
-                    received="none" if state[name] is None else f"shape {tuple(state[name].shape)}",
+                    received="none" if given is None else f"shape {tuple(given.shape)}",
                     remedy="use the weight file of stlpips-pytorch 0.0.2",
                 )
-            value.copy_(state[name].reshape(value.shape))
+            value.copy_(given.reshape(value.shape))
         return metric
 
-    def distance(self, x: Tensor, y: Tensor) -> Tensor:
+    def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
+        """Return the distance of each pair of images in [-1, 1]."""
         total = x.new_zeros(len(x))
         for weight, f, g in zip(self.layer_weights, self.features(x), self.features(y), strict=True):
             difference = (_unit(f) - _unit(g)).square()
             total = total + torch.einsum("c,bchw->b", weight, difference) / (f.shape[2] * f.shape[3])
         return total
 
-    def features(self, x: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) in [-1, 1] -> activations of the five layers."""
+    def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Return the activations of the five layers for images in [-1, 1]."""
         conv1, conv2, conv3, conv4, conv5 = self.convs
         first = F.relu(self._reduced(conv1((x - self.shift) / self.scale)))
         second = F.relu(conv2(self._reduced(F.max_pool2d(first, 3, stride=1))))
@@ -150,7 +158,8 @@ class PackagedLPIPS(PerceptualDistance):
         self.name = f"LPIPS ({backbone})"
         self.network = network.requires_grad_(False).eval()
 
-    def distance(self, x: Tensor, y: Tensor) -> Tensor:
+    def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
+        """Return the distance of each pair of images in [-1, 1]."""
         return self.network(x, y).flatten()
 
 
@@ -159,7 +168,7 @@ def _unit(features: Tensor) -> Tensor:
 
 
 def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
-    """ST-LPIPS with the authors' AlexNet weights.
+    """Make ST-LPIPS with the authors' AlexNet weights.
 
     Args:
         weights: their file; None: that of the installed package `stlpips-pytorch`, whose code is not run.
@@ -187,14 +196,13 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
 
 
 def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
-    """LPIPS by the `lpips` package, with the backbone that it finds or downloads: "alex" or "vgg".
+    """Make LPIPS by the `lpips` package, with the backbone that it finds or downloads: "alex" or "vgg".
 
     Raises:
         MissingPackageError: `lpips`, or torchvision which it needs, is not installed.
         InputError: another backbone.
     """
-    if backbone not in ("alex", "vgg"):
-        raise InputError("backbone of LPIPS", expected="'alex' or 'vgg'", received=repr(backbone))
+    require_choice("backbone of LPIPS", backbone, ("alex", "vgg"))
     try:
         import lpips
     except ImportError as error:
@@ -202,20 +210,13 @@ def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
     return PackagedLPIPS(lpips.LPIPS(net=backbone, verbose=False), backbone)
 
 
-log = logging.getLogger(__name__)
-
-
-MetricName = Literal["st-lpips", "lpips", "none"]
-
-
 def load_metric(name: str, *, device: str = "cpu") -> PerceptualDistance | None:
-    """The metric of a name; None for "none", and where its package is not installed, which is logged.
+    """Make the metric of a name; None for "none", and where its package is not installed, which is logged.
 
     Raises:
         InputError: another name.
     """
-    if name not in get_args(MetricName):
-        raise InputError("perceptual metric", expected=f"one of {', '.join(get_args(MetricName))}", received=name)
+    require_choice("perceptual metric", name, get_args(MetricName))
     if name == "none":
         return None
     try:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
+from avatar.losses.psnr import psnr_from_mse
 from avatar.losses.ssim import ssim
-from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from avatar.render.avatar_view import Rendering
@@ -22,9 +23,9 @@ class ReconstructionWeights:
     """Weights of `L_rec = L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha`. The defaults are the paper's.
 
     Attributes:
-        dssim: of `1 - SSIM`. perceptual: of LPIPS or ST-LPIPS. normal: of the L1 between normals.
-        alpha: of the L1 between opacity and mask, which the paper does not have: on a black background dark hair could
-            be a hole.
+        dssim: a, of `1 - SSIM`. perceptual: b, of LPIPS or ST-LPIPS. normal: c, of the L1 between normals.
+        alpha: d, of the L1 between opacity and mask, which the paper does not have: on a black background dark hair
+            could be a hole.
     """
 
     dssim: float = 0.2
@@ -34,9 +35,7 @@ class ReconstructionWeights:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value = getattr(self, f.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"loss weight {f.name}", expected="a number, at least 0", received=repr(value))
+            require_at_least(f"loss weight {f.name}", getattr(self, f.name), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +43,13 @@ class Target:
     """What a rendering should look like.
 
     Attributes:
-        image: (H, W, 3) sRGB on the background. alpha: (H, W). normals: (H, W, 3) world, 0 on the background, or None.
+        image: sRGB on the background. alpha: the person's opacity.
+        normals: in the world's axes, 0 on the background; None where there are none.
     """
 
-    image: Tensor
-    alpha: Tensor
-    normals: Tensor | None = None
+    image: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    normals: Float[Tensor, "H W 3"] | None = None
 
 
 def reconstruction_loss(
@@ -58,8 +58,8 @@ def reconstruction_loss(
     weights: ReconstructionWeights,
     *,
     perceptual: PerceptualDistance | None = None,
-) -> tuple[Tensor, dict[str, float]]:
-    """The weighted sum, and its terms as numbers.
+) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    """Return the weighted sum, and its terms as numbers.
 
     D-SSIM is `1 - SSIM` as in 3DGS's code. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a normal.
     Terms without what they need (no normals, no perceptual distance, an image below its size) are left out.
@@ -86,5 +86,5 @@ def reconstruction_loss(
         square = float((rendering.image.clamp(0.0, 1.0) - target.image).square().mean())
     return total, {
         **{name: float(term.detach()) for name, term in terms.items()},
-        "psnr_crop": -10.0 * math.log10(max(square, 1e-12)),
+        "psnr_crop": psnr_from_mse(square),
     }

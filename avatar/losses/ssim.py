@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from avatar.losses.checks import check_images, mean, total_weight
@@ -29,20 +30,23 @@ C1, C2 = 0.01**2, 0.03**2
 _BORDER = {"zero": 0, "valid": WINDOW // 2}
 
 
-def ssim(x: Tensor, y: Tensor, *, mask: Tensor | None = None, padding: str = "zero") -> Tensor:
-    """Mean structural similarity of two images; 1 where they are equal.
+def ssim(
+    x: Float[Tensor, "*B H W C"],
+    y: Float[Tensor, "*B H W C"],
+    *,
+    mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None,
+    padding: str = "zero",
+) -> Float[Tensor, ""]:
+    """Return the mean structural similarity of two images over pixels, channels and batch; 1 where they are equal.
 
     float32 tensors on the CPU go through the fused kernel, everything else through `ssim_reference`. The kernel gives
     the same bits at any number of threads.
 
     Args:
-        x, y: (H, W, C) or (B, H, W, C), of one shape, in [0, 1]. Gradients flow to both where they ask for it.
-        mask: (H, W) or (B, H, W) weights >= 0: `sum(mask * SSIM) / (C sum(mask))`. Windows are not masked, so
+        x, y: one image or B of them, in [0, 1]. Gradients flow to both where they ask for it.
+        mask: weights >= 0 of one image or of each: `sum(mask * SSIM) / (C sum(mask))`. Windows are not masked, so
             composite both images on one background first. No gradient flows to the mask.
         padding: "zero" or "valid".
-
-    Returns:
-        Scalar mean over pixels, channels and batch.
 
     Raises:
         InputError: shapes, types or devices that do not fit; a mask without weight; "valid" on images under 11 pixels.
@@ -53,8 +57,10 @@ def ssim(x: Tensor, y: Tensor, *, mask: Tensor | None = None, padding: str = "ze
     return _SsimMean.apply(x, y, mask, _BORDER[padding], torch.is_grad_enabled())
 
 
-def ssim_map(x: Tensor, y: Tensor, *, padding: str = "zero") -> Tensor:
-    """Structural similarity at every pixel and channel: the images' shape, or 10 pixels less each way for "valid".
+def ssim_map(
+    x: Float[Tensor, "*B H W C"], y: Float[Tensor, "*B H W C"], *, padding: str = "zero"
+) -> Float[Tensor, "*B h w C"]:
+    """Return the similarity at every pixel and channel; for "valid" the map is 10 pixels less each way.
 
     Arguments and errors are those of `ssim`.
     """
@@ -66,15 +72,23 @@ def ssim_map(x: Tensor, y: Tensor, *, padding: str = "zero") -> Tensor:
     return value if batched else value[0]
 
 
-def ssim_reference(x: Tensor, y: Tensor, *, mask: Tensor | None = None, padding: str = "zero") -> Tensor:
-    """`ssim` in plain torch, in the images' own precision and on their device."""
+def ssim_reference(
+    x: Float[Tensor, "*B H W C"],
+    y: Float[Tensor, "*B H W C"],
+    *,
+    mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None,
+    padding: str = "zero",
+) -> Float[Tensor, ""]:
+    """Do as `ssim` in plain torch, in the images' own precision and on their device."""
     value = ssim_map_reference(x, y, padding=padding)
     check_images(x, y, mask)
     return mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
 
 
-def ssim_map_reference(x: Tensor, y: Tensor, *, padding: str = "zero") -> Tensor:
-    """`ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
+def ssim_map_reference(
+    x: Float[Tensor, "*B H W C"], y: Float[Tensor, "*B H W C"], *, padding: str = "zero"
+) -> Float[Tensor, "*B h w C"]:
+    """Do as `ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
     batched = x.dim() == 4
     x, y, _ = _checked(x, y, None, padding)
     C = x.shape[-1]
@@ -100,6 +114,7 @@ class _SsimMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor, mask: Tensor | None, border: int, differentiate: bool) -> Tensor:
         B, H, W, C = x.shape
+        weight: float
         if mask is None:
             weight = B * (H - 2 * border) * (W - 2 * border)
         else:
@@ -123,7 +138,9 @@ class _SsimMap(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, y: Tensor, border: int) -> Tensor:
         ctx.save_for_backward(x, y)
         ctx.border = border
-        return _inner(_call(x, y, None, border, map_=True)[1], border)
+        values = _call(x, y, None, border, map_=True)[1]
+        assert values is not None  # asked for
+        return _inner(values, border)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -147,13 +164,13 @@ def _call(
     grad_x: bool = False,
     grad_y: bool = False,
 ) -> tuple[float, Tensor | None, Tensor | None, Tensor | None]:
-    """The kernel: sum of scale * weight * SSIM, the map (B, H, W, C), the gradient of the sum by each image.
+    """Run the kernel: sum of scale * weight * SSIM, the map (B, H, W, C), the gradient of the sum by each image.
 
     `weight` is (H, W), (B, H, W) or (B, H, W, C).
     """
     if grad_y and not grad_x:
-        value, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
-        return value, values, None, by_y
+        swapped, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
+        return swapped, values, None, by_y
     B, H, W, C = x.shape
     values, by_x, by_y = (pooled_empty(*x.shape) if wanted else None for wanted in (map_, grad_x, grad_y))
     value = ctypes.c_double()
@@ -187,7 +204,7 @@ def _native(x: Tensor) -> bool:
 
 
 def _inner(value: Tensor, border: int) -> Tensor:
-    """Without the border of the image axes: those before the channels of a map (B, H, W, C), the last two of a mask."""
+    """Cut the border of the image axes off: those before the channels of a map (B, H, W, C), the last two of a mask."""
     if not border:
         return value
     inside = slice(border, -border)
@@ -195,7 +212,7 @@ def _inner(value: Tensor, border: int) -> Tensor:
 
 
 def _checked(x: Tensor, y: Tensor, mask: Tensor | None, padding: str) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Contiguous images with a batch axis, and the mask in their type."""
+    """Return contiguous images with a batch axis, and the mask in their type."""
     if padding not in _BORDER:
         raise InputError("padding of SSIM", expected="'zero' or 'valid'", received=repr(padding))
     check_images(x, y, mask, least=1 if padding == "zero" else WINDOW)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from avatar.data.views import View
 from avatar.gaussians.sampling import head_faces
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
+from avatar.losses.psnr import psnr_from_mse
 from avatar.losses.ssim import ssim
 from smplxpp.core.camera import Camera
 from smplxpp.template.template import Template
@@ -54,11 +54,6 @@ class ViewQuality:
     perceptual_head: float | None = None
 
 
-def decibels(mean_square: float) -> float:
-    """Peak signal-to-noise ratio of images in [0, 1]: `-10 log10(mean square error)`; infinite for equal images."""
-    return -10.0 * math.log10(mean_square) if mean_square > 0 else math.inf
-
-
 def view_quality(
     view: View,
     image: Tensor,
@@ -84,12 +79,12 @@ def view_quality(
     if head is not None:
         part = (slice(head[1], head[3]), slice(head[0], head[2]))
         if bool(person[part].any()):
-            psnr_head = decibels(float(error[part][person[part]].mean()))
+            psnr_head = psnr_from_mse(float(error[part][person[part]].mean()))
             ssim_head = float(ssim(image[part].contiguous(), real[part].contiguous()))
             perceptual_head = _distance(metric, image[part], real[part])
     return ViewQuality(
-        psnr=decibels(float(error[person].mean())),
-        psnr_image=decibels(float(error.mean())),
+        psnr=psnr_from_mse(float(error[person].mean())),
+        psnr_image=psnr_from_mse(float(error.mean())),
         ssim=float(ssim(image, real)),
         psnr_head=psnr_head,
         ssim_head=ssim_head,

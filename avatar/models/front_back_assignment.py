@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.models.networks.map_sampling import MapSampler
@@ -15,35 +16,37 @@ from avatar.rig.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class FrontBackAssignment:
-    """Sides of P points.
+    """The sides of P points.
 
     Attributes:
-        front: (P,) bool, the side whose surface is the nearer one along z.
-        behind: (P,) metres by which the point lies below the surface that this side shows; 0 where it shows none.
+        front: whether the front is the side whose surface is the nearer one along z.
+        behind: metres by which the point lies below the surface that this side shows; 0 where it shows none.
     """
 
-    front: Tensor
-    behind: Tensor
+    front: Bool[Tensor, " P"]
+    behind: Float[Tensor, " P"]
 
 
-def assign_front_back(rig: Rig, frame: MapFrame, size: int, points: Tensor, normals: Tensor) -> FrontBackAssignment:
-    """Sides by depth, not by the direction that a point faces.
+def assign_front_back(
+    rig: Rig, frame: MapFrame, size: int, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
+) -> FrontBackAssignment:
+    """Choose the side of every point by depth, not by the direction that a point faces.
 
     A fold of the front of a skirt has a far side, which faces backwards: on the back map at its place is the back of
     the skirt, a hand's breadth away, which moves in another way. Where the maps show nothing, the normal decides.
 
     Args:
-        frame, size: of the maps. points: (P, 3) canonical, metres. normals: (P, 3).
+        frame, size: those of the maps. points: canonical, metres.
     """
     maps = front_back_maps(rig.vertices, rig.faces, frame, size=size)
     shown = maps.mask.to(points.dtype)
     # Heights without the background: blended with it, they would be nowhere.
     table = torch.stack([maps.interpolate(rig.vertices)[..., 2] * shown, shown], dim=-1)[None]
     distances, belows = [], []
-    for front in (True, False):
-        side = torch.full((len(points),), front, device=points.device)
+    for is_front in (True, False):
+        side = torch.full((len(points),), is_front, device=points.device)
         height, weight = MapSampler(frame, size, points, side)(table)[0].unbind(-1)
-        below = (height / weight.clamp(min=1e-6) - points[:, 2]) * (1.0 if front else -1.0)
+        below = (height / weight.clamp(min=1e-6) - points[:, 2]) * (1.0 if is_front else -1.0)
         seen = weight > 1e-3
         distances.append(below.abs().masked_fill(~seen, torch.inf))
         belows.append(below.masked_fill(~seen, 0.0))

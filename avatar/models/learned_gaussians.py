@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians
 
@@ -20,6 +18,16 @@ class LearnedGaussians(nn.Module):
         start: where the attributes begin.
     """
 
+    face_index: Tensor
+    barycentric: Tensor
+    normal_offset: nn.Parameter
+    offset: nn.Parameter
+    log_scales: nn.Parameter
+    quats: nn.Parameter
+    opacity_logits: nn.Parameter
+    dc: nn.Parameter
+    sh: nn.Parameter
+
     def __init__(self, start: BoundGaussians) -> None:
         super().__init__()
         self.face_count, self.topology = start.face_count, start.topology
@@ -33,15 +41,15 @@ class LearnedGaussians(nn.Module):
         return len(self.face_index)
 
     def forward(self) -> BoundGaussians:
-        """The Gaussians as they stand, with gradients to the attributes."""
+        """Return the Gaussians as they stand, with gradients to the attributes."""
         named = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         return BoundGaussians(**named, face_count=self.face_count, topology=self.topology)
 
     def snapshot(self) -> BoundGaussians:
-        """Detached copies on the CPU."""
+        """Return detached copies on the CPU."""
         bound = self()
         copies = {name: value.detach().cpu().clone() for name, value in bound.tensors.items()}
-        return replace(bound, **copies)
+        return BoundGaussians(**copies, face_count=self.face_count, topology=self.topology)
 
     def normalise_quats(self) -> None:
         """Give all quaternions length 1, so that residuals added to them have one scale."""

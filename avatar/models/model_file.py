@@ -13,8 +13,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
+from avatar.models.config_dict import config_from_dict, config_to_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.networks.config import config_from_dict, config_to_dict
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
@@ -74,16 +74,24 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
             remedy="train again: the template was built anew since",
         )
     gaussians = _gaussians(tensors, about)
+    model: TeacherAvatar | Student
     if about["kind"] == "teacher":
-        model: TeacherAvatar | Student = TeacherAvatar(config_from_dict(TeacherConfig, about["config"]), rig, gaussians)
-        if "track_controls" in tensors:
-            frames, controls = tensors["track_frames"].tolist(), tensors["track_controls"]
-            row = {frame: k for k, frame in enumerate(frames)}
-            model.remember(Track(row, controls, ControlCage(rig, controls.shape[1])))
+        model = _teacher(about, tensors, rig, gaussians)
     else:
         model = _student(about, tensors, rig, gaussians)
     _load(model, tensors, path)
     return model.eval()
+
+
+def _teacher(
+    about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, gaussians: BoundGaussians
+) -> TeacherAvatar:
+    teacher = TeacherAvatar(config_from_dict(TeacherConfig, about["config"]), rig, gaussians)
+    if "track_controls" in tensors:
+        frames, controls = tensors["track_frames"].tolist(), tensors["track_controls"]
+        row = {frame: k for k, frame in enumerate(frames)}
+        teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1])))
+    return teacher
 
 
 def _student(about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, gaussians: BoundGaussians) -> Student:

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
@@ -27,8 +28,8 @@ class StudentConfig:
     """What a student is made of. The defaults are the paper's.
 
     Attributes:
-        field: of the mesh's motion; None: the mesh follows its joints alone.
-        blend_shapes: of the Gaussians; None: they have none (as before the compensation).
+        field: that of the mesh's motion; None: the mesh follows its joints alone.
+        blend_shapes: those of the Gaussians; None: they have none (as before the compensation).
         control_points: vertices that the field is evaluated on, interpolated to the rest; 0: all vertices.
     """
 
@@ -48,7 +49,7 @@ class Student(nn.Module):
 
     Args:
         config: which of these there are.
-        rig: of the template. gaussians: on it.
+        rig: that of the template. gaussians: those on it.
         frames: the frames that have a code.
         blend_shapes: fitted to these Gaussians; None makes new ones where the configuration has them.
     """
@@ -66,7 +67,7 @@ class Student(nn.Module):
         gaussians.check_topology(rig.faces, "template of the student")
         self.config, self.rig = config, rig
         self.gaussians = LearnedGaussians(gaussians)
-        self.field = None if config.field is None else _make_field(config, rig)
+        self.field = None if config.field is None else _make_field(config.field, config.control_points, rig)
         self.codes = None if config.field is None else FrameCodes(frames, config.field.code_size)
         if blend_shapes is None and config.blend_shapes is not None:
             blend_shapes = make_blend_shapes(config.blend_shapes, rig, gaussians)
@@ -75,18 +76,18 @@ class Student(nn.Module):
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Frames that have a code."""
+        """The frames that have a code."""
         return () if self.codes is None else self.codes.frames
 
-    def displacements(self, motion: Motion) -> Tensor | None:
-        """(V, 3) metres of the field in a pose; None without a field."""
-        if self.field is None:
+    def displacements(self, motion: Motion) -> Float[Tensor, "V 3"] | None:
+        """Return the field's displacements in a pose, metres; None without a field."""
+        if self.field is None or self.codes is None:
             return None
         frame = motion.frame if motion.frame in self.codes.row else None
         return self.field(motion.pose[None], self.codes([frame]))[0]
 
     def compensated(self, motion: Motion) -> BoundGaussians:
-        """The Gaussians with their blend shapes of a pose added."""
+        """Return the Gaussians with their blend shapes of a pose added."""
         bound = self.gaussians()
         if self.blend_shapes is None:
             return bound
@@ -94,8 +95,8 @@ class Student(nn.Module):
         du, dc = self.blend_shapes(self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw))
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The student in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the student as cameras with these centres, metres, see it."""
         displacements = self.displacements(motion)
         vertices = self.rig.pose(motion, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
@@ -106,9 +107,9 @@ class Student(nn.Module):
         return PosedAvatar(vertices, world, colors, bound, displacements)
 
     def with_blend_shapes(self, blend_shapes: BlendShapes | BlendShapeConfig | None) -> Student:
-        """The same student with other blend shapes; a configuration makes new ones, which start at zero."""
+        """Make the same student with other blend shapes; a configuration makes new ones, which start at zero."""
         given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
-        shapes_config = given.config if given is not None else blend_shapes
+        shapes_config = blend_shapes.config if isinstance(blend_shapes, BlendShapes) else blend_shapes
         other = Student(
             replace(self.config, blend_shapes=shapes_config),
             self.rig,
@@ -116,21 +117,21 @@ class Student(nn.Module):
             self.frames,
             blend_shapes=given,
         )
-        if self.field is not None:
-            other.field.load_state_dict(self.field.state_dict())
-            other.codes.load_state_dict(self.codes.state_dict())
+        for mine, its in ((self.field, other.field), (self.codes, other.codes)):
+            if mine is not None and its is not None:
+                its.load_state_dict(mine.state_dict())
         return other
 
 
-def _make_field(config: StudentConfig, rig: Rig) -> DeformationField:
-    control = template_control_points(rig.template, config.control_points) if config.control_points else None
-    steps = config.field.local_pose
+def _make_field(config: FieldConfig, control_points: int, rig: Rig) -> DeformationField:
+    control = template_control_points(rig.template, control_points) if control_points else None
+    steps = config.local_pose
     seen = torch.tensor(seen_joints(rig.template, steps), device=rig.device) if steps else None
-    return DeformationField(config.field, rig.vertices, rig.cloth_mask, control=control, seen=seen)
+    return DeformationField(config, rig.vertices, rig.cloth_mask, control=control, seen=seen)
 
 
 def make_blend_shapes(config: BlendShapeConfig, rig: Rig, gaussians: BoundGaussians) -> BlendShapes:
-    """Blend shapes at zero for Gaussians on a template: parts by place, head weights by the head's faces."""
+    """Make blend shapes at zero for Gaussians on a template: parts by place, head weights by the head's faces."""
     part = head_weight = None
     if config.parts > 1:
         centers = rig.template.mesh.triangles.mean(axis=1)[gaussians.face_index.cpu().numpy()]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
@@ -35,13 +36,13 @@ class TeacherMaps:
     """What the networks are shown of a pose.
 
     Attributes:
-        positions: (1, 2, S, S, 3) posed coordinates without the root's motion, metres; or, `centred`, by how many
+        positions: posed coordinates without the root's motion, metres; or, `centred`, by how many
             deviations they differ from the mean.
-        cosines: (C, 2, S, S) between posed normals and the directions to C cameras, or None.
+        cosines: those between posed normals and the directions to C cameras, or None.
     """
 
-    positions: Tensor
-    cosines: Tensor | None
+    positions: Float[Tensor, "1 2 S S 3"]
+    cosines: Float[Tensor, "C 2 S S"] | None
 
 
 class TeacherAvatar(nn.Module):
@@ -51,9 +52,14 @@ class TeacherAvatar(nn.Module):
     attributes, R the rotation of the triangle in the T-pose.
 
     Args:
-        config: of the networks.
-        rig: of the template. gaussians: on it; their quaternions are brought to length 1.
+        config: that of the networks.
+        rig: that of the template. gaussians: those on it; their quaternions are brought to length 1.
     """
+
+    canonical_from_local: Tensor
+    semantics: Tensor
+    mean_positions: Tensor
+    deviation: Tensor
 
     def __init__(self, config: TeacherConfig, rig: Rig, gaussians: BoundGaussians) -> None:
         super().__init__()
@@ -82,14 +88,17 @@ class TeacherAvatar(nn.Module):
     def remember(self, track: Track) -> None:
         """Keep the surface that was followed through the training frames; it is saved with the teacher."""
         self.track = track = replace(track, controls=track.controls.to(self.rig.device))
-        self.register_buffer("track_frames", torch.tensor(sorted(track.row, key=track.row.get), device=self.rig.device))
+        frames = sorted(track.row, key=lambda frame: track.row[frame])
+        self.register_buffer("track_frames", torch.tensor(frames, device=self.rig.device))
         self.register_buffer("track_controls", track.controls)
 
     def centre(self, motions: Iterable[Motion]) -> None:
         """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""
         if not self.config.centred:
             return
-        count, total, squares = 0, 0.0, 0.0
+        count = 0
+        total = torch.zeros_like(self.mean_positions, dtype=torch.float64)
+        squares = torch.zeros_like(total)
         for motion in motions:
             _, positions = self._root_positions(motion)
             count, total, squares = count + 1, total + positions.double(), squares + positions.double().square()
@@ -100,26 +109,26 @@ class TeacherAvatar(nn.Module):
 
     @contextmanager
     def _exact(self) -> Iterator[None]:
-        """Without gradients and in full precision: half of it would round positions in the world to millimetres."""
+        """Work without gradients and in full precision: half of it would round the world's positions to millimetres."""
         with torch.no_grad(), torch.autocast(self.rig.device.type, enabled=False):
             yield
 
     def _root_positions(self, motion: Motion) -> tuple[Tensor, Tensor]:
-        """Skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
+        """Return the skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
         with self._exact():
             to_root = motion.root_from_world
             vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
             return vertices, self.maps.interpolate(vertices)
 
-    def position_input(self, motion: Motion) -> Tensor:
-        """(1, 2, S, S, 3) maps of a pose as the networks are shown them; a constant for gradients."""
+    def position_input(self, motion: Motion) -> Float[Tensor, "1 2 S S 3"]:
+        """Return the maps of a pose as the networks are shown them; a constant for gradients."""
         return self._shown(self._root_positions(motion)[1])
 
     def _shown(self, positions: Tensor) -> Tensor:
         return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
-    def inputs(self, motion: Motion, camera_centers: Tensor) -> TeacherMaps:
-        """Maps of a pose and of C cameras at `camera_centers` (C, 3); constants for gradients."""
+    def inputs(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
+        """Return the maps of a pose and of cameras with these centres, metres; constants for gradients."""
         with self._exact():
             to_root = motion.root_from_world
             vertices, positions = self._root_positions(motion)
@@ -131,22 +140,22 @@ class TeacherAvatar(nn.Module):
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
             return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
 
-    def residual_maps(self, motion: Motion, camera_centers: Tensor) -> Residuals:
-        """Maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
+    def residual_maps(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> Residuals:
+        """Return the maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
         maps = self.inputs(motion, camera_centers)
         return self.networks(maps.positions, self.semantics, maps.cosines)
 
-    def displacement_maps(self, motions: Sequence[Motion]) -> Tensor:
-        """(B, 2, R, R, 3) metres, dU in B poses; the networks of other residuals do not run if they are apart."""
+    def displacement_maps(self, motions: Sequence[Motion]) -> Float[Tensor, "B 2 R R 3"]:
+        """Return dU in B poses, metres; the networks of other residuals do not run if they are apart."""
         inputs = torch.cat([self.position_input(motion) for motion in motions])
         return self.config.position_scale * self.networks.positions(inputs, self.semantics)
 
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The teacher in a pose, as C cameras at `camera_centers` (C, 3) see it."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the teacher as cameras with these centres, metres, see it."""
         return self.posed(motion, camera_centers, self.residual_maps(motion, camera_centers))
 
-    def posed(self, motion: Motion, camera_centers: Tensor, maps: Residuals) -> PosedAvatar:
-        """`forward` from residual maps at hand."""
+    def posed(self, motion: Motion, camera_centers: Float[Tensor, "C 3"], maps: Residuals) -> PosedAvatar:
+        """Do what `forward` does, from residual maps at hand."""
         residuals = maps.sampled(self.sampler)
         bound = self.gaussians()
         bound = replace(
@@ -170,7 +179,7 @@ class TeacherAvatar(nn.Module):
 
 
 def map_frame(rig: Rig) -> MapFrame:
-    """Square of the canonical maps: +- 1 m about the middle of the T-pose's box, and larger for a larger body."""
+    """Return the square of the canonical maps: +- 1 m about the middle of the T-pose's box, more for a larger body."""
     vertices = rig.template.vertices
     reach = float((vertices.max(axis=0) - vertices.min(axis=0))[:2].max() / 2.0)
     # A Gaussian may stand a little off the surface.

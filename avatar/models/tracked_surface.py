@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
@@ -24,8 +25,11 @@ class ControlCage(nn.Module):
     """Interpolates displacements of K control points of a template to its vertices, part by part.
 
     Args:
-        rig: of the template. count: K.
+        rig: that of the template. count: K.
     """
+
+    off_clothes: Tensor
+    edges: Tensor
 
     def __init__(self, rig: Rig, count: int) -> None:
         super().__init__()
@@ -39,16 +43,16 @@ class ControlCage(nn.Module):
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
 
-    def forward(self, controls: Tensor) -> Tensor:
-        """(K, 3) -> (V, 3) metres."""
+    def forward(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, "V 3"]:
+        """Return the displacements of the vertices, metres, from those of the control points."""
         return self.rows(controls)
 
-    def roughness(self, controls: Tensor) -> Tensor:
-        """Mean squared difference of neighbours, square metres."""
+    def roughness(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
+        """Return the mean squared difference of neighbours, square metres."""
         return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
 
-    def motion_off_clothes(self, controls: Tensor) -> Tensor:
-        """Mean distance, metres, by which points of body, hair and shoes leave skinning; 0 where there are none."""
+    def motion_off_clothes(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
+        """Return by how many metres, on average, points of body, hair and shoes leave skinning; 0 without any."""
         moved = controls[self.off_clothes].square().sum(-1)
         return ((moved + STILL**2).sqrt() - STILL).sum() / max(len(moved), 1)
 
@@ -57,8 +61,8 @@ class TrackedAvatar(nn.Module):
     """Gaussians on a mesh that control points move in one frame at a time (an `AvatarModel`).
 
     Args:
-        rig: of the template. gaussians: on it; they stay as they are.
-        count: control points.
+        rig: that of the template. gaussians: those on it; they stay as they are.
+        count: number of control points.
     """
 
     def __init__(self, rig: Rig, gaussians: BoundGaussians, count: int) -> None:
@@ -67,11 +71,11 @@ class TrackedAvatar(nn.Module):
         self.gaussians = LearnedGaussians(gaussians)
         self.cage = ControlCage(rig, count)
         self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
-        """(K, 3) metres, of the frame that is being followed."""
+        """Displacements (K, 3), metres, in the frame that is being followed."""
         self.to(rig.device)
 
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The avatar in a pose, displaced by the control points as they stand."""
+    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the avatar, displaced by the control points as they stand."""
         displacements = self.cage(self.controls)
         vertices = self.rig.pose(motion, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
@@ -86,14 +90,14 @@ class Track:
     """A surface followed through frames.
 
     Attributes:
-        row: of every frame. cage: interpolates the controls.
-        controls: (T, K, 3) metres, 0 in a frame whose surface the template is.
+        row: each frame's row of the controls. cage: interpolates them.
+        controls: metres, 0 in a frame whose surface the template is.
     """
 
     row: dict[int, int]
-    controls: Tensor
+    controls: Float[Tensor, "T K 3"]
     cage: ControlCage
 
-    def displacements(self, frame: int) -> Tensor:
-        """(V, 3) metres along the axes of the T-pose."""
+    def displacements(self, frame: int) -> Float[Tensor, "V 3"]:
+        """Return the displacements of a frame, metres along the axes of the T-pose."""
         return self.cage(self.controls[self.row[frame]])

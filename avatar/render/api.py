@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.render.reference import camera_depths, rasterize_reference
@@ -19,17 +20,17 @@ DEPTHS = ("accumulated", "expected")
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    features: Float[Tensor, "N D"] | Float[Tensor, "C N D"],
+    viewmats: Float[Tensor, "C 4 4"],
+    Ks: Float[Tensor, "C 3 3"],
     width: int,
     height: int,
     *,
-    background: Tensor | None = None,
+    background: Float[Tensor, " D"] | Float[Tensor, "C D"] | None = None,
     near: float = 0.01,
     far: float = 1e10,
     eps2d: float = 0.3,
@@ -37,8 +38,8 @@ def rasterize(
     camera_gradients: bool = False,
     backend: Literal["cpu", "gsplat", "reference"] | None = None,
     check: bool = True,
-) -> tuple[Tensor, Tensor, RasterMeta]:
-    """Images of 3D Gaussians with any number of channels, with gradients; gsplat's semantics on every backend.
+) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], RasterMeta]:
+    """Return images of 3D Gaussians with any number of channels, with gradients; gsplat's semantics on every backend.
 
     A Gaussian's opacity at a pixel centre p is `alpha = min(0.999, o exp(-sigma))`,
     `sigma = (p - m)^T S^-1 (p - m) / 2`, with m and S its projected centre and covariance (blurred by `eps2d`).
@@ -50,15 +51,15 @@ def rasterize(
     `backend="reference"` also gives those of Ks.
 
     Args:
-        means: (N, 3) centres in the world, metres. N may be 0.
-        quats: (N, 4) rotations, wxyz, of any length but 0.
-        scales: (N, 3) standard deviations along the rotated axes, metres, positive.
-        opacities: (N,) in [0, 1].
-        features: (N, D), or (C, N, D) where they differ from camera to camera (colours that depend on the view).
-        viewmats: (C, 4, 4) world to camera: x right, y down, z forward.
-        Ks: (C, 3, 3) intrinsics in pixels, without skew; pixel centres at +0.5.
+        means: centres in the world, metres. N may be 0.
+        quats: rotations, wxyz, of any length but 0.
+        scales: standard deviations along the rotated axes, metres, positive.
+        opacities: in [0, 1].
+        features: D channels, given a camera where they differ from camera to camera (colours that depend on the view).
+        viewmats: world to camera: x right, y down, z forward.
+        Ks: intrinsics in pixels, without skew; pixel centres at +0.5.
         width, height: size of every image in pixels.
-        background: (D,) or (C, D); None is 0.
+        background: one for all cameras or one for each; None is 0.
         near, far: metres along z; a Gaussian whose centre is outside is dropped.
         eps2d: pixels squared added to the diagonal of the projected covariance.
         depth: also blend z in metres, as `meta.depth`: "accumulated" is `sum alpha_i T_i z_i`, "expected" that over
@@ -69,7 +70,7 @@ def rasterize(
         check: look for NaN and unusable values. Without it they give undefined images.
 
     Returns:
-        Images (C, H, W, D), their alpha (C, H, W, 1) before the background, and the `RasterMeta`.
+        Images, their alpha before the background, and the `RasterMeta`.
 
     Raises:
         InputError: an argument cannot be used; it says which, what was expected and what came.
@@ -113,7 +114,7 @@ def rasterize(
 
 
 def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[..., tuple[Tensor, Tensor, RasterMeta]]:
-    """The backend's function, imported when it is first needed."""
+    """Return the backend's function, imported when it is first needed."""
     if name is not None and name not in BACKENDS:
         raise InputError("backend", expected=f"None or one of {', '.join(BACKENDS)}", received=repr(name))
     if name == "reference":
@@ -144,7 +145,7 @@ def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[...
 
 
 def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Features with the Gaussians' z as one more channel, and the background with 0 there."""
+    """Return features with the Gaussians' z as one more channel, and the background with 0 there."""
     features, depths = tensors["features"], camera_depths(tensors["means"], tensors["viewmats"])
     cameras = len(depths)
     if cameras == 1 and features.ndim == 2:
@@ -157,9 +158,9 @@ def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -
 def _draw_nothing(
     tensors: dict[str, Tensor], background: Tensor | None, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, RasterMeta]:
-    """The background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
+    """Return the background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
     cameras, count, features = len(tensors["viewmats"]), len(tensors["means"]), tensors["features"]
-    nothing = sum(tensor.sum() for tensor in tensors.values()) * 0
+    nothing = torch.stack([tensor.sum() for tensor in tensors.values()]).sum() * 0
     image = nothing.expand(cameras, settings.height, settings.width, features.shape[-1])
     if background is not None:
         image = image + background[:, None, None, :]
@@ -169,6 +170,6 @@ def _draw_nothing(
 
 
 def _divide(blended: Tensor, alpha: Tensor) -> Tensor:
-    """`blended / alpha`, and 0 with gradient 0 where alpha is 0."""
+    """Return `blended / alpha`, and 0 with gradient 0 where alpha is 0."""
     seen = alpha > 0
     return torch.where(seen, blended / torch.where(seen, alpha, 1.0), 0.0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.render.api import rasterize
@@ -20,33 +21,33 @@ class Rendering:
     """What one camera sees.
 
     Attributes:
-        image: (H, W, 3) sRGB on the background, not clamped. alpha: (H, W).
-        normals: (H, W, 3) blended world normals, 0 where nothing is; None if not asked for.
-        extra: (H, W, D) blended values of the Gaussians; None if there were none.
+        image: sRGB on the background, not clamped. alpha: its opacity.
+        normals: blended world normals, 0 where nothing is; None if not asked for.
+        extra: blended values of the Gaussians; None if there were none.
     """
 
-    image: Tensor
-    alpha: Tensor
-    normals: Tensor | None = None
-    extra: Tensor | None = None
+    image: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    normals: Float[Tensor, "H W 3"] | None = None
+    extra: Float[Tensor, "H W D"] | None = None
 
 
 def render_view(
     posed: PosedAvatar,
     index: int,
     view: View,
-    background: Tensor,
+    background: Float[Tensor, " 3"],
     *,
     eps2d: float = 0.1,
     normals: bool = False,
-    extra: Tensor | None = None,
+    extra: Float[Tensor, "N D"] | None = None,
 ) -> Rendering:
     """Rasterise camera `index` of the posed avatar's C, through the pixels of `view`, with gradients.
 
     Args:
-        background: (3,) behind the person; normals and extra values have 0 there.
+        background: the colour behind the person; normals and extra values have 0 there.
         eps2d: see `rasterize`.
-        normals: draw the Gaussians' normals too. extra: (N, D) more values a Gaussian.
+        normals: draw the Gaussians' normals too. extra: D more values a Gaussian.
     """
     world = posed.gaussians
     features = [posed.colors[index]]

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
 from smplxpp.core.camera import Camera
 
 
-def ray_from_pixel(camera: Camera) -> np.ndarray:
-    """(3, 3) from (px, py, 1) to the camera's frame: a pinhole's ray at depth 1, or x and y of a parallel ray."""
+def ray_from_pixel(camera: Camera) -> Float64[np.ndarray, "3 3"]:
+    """Return what takes (px, py, 1) to the camera's frame: a pinhole's ray at depth 1, or x and y of a parallel ray."""
     K = np.eye(3)
     K[:2] = camera.K[:2]
     return np.linalg.inv(K)
 
 
-def barycentrics_reference(vertices: Tensor, faces: Tensor, face_id: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Barycentrics (H, W, 3) and depth (H, W) of the point of face `face_id` (H, W) that a pixel's ray meets.
+def barycentrics_reference(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], face_id: Int32[Tensor, "H W"], camera: Camera
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Return barycentrics and depth of the point of face `face_id` that a pixel's ray meets.
 
     With r the ray and a, b, c the corners in the camera's frame, `w_a = r . (b x c)` and so on, and the barycentrics
     are `w / sum(w)`: the point `sum(w p) / sum(w)` lies on the ray. For parallel rays r and the corners have 1 for z.
@@ -39,8 +42,13 @@ def barycentrics_reference(vertices: Tensor, faces: Tensor, face_id: Tensor, cam
     return barycentric, vertices.new_full(face_id.shape, torch.inf).index_put((rows, cols), z.to(vertices.dtype))
 
 
-def interpolate_reference(values: Tensor, barycentric: Tensor, faces: Tensor, face_id: Tensor) -> Tensor:
-    """(V, D) values at the barycentrics (..., 3) of faces (...): (..., D), 0 on the background."""
+def interpolate_reference(
+    values: Float[Tensor, "V D"],
+    barycentric: Float[Tensor, "*P 3"],
+    faces: Int[Tensor, "F 3"],
+    face_id: Int32[Tensor, "*P"],
+) -> Float[Tensor, "*P D"]:
+    """Interpolate vertex values at the barycentrics of faces; 0 on the background."""
     hit = face_id >= 0
     seen = (barycentric[hit][..., None] * values[faces[face_id[hit].long()]]).sum(1)
     return seen.new_zeros((*face_id.shape, values.shape[1])).index_put(hit.nonzero(as_tuple=True), seen)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.render.memory import pooled_empty
-from avatar.render.native import View, Workspace
+from avatar.render.native import CameraCall, Workspace
 from avatar.render.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
 
@@ -16,34 +19,34 @@ MAX_COUNT = 2**31 - 1
 
 
 def rasterize_cpu(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    background: Tensor | None,
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    features: Float[Tensor, "N D"] | Float[Tensor, "C N D"],
+    viewmats: Float[Tensor, "C 4 4"],
+    Ks: Float[Tensor, "C 3 3"],
+    background: Float[Tensor, "C D"] | None,
     settings: RasterSettings,
-) -> tuple[Tensor, Tensor, RasterMeta]:
-    """Images of N-channel Gaussians in single precision, with gradients to all but `Ks`.
+) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], RasterMeta]:
+    """Return images of D-channel Gaussians in single precision, with gradients to all but `Ks`.
 
     Runs on `torch.get_num_threads()` threads; the picture is the same for any number of them, the gradients bit for bit
     for a fixed number. Image and alpha are exact to about 1e-6, gradients to about 1e-5 of their largest entry.
 
     Args:
-        means: (N, 3) float32, as all the others; metres.
-        quats: (N, 4) wxyz, of any length but 0.
-        scales: (N, 3) metres.
-        opacities: (N,) in [0, 1].
-        features: (N, D), or (C, N, D) for features of each camera.
-        viewmats: (C, 4, 4) world to camera, OpenCV's axes.
-        Ks: (C, 3, 3) intrinsics in pixels, without skew.
-        background: (C, D) or None for 0.
+        means: metres, float32 as all the others.
+        quats: wxyz, of any length but 0.
+        scales: metres.
+        opacities: in [0, 1].
+        features: channels, the same for all cameras or those of each.
+        viewmats: world to camera, OpenCV's axes.
+        Ks: intrinsics in pixels, without skew.
+        background: None is 0.
         settings: image size and constants; without `camera_gradients` the poses get none.
 
     Returns:
-        Images (C, H, W, D), their alpha (C, H, W, 1), and what was found on the way.
+        Images, their alpha, and what was found on the way.
 
     Raises:
         InputError: not float32.
@@ -63,9 +66,24 @@ def rasterize_cpu(
     return image, alpha, RasterMeta(means2d=means2d, radii=radii, depths=depths)
 
 
+_Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]
+"""Means, quaternions, scales, opacities, features, poses, intrinsics and background."""
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, features, viewmats, Ks, background, settings):
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        background: Tensor | None,
+        settings: RasterSettings,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         cameras, count, channels = len(viewmats), len(means), features.shape[-1]
         image = pooled_empty(cameras, settings.height, settings.width, channels)
         alpha = pooled_empty(cameras, settings.height, settings.width, 1)
@@ -85,7 +103,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_image, grad_alpha, *_):
+    def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         *inputs, radii = ctx.saved_tensors
         *gaussians, features, viewmats, _, background = inputs
         if grad_image is None and grad_alpha is None:
@@ -96,7 +114,9 @@ class _Rasterize(torch.autograd.Function):
         poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
         grad_background = torch.empty_like(background) if ctx.needs_input_grad[7] else None
         own_features = features.ndim == 3
-        for camera, (view, workspace) in enumerate(zip(_views(inputs, ctx.settings), ctx.workspaces, strict=True)):
+        for camera, (view, workspace) in enumerate(
+            zip(_views(tuple(inputs), ctx.settings), ctx.workspaces, strict=True)
+        ):
             workspace.backward(
                 view,
                 radii[camera],
@@ -115,12 +135,12 @@ class _Rasterize(torch.autograd.Function):
         return (*grads, grad_viewmats, None, grad_background, None)
 
 
-def _views(inputs: tuple[Tensor | None, ...], settings: RasterSettings) -> list[View]:
-    """What the library needs to know of each camera."""
-    *gaussians, features, viewmats, Ks, background = inputs
+def _views(inputs: _Inputs, settings: RasterSettings) -> list[CameraCall]:
+    """Return what the library needs to know of each camera."""
+    means, quats, scales, opacities, features, viewmats, Ks, background = inputs
     return [
-        View(
-            (*gaussians, features if features.ndim == 2 else features[camera]),
+        CameraCall(
+            (means, quats, scales, opacities, features if features.ndim == 2 else features[camera]),
             (viewmats[camera], Ks[camera], None if background is None else background[camera]),
             settings,
         )

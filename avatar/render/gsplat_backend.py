@@ -9,6 +9,7 @@ from __future__ import annotations
 from types import ModuleType
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.render.reference import camera_depths
@@ -20,17 +21,17 @@ SUPPORTED = "1.5."
 
 
 def rasterize_gsplat(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    background: Tensor | None,
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    features: Float[Tensor, "N D"] | Float[Tensor, "C N D"],
+    viewmats: Float[Tensor, "C 4 4"],
+    Ks: Float[Tensor, "C 3 3"],
+    background: Float[Tensor, "C D"] | None,
     settings: RasterSettings,
-) -> tuple[Tensor, Tensor, RasterMeta]:
-    """`rasterize_reference` on a GPU in float32; arguments and results as there, but no gradient to `Ks`.
+) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], RasterMeta]:
+    """Do as `rasterize_reference` on a GPU in float32; arguments and results as there, but no gradient to `Ks`.
 
     Its gradients are summed by atomic additions: two runs differ in the last digits.
 

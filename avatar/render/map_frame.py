@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from smplxpp.core.camera import Camera
@@ -19,7 +20,7 @@ class MapFrame:
     shows the front and the back of the same place.
 
     Attributes:
-        center: (3,) metres, the middle of the canonical box.
+        center: metres, the middle of the canonical box.
         half_extent: metres from the middle of a map to its border.
     """
 
@@ -27,13 +28,13 @@ class MapFrame:
     half_extent: float = 1.0
 
     @staticmethod
-    def of(vertices: np.ndarray, *, half_extent: float = 1.0) -> MapFrame:
-        """Frame about the middle of the box of the canonical vertices (V, 3)."""
-        low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
-        return MapFrame(tuple(float(c) for c in 0.5 * (low + high)), half_extent)
+    def of(vertices: Float[np.ndarray, "V 3"], *, half_extent: float = 1.0) -> MapFrame:
+        """Make the frame about the middle of the box of canonical vertices, metres."""
+        x, y, z = 0.5 * (np.min(vertices, axis=0) + np.max(vertices, axis=0))
+        return MapFrame((float(x), float(y), float(z)), half_extent)
 
     def cameras(self, size: int) -> tuple[Camera, Camera]:
-        """Orthographic cameras of the front and the mirrored back map, `size` pixels a side."""
+        """Make the orthographic cameras of the front and the mirrored back map, `size` pixels a side."""
         front, back = (
             Camera.orthographic_view(
                 center=np.array(self.center), direction=np.array([0.0, 0.0, z]), half_extent=self.half_extent, size=size
@@ -44,7 +45,7 @@ class MapFrame:
         mirrored = back.K * np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
         return replace(front, name="front"), replace(back, K=mirrored, name="back")
 
-    def pixels_from_canonical(self, points: Tensor, size: int) -> Tensor:
-        """(..., 3) canonical points, metres -> (..., 2) column and row in pixels, pixel centres at +0.5."""
+    def pixels_from_canonical(self, points: Float[Tensor, "*P 3"], size: int) -> Float[Tensor, "*P 2"]:
+        """Return column and row in pixels, pixel centres at +0.5, of canonical points in metres."""
         x, y = points[..., 0] - self.center[0], points[..., 1] - self.center[1]
         return torch.stack([x, -y], dim=-1) * (0.5 * size / self.half_extent) + 0.5 * size

@@ -11,6 +11,7 @@ import threading
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 from torch import Tensor
 
 POOLED_BYTES = 4 << 20
@@ -22,8 +23,8 @@ _lock = threading.Lock()
 _idle: list[np.ndarray] = []
 
 
-def pooled_empty(*shape: int) -> Tensor:
-    """A float32 tensor of a shape, not initialised; its memory goes back to the pool when nothing uses it any more."""
+def pooled_empty(*shape: int) -> Float32[Tensor, "*S"]:
+    """Make a float32 tensor, not initialised; its memory goes back to the pool when nothing uses it any more."""
     count = math.prod(shape)
     if 4 * count < POOLED_BYTES:
         return torch.empty(shape)
@@ -39,11 +40,11 @@ def pooled_empty(*shape: int) -> Tensor:
 class _Lease:
     """Owner of an array that numpy and torch look into: they let go of it with the last tensor."""
 
-    def __init__(self, array: np.ndarray):
+    def __init__(self, array: np.ndarray) -> None:
         self.array = array
         self.__array_interface__ = array.__array_interface__
 
-    def __del__(self):
+    def __del__(self) -> None:
         # The garbage collector may call this in the middle of `pooled_empty`: no lock, and nothing but an append.
         if self.array.nbytes + _idle_bytes() <= IDLE_BYTES:
             _idle.append(self.array)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
 from avatar.gaussians.native_kernels import is_native
@@ -33,27 +34,27 @@ class MeshMapsTensor:
     """What one camera, or B cameras of one size, see of a mesh. The leading axis is there for a sequence of cameras.
 
     Attributes:
-        faces: (F, 3) int64. vertex_count: V. Both of the mesh.
-        face_id: ([B,] H, W) int32, -1 on the background.
-        barycentric: ([B,] H, W, 3) weights of the face's corners, perspective-correct; 0 on the background.
-        depth: ([B,] H, W) metres along the camera's z axis; inf on the background, so mask it before arithmetic.
-        attributes: ([B,] H, W, D) interpolated vertex values, where they were asked for; 0 on the background.
+        faces: of the mesh. vertex_count: V of the mesh.
+        face_id: -1 on the background.
+        barycentric: weights of the face's corners, perspective-correct; 0 on the background.
+        depth: metres along the camera's z axis; inf on the background, so mask it before arithmetic.
+        attributes: interpolated vertex values, where they were asked for; 0 on the background.
     """
 
-    faces: Tensor
+    faces: Int64[Tensor, "F 3"]
     vertex_count: int
-    face_id: Tensor
-    barycentric: Tensor
-    depth: Tensor
-    attributes: Tensor | None = None
+    face_id: Int32[Tensor, "*B H W"]
+    barycentric: Float[Tensor, "*B H W 3"]
+    depth: Float[Tensor, "*B H W"]
+    attributes: Float[Tensor, "*B H W D"] | None = None
 
     @property
-    def mask(self) -> Tensor:
-        """([B,] H, W) bool: pixels covered by the mesh."""
+    def mask(self) -> Bool[Tensor, "*B H W"]:
+        """The pixels that the mesh covers."""
         return self.face_id >= 0
 
-    def interpolate(self, values: Tensor) -> Tensor:
-        """Vertex values (V, D) at every pixel: ([B,] H, W, D), 0 on the background; gradients to both.
+    def interpolate(self, values: Float[Tensor, "V D"]) -> Float[Tensor, "*B H W D"]:
+        """Return vertex values at every pixel, 0 on the background, with gradients to values and barycentrics.
 
         Vertices themselves give the position map; so a T-pose's maps carry posed coordinates or semantic colours.
 
@@ -74,10 +75,10 @@ class MeshMapsTensor:
 
 
 def mesh_maps(
-    vertices: Tensor,
-    faces: Tensor,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
     camera: Camera | Sequence[Camera],
-    attributes: Tensor | None = None,
+    attributes: Float[Tensor, "V D"] | None = None,
     *,
     near: float = 1e-3,
 ) -> MeshMapsTensor:
@@ -87,10 +88,9 @@ def mesh_maps(
     rest in torch on their device. The same input gives the same bits at one number of threads.
 
     Args:
-        vertices: (V, 3) world coordinates, metres.
-        faces: (F, 3) integers.
+        vertices: world coordinates, metres.
         camera: perspective or orthographic, one or several of one image size.
-        attributes: (V, D) values to interpolate, as `MeshMapsTensor.interpolate`.
+        attributes: values to interpolate, as `MeshMapsTensor.interpolate`.
         near: metres; a face with a corner nearer than this to a perspective camera is skipped whole.
 
     Raises:
@@ -109,9 +109,14 @@ def mesh_maps(
 
 
 def front_back_maps(
-    vertices: Tensor, faces: Tensor, frame: MapFrame, *, size: int = 512, attributes: Tensor | None = None
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    frame: MapFrame,
+    *,
+    size: int = 512,
+    attributes: Float[Tensor, "V D"] | None = None,
 ) -> MeshMapsTensor:
-    """Orthographic maps (2, size, size) of a canonical mesh from the front and the back, the back mirrored.
+    """Rasterise orthographic maps (2, size, size) of a canonical mesh from the front and the back, the back mirrored.
 
     One pixel has the same canonical x and y in both (see `MapFrame`). Rasterise the canonical mesh once and interpolate
     the values of every frame in it.
@@ -119,27 +124,18 @@ def front_back_maps(
     return mesh_maps(vertices, faces, frame.cameras(size), attributes)
 
 
-def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(V, 3) unit normals, faces weighted by their area; zero at a vertex without any. Differentiable."""
+def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Return unit normals, faces weighted by their area; zero at a vertex without any. Differentiable."""
     a, b, c = vertices[faces].unbind(1)
     cross = torch.cross(b - a, c - a, dim=-1)
     total = torch.zeros_like(vertices).index_add(0, faces.flatten(), cross.repeat_interleave(3, dim=0))
     return torch.nn.functional.normalize(total, dim=-1, eps=_tiny(vertices))
 
 
-def vertex_normal_map(maps: MeshMapsTensor, vertices: Tensor) -> Tensor:
-    """([B,] H, W, 3) unit world normals interpolated between the vertices'; 0 on the background."""
+def vertex_normal_map(maps: MeshMapsTensor, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "*B H W 3"]:
+    """Return unit world normals interpolated between the vertices'; 0 on the background."""
     normals = maps.interpolate(vertex_normals(vertices, maps.faces))
     return torch.nn.functional.normalize(normals, dim=-1, eps=_tiny(normals))
-
-
-def face_normal_map(maps: MeshMapsTensor, vertices: Tensor) -> Tensor:
-    """([B,] H, W, 3) unit world normals of the faces; 0 on the background."""
-    hit = maps.mask
-    a, b, c = vertices[maps.faces].unbind(1)
-    normals = torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=-1), dim=-1, eps=_tiny(vertices))
-    seen = normals[maps.face_id[hit].long()]
-    return vertices.new_zeros((*hit.shape, 3)).index_put(hit.nonzero(as_tuple=True), seen)
 
 
 def _tiny(values: Tensor) -> float:
@@ -147,7 +143,7 @@ def _tiny(values: Tensor) -> float:
 
 
 def _view(vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Face ids, barycentrics and depth of one camera, the last two with gradients to the vertices."""
+    """Return face ids, barycentrics and depth of one camera, the last two with gradients to the vertices."""
     face_id = torch.from_numpy(seen.face_id).to(vertices.device)
     if is_native(vertices):
         return face_id, *BarycentricFunction.apply(vertices, faces, seen, camera)

@@ -38,7 +38,7 @@ class _Gradients(ctypes.Structure):
     _fields_ += [("accumulate", ctypes.c_int32), ("accumulate_features", ctypes.c_int32)]
 
 
-class View:
+class CameraCall:
     """One camera's call: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
 
     def __init__(
@@ -46,7 +46,7 @@ class View:
         gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
         camera: tuple[Tensor, Tensor, Tensor | None],
         settings: RasterSettings,
-    ):
+    ) -> None:
         self.tensors = (*gaussians, *camera)
         count, channels = gaussians[-1].shape
         self.scene = _Scene(count, channels, 0, *map(address, gaussians))
@@ -66,17 +66,17 @@ class Workspace:
     `seconds`, if given, are added to by stage, in the order of `STAGES`.
     """
 
-    def __init__(self, level: str | None = None):
+    def __init__(self, level: str | None = None) -> None:
         self._library = _library(level)
         self._handle = _POOL.take(self._library)
         self._lock = threading.Lock()
 
-    def __del__(self):
+    def __del__(self) -> None:
         if getattr(self, "_handle", None):
             _POOL.give_back(self._library, self._handle)
 
-    def forward(self, view: View, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
-        """Writes image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N)."""
+    def forward(self, view: CameraCall, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
+        """Write image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N)."""
         with self._lock:
             failed = self._library.gaussian_forward(
                 self._handle, view.scene, view.camera, *map(address, outputs), torch.get_num_threads(), seconds
@@ -85,7 +85,7 @@ class Workspace:
 
     def backward(
         self,
-        view: View,
+        view: CameraCall,
         radii: Tensor,
         grad_image: Tensor | None,
         grad_alpha: Tensor | None,
@@ -93,7 +93,7 @@ class Workspace:
         accumulate: tuple[bool, bool],
         seconds: ctypes.Array | None = None,
     ) -> None:
-        """Gradients of the last forward pass, to means .. features, the pose (3, 4) float64 and the background (D).
+        """Write the last forward pass's gradients to means .. features, the pose (3, 4) float64 and the background (D).
 
         The last two may be None. `accumulate` says whether to add to the first four, and to the features', what is
         otherwise written; the pose's is always added to.
@@ -114,16 +114,16 @@ class Workspace:
         _check_memory(failed)
 
     def counts(self) -> tuple[int, int, int]:
-        """Visible Gaussians, entries of all tile lists and visits of blocks in the last forward pass."""
+        """Count visible Gaussians, entries of all tile lists and visits of blocks in the last forward pass."""
         counts = (ctypes.c_int64 * 3)()
         self._library.gaussian_counts(self._handle, counts)
-        return tuple(counts)
+        return counts[0], counts[1], counts[2]
 
 
 class _Pool:
     """Idle workspaces of the library: fresh memory costs more than the arithmetic of a large image."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._idle: list[tuple[ctypes.CDLL, int, int]] = []
 
@@ -154,7 +154,7 @@ _POOL = _Pool()
 
 
 def address(tensor: Tensor | None) -> int | None:
-    """Where a tensor's numbers begin."""
+    """Return where a tensor's numbers begin."""
     return None if tensor is None else tensor.data_ptr()
 
 
@@ -168,7 +168,7 @@ def _check_memory(failed: int) -> None:
 @cache
 def _library(level: str | None) -> ctypes.CDLL:
     library = native_library(level)
-    pointer, structure = _POINTER, ctypes.POINTER
+    pointer, scene, camera, gradients = _POINTER, *map(ctypes.POINTER, (_Scene, _Camera, _Gradients))
     library.gaussian_workspace_new.restype = pointer
     library.gaussian_workspace_new.argtypes = []
     library.gaussian_workspace_free.argtypes = [pointer]
@@ -177,7 +177,7 @@ def _library(level: str | None) -> ctypes.CDLL:
     library.gaussian_workspace_bytes.restype = ctypes.c_int64
     library.gaussian_counts.argtypes = [pointer, pointer]
     library.gaussian_counts.restype = None
-    view = [pointer, structure(_Scene), structure(_Camera)]
-    library.gaussian_forward.argtypes = [*view, *[pointer] * 5, ctypes.c_int32, pointer]
-    library.gaussian_backward.argtypes = [*view, *[pointer] * 3, structure(_Gradients), ctypes.c_int32, pointer]
+    view = (pointer, scene, camera)
+    library.gaussian_forward.argtypes = (*view, *[pointer] * 5, ctypes.c_int32, pointer)
+    library.gaussian_backward.argtypes = (*view, *[pointer] * 3, gradients, ctypes.c_int32, pointer)
     return library

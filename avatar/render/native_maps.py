@@ -18,7 +18,7 @@ from smplxpp.raster import MeshMaps
 
 
 class BarycentricFunction(torch.autograd.Function):
-    """(V, 3) vertices -> barycentrics (H, W, 3) and depth (H, W) as rasterised, with their gradient to the vertices."""
+    """Takes (V, 3) vertices to barycentrics (H, W, 3) and depth (H, W) as rasterised; gradients reach the vertices."""
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -49,7 +49,7 @@ class BarycentricFunction(torch.autograd.Function):
 
 
 class InterpolateFunction(torch.autograd.Function):
-    """Vertex values (V, D), barycentrics (..., 3), faces (F, 3) int32, face ids (...) int32 -> (..., D)."""
+    """Takes vertex values (V, D), barycentrics (..., 3), faces (F, 3) int32 and face ids (...) int32 to (..., D)."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, barycentric: Tensor, faces: Tensor, face_id: Tensor) -> Tensor:

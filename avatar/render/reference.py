@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from avatar.gaussians.quaternions import matrix_from_quat
 from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
 
 BLOCK = 16
@@ -20,34 +22,34 @@ FRUSTUM_MARGIN = 0.3
 
 
 def rasterize_reference(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    background: Tensor | None,
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    features: Float[Tensor, "N D"] | Float[Tensor, "C N D"],
+    viewmats: Float[Tensor, "C 4 4"],
+    Ks: Float[Tensor, "C 3 3"],
+    background: Float[Tensor, "C D"] | None,
     settings: RasterSettings,
-) -> tuple[Tensor, Tensor, RasterMeta]:
-    """Images of N-channel Gaussians by alpha blending front to back, with gradients to every tensor, `Ks` included.
+) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], RasterMeta]:
+    """Return images by alpha blending front to back, with gradients to every tensor, `Ks` included.
 
     The semantics are those of gsplat's classic mode: EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting
     (Kerbl et al. 2023). See `docs/rendering.md` for the equations.
 
     Args:
-        means: (N, 3) centres in the world, metres.
-        quats: (N, 4) rotations, wxyz, of any length but 0.
-        scales: (N, 3) standard deviations along the rotated axes, metres.
-        opacities: (N,) in [0, 1].
-        features: (N, D), or (C, N, D) for features of each camera.
-        viewmats: (C, 4, 4) world to camera, OpenCV's axes.
-        Ks: (C, 3, 3) intrinsics in pixels, without skew.
-        background: (C, D) or None for 0.
+        means: centres in the world, metres.
+        quats: rotations, wxyz, of any length but 0.
+        scales: standard deviations along the rotated axes, metres.
+        opacities: in [0, 1].
+        features: channels, the same for all cameras or those of each.
+        viewmats: world to camera, OpenCV's axes.
+        Ks: intrinsics in pixels, without skew.
+        background: None is 0.
         settings: image size and constants.
 
     Returns:
-        Images (C, H, W, D), their alpha (C, H, W, 1), and what was found on the way.
+        Images, their alpha, and what was found on the way.
     """
     views = [
         _render_view(
@@ -76,22 +78,9 @@ class _Splats:
     depths: Tensor  # (N,) of all Gaussians, culled or not
 
 
-def camera_depths(means: Tensor, viewmats: Tensor) -> Tensor:
-    """(C, N) metres along each camera's z of points (N, 3), for `viewmats` (C, 4, 4)."""
+def camera_depths(means: Float[Tensor, "N 3"], viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "C N"]:
+    """Return the metres along each camera's z of points in the world."""
     return viewmats[:, 2, :3] @ means.T + viewmats[:, 2, 3, None]
-
-
-def rotation_from_quat(quats: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but 0."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    return torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=-1,
-    ).reshape(-1, 3, 3)
 
 
 def _project(
@@ -103,7 +92,7 @@ def _project(
     K: Tensor,
     settings: RasterSettings,
 ) -> _Splats:
-    """Gaussians to the image of one camera; drops those that cannot reach a pixel, sorts the rest by depth."""
+    """Take Gaussians to the image of one camera; drops those that cannot reach a pixel, sorts the rest by depth."""
     cam_from_world = viewmat[:3, :3]
     centers = means @ cam_from_world.T + viewmat[:3, 3]
     depths = centers[:, 2]
@@ -112,7 +101,7 @@ def _project(
     index = near_to_far.nonzero()[:, 0]
     index = index[torch.argsort(depths[index], stable=True)]
 
-    axes = rotation_from_quat(quats[index]) * scales[index, None, :]
+    axes = matrix_from_quat(quats[index]) * scales[index, None, :]
     half = _projection_jacobian(centers[index], K, settings) @ cam_from_world @ axes
     covariance = half @ half.mT + settings.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
@@ -130,7 +119,7 @@ def _project(
 
 
 def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -> Tensor:
-    """(M, 2, 3) derivative of the pixel by the point in camera space, at `centers` clamped to a widened frustum."""
+    """Return the (M, 2, 3) derivative of pixels by points in camera space, at `centers` clamped to a wider frustum."""
     size = centers.new_tensor([settings.width, settings.height])
     focal, principal = K.diagonal()[:2], K[:2, 2]
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
@@ -142,7 +131,7 @@ def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -
 def _render_view(
     splats: _Splats, opacities: Tensor, features: Tensor, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Blended features (H, W, D), what is left of the light (H, W, 1), and (means2d, radii, depths) of all N."""
+    """Return blended features (H, W, D), what is left of the light (H, W, 1), and (means2d, radii, depths) of all N."""
     rows = []
     for top in range(0, settings.height, BLOCK):
         bottom = min(top + BLOCK, settings.height)
@@ -163,7 +152,7 @@ def _render_view(
 def _blend_block(
     splats: _Splats, opacities: Tensor, features: Tensor, box: tuple[int, int, int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Blends a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
+    """Blend a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
     left, top, right, bottom = box
     low, high = splats.means2d.new_tensor([left, top]), splats.means2d.new_tensor([right, bottom])
     reaching = ((splats.means2d + splats.radii > low) & (splats.means2d - splats.radii < high)).all(-1)

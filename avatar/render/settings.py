@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 ALPHA_MAX = 0.999
@@ -38,19 +39,19 @@ class RasterMeta:
     """What a backend found on the way; none of it carries gradients, but `depth`.
 
     Attributes:
-        means2d: (C, N, 2) projected centres in pixels; 0 where culled.
-        radii: (C, N, 2) half width and height in pixels of the box that can reach `ALPHA_MIN` (gsplat rounds them up);
+        means2d: projected centres in pixels; 0 where culled.
+        radii: half width and height in pixels of the box that can reach `ALPHA_MIN` (gsplat rounds them up);
             0 where culled.
-        depths: (C, N) metres along the camera's z, of culled Gaussians too.
-        depth: (C, H, W, 1) accumulated or expected depth in metres, where it was asked for.
+        depths: metres along the camera's z, of culled Gaussians too.
+        depth: accumulated or expected depth in metres, where it was asked for.
     """
 
-    means2d: Tensor
-    radii: Tensor
-    depths: Tensor
-    depth: Tensor | None = None
+    means2d: Float[Tensor, "C N 2"]
+    radii: Float[Tensor, "C N 2"]
+    depths: Float[Tensor, "C N"]
+    depth: Float[Tensor, "C H W 1"] | None = None
 
     @property
-    def visible(self) -> Tensor:
-        """(C, N) bool: Gaussians that can reach some pixel of the image."""
+    def visible(self) -> Bool[Tensor, "C N"]:
+        """The Gaussians that can reach some pixel of the image."""
         return (self.radii > 0).all(-1)

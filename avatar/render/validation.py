@@ -6,7 +6,6 @@ takes about 1 % of the rasterisation of a large scene. On a GPU they wait for it
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import numbers
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ SKEW_TOLERANCE = 1e-6
 
 
 def checked_settings(settings: RasterSettings) -> RasterSettings:
-    """Image size, clipping planes and blur as Python's own numbers (numpy's are welcome).
+    """Return image size, clipping planes and blur as Python's own numbers (numpy's are welcome).
 
     Raises:
         InputError: one of them cannot be used.
@@ -43,13 +42,18 @@ def checked_settings(settings: RasterSettings) -> RasterSettings:
         raise InputError("near, far", expected="0 < near < far, in metres", received=f"{settings.near}, {settings.far}")
     if settings.eps2d < 0:
         raise InputError("eps2d", expected="0 or more, in pixels squared", received=repr(settings.eps2d))
-    plain = {name: int(getattr(settings, name)) for name in ("width", "height")}
-    plain |= {name: float(getattr(settings, name)) for name in ("near", "far", "eps2d")}
-    return dataclasses.replace(settings, **plain)
+    return RasterSettings(
+        width=int(settings.width),
+        height=int(settings.height),
+        near=float(settings.near),
+        far=float(settings.far),
+        eps2d=float(settings.eps2d),
+        camera_gradients=settings.camera_gradients,
+    )
 
 
 def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> None:
-    """Types, shapes, one dtype and one device; `tensors` holds all arguments but the background, by name.
+    """Require fitting types and shapes, one dtype and device; `tensors` holds all arguments but the background by name.
 
     Raises:
         InputError: names the first argument that does not fit the ones before it.
@@ -82,7 +86,7 @@ def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
 
 
 def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> None:
-    """Finite numbers everywhere, positive scales, opacities in [0, 1], quaternions that are not 0, usable cameras.
+    """Require finite numbers, positive scales, opacities in [0, 1], quaternions that are not 0, usable cameras.
 
     Raises:
         InputError: names the argument and how many of its rows are at fault.
@@ -97,7 +101,7 @@ def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
 
 
 def _check_shape(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | str, ...]) -> dict[str, int]:
-    """Sizes of the axes that `shape` names by a letter; the others must be as given."""
+    """Return the sizes of the axes that `shape` names by a letter; the others must be as given."""
     received = tuple(tensors[name].shape)
     if len(received) != len(shape) or any(
         not isinstance(want, str) and want != got for want, got in zip(shape, received, strict=True)
@@ -121,16 +125,18 @@ def _check_dtype_and_device(given: Mapping[str, Tensor]) -> None:
 
 
 def _suspects(values: Mapping[str, Tensor]) -> list[str]:
-    """Arguments that a quick look cannot clear.
+    """Return the arguments that a quick look cannot clear.
 
     A sum is finite unless a term is not (or it overflows, which the exact look then clears), and is several times
     cheaper than `isfinite`; minimum and maximum hand a NaN on.
     """
     filled = {name: value for name, value in values.items() if value.numel() > 0}
-    looks = {name: (value.sum(),) for name, value in filled.items() if name not in ("scales", "opacities")}
+    looks: dict[str, tuple[Tensor, ...]] = {
+        name: (value.sum(),) for name, value in filled.items() if name not in ("scales", "opacities")
+    }
     if "means" in filled:
-        looks["scales"] = torch.aminmax(filled["scales"])
-        looks["opacities"] = torch.aminmax(filled["opacities"])
+        looks["scales"] = tuple(torch.aminmax(filled["scales"]))
+        looks["opacities"] = tuple(torch.aminmax(filled["opacities"]))
         looks["quats"] += (filled["quats"][:, 0].abs().min(),)
     flat = [stat for stats in looks.values() for stat in stats]
     answers = iter(torch.stack(flat).tolist() if flat else [])

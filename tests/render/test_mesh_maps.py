@@ -7,7 +7,7 @@ import trimesh
 
 from avatar.render.barycentrics import barycentrics_reference
 from avatar.render.map_frame import MapFrame
-from avatar.render.mesh_maps import face_normal_map, front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
+from avatar.render.mesh_maps import front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 
@@ -144,9 +144,8 @@ def test_a_camera_moved_with_the_mesh_sees_the_same_and_normals_turn_along():
     a, b = mesh_maps(v, f, PERSPECTIVE), mesh_maps(moved, f, there)
     same = a.face_id == b.face_id
     assert same.double().mean() > 0.99
-    for normal_map in (vertex_normal_map, face_normal_map):
-        turned = normal_map(a, v) @ pose[:3, :3].T
-        torch.testing.assert_close(turned[same], normal_map(b, moved)[same], atol=1e-9, rtol=0)
+    turned = vertex_normal_map(a, v) @ pose[:3, :3].T
+    torch.testing.assert_close(turned[same], vertex_normal_map(b, moved)[same], atol=1e-9, rtol=0)
 
 
 def test_normals_of_a_sphere_point_outwards():
@@ -155,8 +154,7 @@ def test_normals_of_a_sphere_point_outwards():
     assert ((vertex_normals(v, f) * v).sum(-1) > 0.499).all()
     outwards = torch.nn.functional.normalize(maps.interpolate(v), dim=-1)
     assert ((vertex_normal_map(maps, v) * outwards).sum(-1)[maps.mask] > 0.999).all()
-    assert ((face_normal_map(maps, v) * outwards).sum(-1)[maps.mask] > 0.99).all()
-    assert (face_normal_map(maps, v)[~maps.mask] == 0).all()
+    assert (vertex_normal_map(maps, v)[~maps.mask] == 0).all()
 
 
 def test_front_and_back_share_their_pixels():
@@ -191,7 +189,7 @@ def test_nothing_to_see_is_background(camera, vertex_count):
     v, f = torch.zeros(vertex_count, 3, requires_grad=True), torch.zeros(0, 3, dtype=torch.int64)
     maps = mesh_maps(v, f, camera, v)
     assert not maps.mask.any() and (maps.depth == torch.inf).all()
-    assert (maps.attributes == 0).all() and (face_normal_map(maps, v) == 0).all()
+    assert (maps.attributes == 0).all() and (vertex_normal_map(maps, v) == 0).all()
     maps.attributes.sum().backward()
     assert (v.grad == 0).all()
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
+from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
 from smplxpp.core.errors import InputError
@@ -21,10 +22,10 @@ class BlendShapeConfig:
 
     Attributes:
         head_shapes, body_shapes: n_h and n_b.
-        expression_size: expression parameters that drive the head.
+        expression_size: number of expression parameters that drive the head.
         jaw: the jaw's rotation (axis-angle) drives the head too.
         pose_size: length of theta, which drives the body.
-        width, hidden_layers: of both mapping networks.
+        width, hidden_layers: sizes of both mapping networks.
         gated: head shapes act on the head alone and body shapes on the rest, by a weight for each Gaussian.
         parts: 1, every Gaussian has the same coefficients; more, every part of the Gaussians has its own.
     """
@@ -45,12 +46,12 @@ class BlendShapeConfig:
 
     @property
     def shapes(self) -> int:
-        """n = n_h + n_b."""
+        """The number of all shapes, n = n_h + n_b."""
         return self.head_shapes + self.body_shapes
 
     @property
     def head_inputs(self) -> int:
-        """Length of what drives the head."""
+        """The length of what drives the head."""
         return self.expression_size + 3 * self.jaw
 
 
@@ -72,22 +73,26 @@ class BlendShapes(nn.Module):
     Args:
         config: sizes.
         count: N.
-        part: (N,) integers below `config.parts`; needed where there are several.
-        head_weight: (N,) in [0, 1]; needed with gating.
-        active: (M,) increasing indices of the Gaussians that have blend shapes; None: all.
+        part: below `config.parts`; needed where there are several.
+        head_weight: in [0, 1]; needed with gating.
+        active: increasing indices of the Gaussians that have blend shapes; None: all.
 
     Raises:
         InputError: one of these that does not fit the others.
     """
+
+    active: Tensor
+    part: Tensor | None
+    head_weight: Tensor | None
 
     def __init__(
         self,
         config: BlendShapeConfig,
         count: int,
         *,
-        part: Tensor | None = None,
-        head_weight: Tensor | None = None,
-        active: Tensor | None = None,
+        part: Int[Tensor, " N"] | None = None,
+        head_weight: Float[Tensor, " N"] | None = None,
+        active: Int64[Tensor, " M"] | None = None,
     ) -> None:
         super().__init__()
         if (part is not None) != (config.parts > 1):
@@ -124,16 +129,18 @@ class BlendShapes(nn.Module):
         self.register_buffer("part", part)
         self.register_buffer("head_weight", head_weight)
 
-    def coefficients(self, expression: Tensor, pose: Tensor, jaw: Tensor | None = None) -> Tensor:
-        """z of every part.
+    def coefficients(
+        self,
+        expression: Float[Tensor, "B E"],
+        pose: Float[Tensor, "B T"],
+        jaw: Float[Tensor, "B 3"] | None = None,
+    ) -> Float[Tensor, "B P n"]:
+        """Return z of every one of P parts.
 
         Args:
-            expression: (B, expression_size).
-            pose: (B, pose_size) theta, radians.
-            jaw: (B, 3) axis-angle, radians; given if and only if the configuration says so.
-
-        Returns:
-            (B, parts, n).
+            expression: as many parameters as `expression_size`.
+            pose: theta, radians, of length `pose_size`.
+            jaw: axis-angle, radians; given if and only if the configuration says so.
 
         Raises:
             InputError: parameters of another size, a jaw too many or too few.
@@ -151,16 +158,8 @@ class BlendShapes(nn.Module):
         parts = (self.config.parts, -1)
         return torch.cat([self.head(of_head).unflatten(1, parts), self.body(pose).unflatten(1, parts)], dim=-1)
 
-    def forward(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals of all Gaussians.
-
-        Args:
-            coefficients: (B, parts, n).
-
-        Returns:
-            du: (B, N, 3) metres in the triangles' frames.
-            dc: (B, N, 3) colour.
-        """
+    def forward(self, coefficients: Float[Tensor, "B P n"]) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 3"]]:
+        """Return du, metres in the triangles' frames, and dc, colour, of all Gaussians."""
         return self._blend(self.U, coefficients), self._blend(self.C, coefficients)
 
     def _blend(self, basis: Tensor, z: Tensor) -> Tensor:
@@ -170,45 +169,45 @@ class BlendShapes(nn.Module):
         else:
             of_gaussian = z[:, self.part[self.active]] if self.part is not None else z.expand(-1, M, -1)
             if self.head_weight is not None:
-                of_gaussian = of_gaussian * self._gate()
+                of_gaussian = of_gaussian * self._gate(self.head_weight)
             out = torch.einsum("mck,bmk->bmc", basis, of_gaussian)
         if M == self.count:
             return out
         return out.new_zeros(B, self.count, 3).index_copy(1, self.active, out)
 
-    def _gate(self) -> Tensor:
-        """(M, n)."""
-        w = self.head_weight[self.active][:, None]
+    def _gate(self, head_weight: Tensor) -> Tensor:
+        """Return what the active Gaussians' shapes are multiplied by, (M, n)."""
+        w = head_weight[self.active][:, None]
         return torch.cat([w.expand(-1, self.config.head_shapes), (1 - w).expand(-1, self.config.body_shapes)], dim=1)
 
     def stored_bytes(self) -> int:
-        """Bytes of U, C and the mapping networks in half precision (and of `active`, if pruned)."""
+        """Count the bytes of U, C and the mapping networks in half precision (and of `active`, if pruned)."""
         values = sum(parameter.numel() for parameter in self.parameters())
         return STORED_BYTES * values + (4 * len(self.active) if len(self.active) < self.count else 0)
 
-    def importance(self, coefficient_std: Tensor) -> Tensor:
-        """(N,) share of each Gaussian in the motion and the colour changes of all, 0 where it has no blend shapes.
+    def importance(self, coefficient_std: Float[Tensor, "P n"]) -> Float[Tensor, " N"]:
+        """Return each Gaussian's share in the motion and the colour changes of all, 0 where it has no blend shapes.
 
         The energy of a Gaussian's residual is `sum_k (|U_k| sigma_k)^2`, in position and in colour; each is divided by
         its sum over the Gaussians, so that metres and colours weigh the same.
 
         Args:
-            coefficient_std: (parts, n) standard deviations of the coefficients over the training frames.
+            coefficient_std: standard deviations of the coefficients over the training frames.
         """
         sigma = coefficient_std[self.part[self.active]] if self.part is not None else coefficient_std
         if self.head_weight is not None:
-            sigma = sigma * self._gate()
+            sigma = sigma * self._gate(self.head_weight)
         shares = torch.zeros(self.count, dtype=self.U.dtype, device=self.U.device)
         for basis in (self.U.detach(), self.C.detach()):
             energy = (basis * sigma[:, None]).square().sum((1, 2))
             shares[self.active] += 0.5 * energy / energy.sum().clamp_min(torch.finfo(energy.dtype).tiny)
         return shares
 
-    def pruned(self, coefficient_std: Tensor, *, keep: float) -> BlendShapes:
-        """Copy with the blend shapes of the most important Gaussians alone.
+    def pruned(self, coefficient_std: Float[Tensor, "P n"], *, keep: float) -> BlendShapes:
+        """Return a copy with the blend shapes of the most important Gaussians alone.
 
         Args:
-            coefficient_std: (parts, n), see `importance`.
+            coefficient_std: see `importance`.
             keep: share of the N Gaussians that keep theirs, above 0 and at most 1.
 
         Raises:

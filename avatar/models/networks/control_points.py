@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64, Int64, Shaped
 from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 from smplxpp.template.template import Template
 
 CLOTH_DENSITY = 4.0
@@ -19,23 +21,23 @@ class ControlPoints:
     """K control vertices of V, and how every vertex is interpolated from them.
 
     Attributes:
-        vertices: (K,) index of each control vertex.
-        neighbours: (V, k) index of control points, from 0 to K - 1.
-        weights: (V, k) non-negative, rows sum to 1.
+        vertices: index of each control vertex.
+        neighbours: index of control points, from 0 to K - 1.
+        weights: non-negative, rows sum to 1.
     """
 
-    vertices: np.ndarray
-    neighbours: np.ndarray
-    weights: np.ndarray
+    vertices: Int64[np.ndarray, " K"]
+    neighbours: Int64[np.ndarray, "V k"]
+    weights: Float64[np.ndarray, "V k"]
 
 
 def choose_control_points(
-    vertices: np.ndarray,
-    groups: np.ndarray,
+    vertices: Float[np.ndarray, "V 3"],
+    groups: Shaped[np.ndarray, " V"],
     *,
     count: int,
     neighbour_count: int = 6,
-    importance: np.ndarray | None = None,
+    importance: Float[np.ndarray, " V"] | None = None,
 ) -> ControlPoints:
     """Spread control points evenly over every group of vertices and tie each vertex to the nearest of its own group.
 
@@ -45,11 +47,11 @@ def choose_control_points(
     however close they lie.
 
     Args:
-        vertices: (V, 3) metres.
-        groups: (V,) integers.
-        count: of control points, shared among the groups by their numbers of vertices (at least one each).
-        neighbour_count: control points a vertex depends on.
-        importance: (V,) positive; a group's vertices count as many times in its share. None: all alike.
+        vertices: metres.
+        groups: the group of each vertex.
+        count: number of control points, shared among the groups by their numbers of vertices (at least one each).
+        neighbour_count: number of control points a vertex depends on.
+        importance: positive; a group's vertices count as many times in its share. None: all alike.
 
     Raises:
         InputError: fewer control points than groups or more than vertices, or no neighbour.
@@ -63,8 +65,7 @@ def choose_control_points(
             expected=f"{len(names)} (one for every group) to {len(vertices)} (one for every vertex)",
             received=str(count),
         )
-    if neighbour_count < 1:
-        raise InputError("neighbours of a vertex", expected="at least 1", received=str(neighbour_count))
+    require_at_least("neighbours of a vertex", neighbour_count, 1)
 
     chosen: list[np.ndarray] = []
     neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
@@ -85,10 +86,10 @@ def choose_control_points(
 
 
 def template_control_points(template: Template, count: int) -> ControlPoints:
-    """Control points of a template, part by part; its clothes, which fold, have `CLOTH_DENSITY` times as many.
+    """Choose control points of a template, part by part; its clothes, which fold, have `CLOTH_DENSITY` times as many.
 
     Args:
-        count: of control points; all vertices where there are no more.
+        count: number of control points; all vertices where there are no more.
     """
     density = np.where(template.cloth_mask, CLOTH_DENSITY, 1.0)
     count = min(count, template.vertex_count)
@@ -96,7 +97,7 @@ def template_control_points(template: Template, count: int) -> ControlPoints:
 
 
 def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
-    """`count` split in proportion to `wishes`, exactly: from 1 to the size of each group.
+    """Split `count` in proportion to `wishes`, exactly: from 1 to the size of each group.
 
     The largest remainders are rounded up; what a full group cannot take goes to the others in the same proportion.
     """
@@ -113,7 +114,7 @@ def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
 
 
 def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of `count` points, each the farthest from those before it."""
+    """Return the indices of `count` points, each the farthest from those before it."""
     picked = np.empty(count, dtype=np.int64)
     picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
     distance = np.full(len(points), np.inf)
@@ -125,7 +126,7 @@ def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _local_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` nearest controls of each point, and their weights."""
+    """Return the `count` nearest controls of each point, and their weights."""
     asked = min(count + 1, len(controls))
     distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
     distance = np.maximum(distance, 1e-9)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from avatar.models.networks.control_points import ControlPoints
@@ -21,10 +22,10 @@ class FieldConfig:
     """Sizes of the field. The defaults are the paper's.
 
     Attributes:
-        frequencies: bands L of the positional encoding.
+        frequencies: number of bands L of the positional encoding.
         pose_size: length of theta (21 body joints, axis-angle).
         code_size: length of a frame's code z_t.
-        width, hidden_layers: of both MLPs; one more layer gives the displacement.
+        width, hidden_layers: sizes of both MLPs; one more layer gives the displacement.
         local_pose: a point sees the joints of theta within as many steps along the skeleton of one that carries it
             (`seen_joints`), the others as zero; 0: all of them, as published.
     """
@@ -44,19 +45,16 @@ class FieldConfig:
 
     @property
     def encoding_size(self) -> int:
-        """Length of a point's positional encoding."""
+        """The length of a point's positional encoding."""
         return 3 + 6 * self.frequencies
 
 
-def positional_encoding(points: Tensor, frequencies: int) -> Tensor:
-    """`phi(v) = (v, sin(2^l pi v), cos(2^l pi v) for l < L)` (Mildenhall et al. 2020, equation 4), with the identity.
+def positional_encoding(points: Float[Tensor, "*P 3"], frequencies: int) -> Float[Tensor, "*P E"]:
+    """Return `phi(v) = (v, sin(2^l pi v), cos(2^l pi v) for l < L)` (Mildenhall et al. 2020, equation 4).
 
     Args:
-        points: (..., 3) metres.
-        frequencies: L.
-
-    Returns:
-        (..., 3 + 6 L).
+        points: metres.
+        frequencies: L; E is 3 + 6 L.
     """
     bands = math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = (points[..., None, :] * bands[:, None]).flatten(-2)
@@ -84,7 +82,7 @@ class _FieldNetwork(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, encodings: Tensor, frames: Tensor, member: Tensor | None) -> Tensor:
-        """(V, E) encodings, (B, U, pose + code) and (V, U) one-hot, or None where U is 1 -> (B, V, 3)."""
+        """Take (V, E) encodings, (B, U, pose + code) and (V, U) one-hot, or None where U is 1, to (B, V, 3)."""
         of_frame = self.of_frame(frames)
         x = F.relu(self.of_point(encodings) + (of_frame if member is None else member @ of_frame))
         for layer in self.hidden:
@@ -100,23 +98,29 @@ class DeformationField(nn.Module):
 
     Args:
         config: sizes.
-        vertices: (V, 3) canonical vertices, metres.
-        cloth_mask: (V,) bool, m.
+        vertices: canonical vertices, metres.
+        cloth_mask: m.
         control: control points of the same vertices, or None to evaluate the field on every vertex.
-        seen: (V, pose_size / 3) bool, the joints of theta that each vertex sees, where the configuration asks for it.
+        seen: the joints of theta, J = pose_size / 3, that each vertex sees, where the configuration asks for it.
 
     Raises:
         InputError: a mask, control points or seen joints of another number of vertices or joints.
     """
 
+    points: Tensor
+    encodings: Tensor
+    cloth_index: Tensor
+    sets: Tensor | None
+    member: Tensor | None
+
     def __init__(
         self,
         config: FieldConfig,
-        vertices: Tensor,
-        cloth_mask: Tensor,
+        vertices: Float[Tensor, "V 3"],
+        cloth_mask: Bool[Tensor, " V"],
         *,
         control: ControlPoints | None = None,
-        seen: Tensor | None = None,
+        seen: Bool[Tensor, "V J"] | None = None,
     ) -> None:
         super().__init__()
         if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
@@ -162,8 +166,8 @@ class DeformationField(nn.Module):
         self.register_buffer("sets", sets, persistent=False)
         self.register_buffer("member", member, persistent=False)
 
-    def forward(self, pose: Tensor, code: Tensor) -> Tensor:
-        """(B, V, 3) metres, displacements of all vertices along the canonical axes; see `at_points`."""
+    def forward(self, pose: Float[Tensor, "B T"], code: Float[Tensor, "B Z"]) -> Float[Tensor, "B V 3"]:
+        """Return the displacements of all vertices, metres along the canonical axes; see `at_points`."""
         moved = self.at_points(pose, code)
         if self.rows is None:
             return moved
@@ -171,15 +175,15 @@ class DeformationField(nn.Module):
         spread = self.rows(moved.transpose(0, 1).flatten(1))
         return spread.unflatten(1, (len(moved), 3)).transpose(0, 1)
 
-    def at_points(self, pose: Tensor, code: Tensor) -> Tensor:
-        """Displacements where the networks are evaluated: the K control points, or all vertices.
+    def at_points(self, pose: Float[Tensor, "B T"], code: Float[Tensor, "B Z"]) -> Float[Tensor, "B K 3"]:
+        """Return displacements where the networks are evaluated: at the K control points, or all vertices.
 
         Args:
-            pose: (B, pose_size) theta, axis-angle, radians.
-            code: (B, code_size) frame codes.
+            pose: theta, axis-angle, radians, of length `pose_size`.
+            code: frame codes of length `code_size`.
 
         Returns:
-            (B, K, 3) metres, along the canonical axes.
+            Metres along the canonical axes.
 
         Raises:
             InputError: poses or codes of another length or number.
@@ -221,8 +225,8 @@ class FrameCodes(nn.Module):
         self.row = {frame: row for row, frame in enumerate(self.frames)}
         self.codes = nn.Parameter(torch.zeros(len(self.frames), code_size))
 
-    def forward(self, frames: Sequence[int | None]) -> Tensor:
-        """(B, code_size): the code of each frame, the null code for None.
+    def forward(self, frames: Sequence[int | None]) -> Float[Tensor, "B Z"]:
+        """Return the code of each frame, the null code for None.
 
         Raises:
             InputError: a frame that has no code.

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool
 
 from smplxpp.template.template import Template
 
-CARRIES = 0.05
+MIN_SKIN_WEIGHT = 0.05
 """Skin weight from which a joint carries a vertex."""
 BODY_JOINTS = 21
-"""Of theta: joints 1 to 21 of the skeleton."""
+"""Joints in theta: 1 to 21 of the skeleton."""
 
 
-def seen_joints(template: Template, steps: int) -> np.ndarray:
-    """Joints within `steps` of one that carries the vertex, along the skeleton.
+def seen_joints(template: Template, steps: int) -> Bool[np.ndarray, "V 21"]:
+    """Mark, for each vertex, the joints of theta within `steps` of one that carries the vertex, along the skeleton.
 
     A skirt that has seen few poses would learn the arms of those poses by heart. Saito et al., "SCANimate" (2021),
     mask the pose by skin weights for the same reason.
-
-    Returns:
-        (V, 21) bool, the joints of theta.
     """
     parents = np.asarray(template.body.parents)
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True
-    seen = template.weights.dense() > CARRIES
+    seen = template.weights.dense() > MIN_SKIN_WEIGHT
     for _ in range(steps):
         seen = seen @ near
     return seen[:, 1 : BODY_JOINTS + 1]

@@ -1,8 +1,9 @@
-"""Front and back maps of a body in its canonical pose: their cameras, and Gaussians looked up in them."""
+"""Gaussians looked up in the front and back maps of a body in its canonical pose."""
 
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from avatar.models.networks.sparse_rows import SparseRows
@@ -18,16 +19,16 @@ class MapSampler(nn.Module):
     several times faster than `grid_sample` on a CPU.
 
     Args:
-        frame: of the maps.
+        frame: that of the maps.
         size: side of the maps in pixels.
-        points: (N, 3) canonical positions, metres.
-        front: (N,) bool, True for those on the front map.
+        points: canonical positions, metres.
+        front: True for those on the front map.
 
     Raises:
         InputError: points that are not finite or outside the frame, or sides of another number.
     """
 
-    def __init__(self, frame: MapFrame, size: int, points: Tensor, front: Tensor) -> None:
+    def __init__(self, frame: MapFrame, size: int, points: Float[Tensor, "N 3"], front: Bool[Tensor, " N"]) -> None:
         super().__init__()
         if points.ndim != 2 or points.shape[1] != 3 or front.shape != points.shape[:1]:
             raise InputError(
@@ -53,8 +54,8 @@ class MapSampler(nn.Module):
         weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]
         self.lookup = SparseRows(rows, torch.stack(weights, dim=1), 2 * size * size)
 
-    def forward(self, maps: Tensor) -> Tensor:
-        """(B, 2, size, size, C) front and back maps -> (B, N, C).
+    def forward(self, maps: Float[Tensor, "B 2 S S C"]) -> Float[Tensor, "B N C"]:
+        """Look the Gaussians up in front and back maps.
 
         Raises:
             InputError: maps of another size.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.teacher import TeacherConfig
@@ -11,28 +11,21 @@ from smplxpp.core.validation import require_choice
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """Teacher and field of a preset."""
+    """The teacher and the field of a preset."""
 
     teacher: TeacherConfig
     field: FieldConfig
 
 
-_LEAN = {
-    "networks": "shared",
-    "position_size": 128,
-    "centred": True,
-    "style_layers": 1,
-    "noise": False,
-    "zero_output": True,
-}
+_LEAN = TeacherConfig(networks="shared", position_size=128, centred=True, style_layers=1, noise=False, zero_output=True)
 
 _TEACHERS = {
     "paper": TeacherConfig(),
     "gpu": TeacherConfig(
         in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
     ),
-    "cpu": TeacherConfig(in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32, **_LEAN),
-    "demo": TeacherConfig(in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16, **_LEAN),
+    "cpu": replace(_LEAN, in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32),
+    "demo": replace(_LEAN, in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16),
 }
 
 # Short trainings see few poses.
@@ -46,7 +39,7 @@ NETWORK_PRESETS = {
 
 
 def network_preset(name: str) -> NetworkPreset:
-    """The preset "paper", "gpu", "cpu" or "demo".
+    """Return the preset "paper", "gpu", "cpu" or "demo".
 
     Raises:
         InputError: another name.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 
@@ -11,13 +14,13 @@ class _Bags(torch.autograd.Function):
     """Sparse matrix times (rows, C) table, by weighted sums of rows; the adjoint is the transposed sparse matrix."""
 
     @staticmethod
-    def forward(ctx, table: Tensor, *matrices: Tensor) -> Tensor:
+    def forward(ctx: Any, table: Tensor, *matrices: Tensor) -> Tensor:
         ctx.save_for_backward(*matrices)
         rows, offsets, weights = matrices[:3]
         return F.embedding_bag(rows, table.to(weights.dtype), offsets, mode="sum", per_sample_weights=weights)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         rows, offsets, weights = ctx.saved_tensors[3:]
         gradient = gradient.to(weights.dtype)
         summed = F.embedding_bag(rows, gradient, offsets, mode="sum", per_sample_weights=weights)
@@ -31,11 +34,11 @@ class SparseRows(nn.Module):
     are not saved: they follow from what the module is made of.
 
     Args:
-        rows: (P, k) int64, rows of the table. weights: (P, k).
-        count: rows of the table.
+        rows: rows of the table. weights: those of the rows.
+        count: number of the table's rows.
     """
 
-    def __init__(self, rows: Tensor, weights: Tensor, count: int) -> None:
+    def __init__(self, rows: Int[Tensor, "P k"], weights: Float[Tensor, "P k"], count: int) -> None:
         super().__init__()
         points, per_point = rows.shape
         flat, weights = rows.flatten(), weights.flatten()
@@ -54,6 +57,6 @@ class SparseRows(nn.Module):
         for name, value in matrices.items():
             self.register_buffer(name, value, persistent=False)
 
-    def forward(self, table: Tensor) -> Tensor:
-        """(count, C) -> (P, C)."""
+    def forward(self, table: Float[Tensor, "R C"]) -> Float[Tensor, "P C"]:
+        """Return the weighted sums of the table's rows."""
         return _Bags.apply(table, *(getattr(self, name) for name in self._names))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.models.networks.layers import (
+from avatar.models.networks.stylegan2_layers import (
     GAIN,
     SLOPE,
     ConvLayer,
@@ -27,13 +28,13 @@ from avatar.models.networks.layers import (
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
-STYLE_RATE = 0.01
+STYLE_LR_MULTIPLIER = 0.01
 """Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""
 
 
 @dataclass(frozen=True)
 class Head:
-    """Output of a StyleUNet: number of channels, and whether it depends on the viewing direction."""
+    """An output of a StyleUNet: number of channels, and whether it depends on the viewing direction."""
 
     channels: int
     sees_view: bool = False
@@ -44,7 +45,7 @@ class StyleUNetConfig:
     """Sizes of a StyleUNet. The defaults are those of Animatable Gaussians.
 
     Attributes:
-        in_channels: of the input image (front and back together).
+        in_channels: channels of the input image (front and back together).
         heads: outputs; everything but the finest scale of the decoder is shared between them.
         in_size, out_size: side of the input and output in pixels, powers of two.
         bottleneck: side of the coarsest feature map.
@@ -82,7 +83,7 @@ class StyleUNetConfig:
             )
 
     def channels(self, side: int) -> int:
-        """Channels of a feature map of this side."""
+        """Return the number of channels of a feature map of this side."""
         return min(self.channel_max, self.channel_base // side)
 
 
@@ -102,8 +103,8 @@ class Encoder(nn.Module):
         self.last = ConvLayer(c(side), c(side))
         self.filter = FirFilter()
 
-    def forward(self, image: Tensor) -> dict[int, Tensor]:
-        """(B, in_channels, S, S) -> feature maps by their side."""
+    def forward(self, image: Float[Tensor, "B I S S"]) -> dict[int, Tensor]:
+        """Return the feature maps by their side."""
         x = self.first(image)
         features = {x.shape[-1]: x}
         for from_image, block in zip(self.from_image, self.blocks, strict=True):
@@ -131,12 +132,18 @@ class Merge(nn.Module):
             side *= 2
 
     def skips(self, features: dict[int, Tensor]) -> dict[int, Tensor]:
-        """Encoder features by side -> their half of each convolution, by side."""
-        return {int(side): conv.skip(features[int(side)]) for side, conv in self.convs.items()}
+        """Take encoder features by side to their half of each convolution, by side."""
+        return {side: self._conv(side).skip(features[side]) for side in map(int, self.convs)}
 
-    def forward(self, x: Tensor, skips: dict[int, Tensor]) -> Tensor:
+    def _conv(self, side: int) -> JoiningConv:
+        conv = self.convs[str(side)]
+        assert isinstance(conv, JoiningConv)
+        return conv
+
+    def forward(self, x: Float[Tensor, "B C S S"], skips: dict[int, Tensor]) -> Float[Tensor, "_ C S S"]:
+        """Join decoder features to the skip of their side, if there is one."""
         side = x.shape[-1]
-        return self.convs[str(side)](x, skips[side]) if side in skips else x
+        return self._conv(side)(x, skips[side]) if side in skips else x
 
 
 class DecoderStep(nn.Module):
@@ -150,7 +157,10 @@ class DecoderStep(nn.Module):
         self.conv = StyledConv(outputs, outputs, style, noise_size=noise_size)
         self.to_maps = ToMaps(outputs, channels, style, zero=config.zero_output)
 
-    def forward(self, x: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, x: Float[Tensor, "B I S S"], style: Float[Tensor, " Z"]
+    ) -> tuple[Float[Tensor, "B O R R"], Float[Tensor, "B C T T"]]:
+        """Return features of twice the side, and their part of the output, of four times the side."""
         x = self.conv(self.up(x, style), style)
         return x, self.to_maps(x, style)
 
@@ -170,33 +180,38 @@ class Decoder(nn.Module):
         self.filter = FirFilter(gain=4.0)
 
     def forward(
-        self, x: Tensor, skip: Callable[[Tensor], Tensor], style: Tensor, view_features: Tensor | None
+        self,
+        x: Float[Tensor, "B C S S"],
+        skip: Callable[[Tensor], Tensor],
+        style: Float[Tensor, " Z"],
+        view_features: Float[Tensor, "V D Q Q"] | None,
     ) -> list[Tensor]:
-        """Maps of each head.
+        """Return the maps of each head.
 
         Args:
-            x: (B, C, bottleneck, bottleneck) coarsest features.
+            x: coarsest features, S the bottleneck.
             skip: joins decoder features to the encoder's of the same side.
-            style: (style_size,).
-            view_features: (V, C, out_size/4, out_size/4) or None.
+            style: what modulates every convolution.
+            view_features: those of V views, Q a quarter of the output's side.
 
         Returns:
             (B, channels, out_size, out_size) for each head, (V, ...) where it sees the view.
         """
-        maps = None
+        maps: Tensor | None = None
         for step in self.coarse:
             x, part = step(skip(x), style)
-            maps = part if maps is None else self.filter.double(maps) + part
+            maps = part if maps is None else self.filter.enlarge(maps) + part
+        assert maps is not None  # the output has at least eight times the bottleneck's side
         coarse_maps = maps.split([head.channels for head in self.heads], dim=1)
         outputs = []
         for head, step, coarse in zip(self.heads, self.fine, coarse_maps, strict=True):
             seen = x + view_features if head.sees_view and view_features is not None else x
-            outputs.append(self.filter.double(coarse) + step(skip(seen), style)[1])
+            outputs.append(self.filter.enlarge(coarse) + step(skip(seen), style)[1])
         return outputs
 
 
 class ViewEncoder(nn.Module):
-    """Maps of the cosine between normal and viewing direction to features that are added before the finest scale."""
+    """Takes maps of the cosine between normal and viewing direction to features added before the finest scale."""
 
     def __init__(self, config: StyleUNetConfig) -> None:
         super().__init__()
@@ -205,8 +220,8 @@ class ViewEncoder(nn.Module):
         self.first = ConvLayer(1, max(1, channels // 2), down=True)
         self.second = ConvLayer(max(1, channels // 2), channels, down=True)
 
-    def forward(self, cosines: Tensor) -> tuple[Tensor, Tensor]:
-        """(V, 2, S, S) cosines of front and back -> their features, (V, channels, out_size/4, out_size/4) each."""
+    def forward(self, cosines: Float[Tensor, "V 2 S S"]) -> tuple[Float[Tensor, "V D Q Q"], Float[Tensor, "V D Q Q"]]:
+        """Take cosines of front and back to their features, Q a quarter of the output's side."""
         features = self.second(self.first(cosines.flatten(0, 1)[:, None]))
         features = F.interpolate(features, size=(self.side, self.side), mode="bilinear")
         return features[0::2], features[1::2]
@@ -220,31 +235,36 @@ class StyleUNet(nn.Module):
     The style is `mapping(1)`, one learnt vector.
     """
 
+    style_seed: Tensor
+
     def __init__(self, config: StyleUNetConfig) -> None:
         super().__init__()
         self.config = config
         self.register_buffer("style_seed", torch.ones(config.style_size), persistent=False)
         self.mapping = nn.ModuleList(
-            EqualizedLinear(config.style_size, config.style_size, rate=STYLE_RATE) for _ in range(config.style_layers)
+            EqualizedLinear(config.style_size, config.style_size, lr_multiplier=STYLE_LR_MULTIPLIER)
+            for _ in range(config.style_layers)
         )
         self.encoder = Encoder(config)
         self.merge = Merge(config)
         self.decoders = nn.ModuleList([Decoder(config), Decoder(config)])
         self.view_encoder = ViewEncoder(config) if any(head.sees_view for head in config.heads) else None
 
-    def style(self) -> Tensor:
-        """(style_size,): what modulates every convolution of the decoders."""
+    def style(self) -> Float[Tensor, " Z"]:
+        """Return what modulates every convolution of the decoders."""
         w = self.style_seed
         for layer in self.mapping:
             w = F.leaky_relu(layer(w), SLOPE) * GAIN
         return w
 
-    def forward(self, image: Tensor, view_cosines: Tensor | None = None) -> list[Tensor]:
-        """Maps of each head.
+    def forward(
+        self, image: Float[Tensor, "B I S S"], view_cosines: Float[Tensor, "V 2 S S"] | None = None
+    ) -> list[Tensor]:
+        """Return the maps of each head.
 
         Args:
-            image: (B, in_channels, in_size, in_size).
-            view_cosines: (V, 2, in_size, in_size), cosine between the normal and the direction to the camera on the
+            image: S is `in_size`.
+            view_cosines: cosine between the normal and the direction to the camera on the
                 front and the back; B = V, or B = 1 for V views of one pose. None: the heads that could see the view
                 do not.
 

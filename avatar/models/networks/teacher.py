@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_choice
+from smplxpp.core.validation import require_between, require_choice, require_positive
 
 POSITION, COLOUR = 3, 3
 OTHER = 7
@@ -60,15 +61,13 @@ class TeacherConfig:
     def __post_init__(self) -> None:
         require_choice("teacher networks", self.networks, ("separate", "shared"))
         require_choice("teacher semantics", self.semantics, ("sum", "concatenate"))
-        if not self.position_scale > 0:
-            raise InputError("teacher position_scale", expected="above 0 m", received=f"{self.position_scale:g}")
-        largest = min(2 * self.in_size, self.out_size)
-        if not 0 <= self.position_size <= largest:
-            raise InputError("teacher position_size", expected=f"from 0 to {largest}", received=str(self.position_size))
+        require_positive("teacher position_scale", self.position_scale)
+        require_between("teacher position_size", self.position_size, 0, min(2 * self.in_size, self.out_size))
         self.network_configs()
 
     def network_configs(self) -> dict[str, StyleUNetConfig]:
-        """The StyleUNets by name."""
+        """Return the configurations of the StyleUNets by name."""
+        heads: dict[str, tuple[Head, ...]]
         position, other, colour = (Head(POSITION),), (Head(OTHER),), Head(COLOUR, sees_view=self.sees_view)
         if self.networks == "separate":
             heads = {"position": position, "colour": (colour,), "other": other}
@@ -108,50 +107,49 @@ class Residuals:
     """What the teacher adds to the attributes: as maps (B, 2, R, R, ...) or Gaussian by Gaussian (B, N, ...).
 
     Attributes:
-        shape: (..., 10) position in units of `position_scale`, opacity, log scales and quaternion, side by side.
-        colour: (..., 3) added to the colour that does not depend on the view; V views in the place of B poses if the
+        shape: position in units of `position_scale`, opacity, log scales and quaternion, side by side.
+        colour: added to the colour that does not depend on the view; V views in the place of B poses if the
             teacher was given V view maps.
         position_scale: metres.
     """
 
-    shape: Tensor
-    colour: Tensor
+    shape: Float[Tensor, "*B 10"]
+    colour: Float[Tensor, "*V 3"]
     position_scale: float
 
     @property
-    def position(self) -> Tensor:
-        """(..., 3) metres along the axes of the canonical pose."""
+    def position(self) -> Float[Tensor, "*B 3"]:
+        """The displacements, metres along the axes of the canonical pose."""
         return self.position_scale * self.shape[..., :3]
 
     @property
-    def opacity_logit(self) -> Tensor:
-        """(...), added before the sigmoid."""
+    def opacity_logit(self) -> Float[Tensor, "*B"]:
+        """The opacities' residuals, added before the sigmoid."""
         return self.shape[..., 3]
 
     @property
-    def log_scales(self) -> Tensor:
-        """(..., 2), added to the logarithms of the tangential scales."""
+    def log_scales(self) -> Float[Tensor, "*B 2"]:
+        """The scales' residuals, added to the logarithms of the tangential scales."""
         return self.shape[..., 4:6]
 
     @property
-    def quats(self) -> Tensor:
-        """(..., 4) wxyz, added before normalisation."""
+    def quats(self) -> Float[Tensor, "*B 4"]:
+        """The rotations' residuals, wxyz, added before normalisation."""
         return self.shape[..., 6:]
 
     def sampled(self, sampler: MapSampler) -> Residuals:
-        """Maps looked up at the Gaussians of `sampler`."""
+        """Look maps up at the Gaussians of `sampler`."""
         return Residuals(sampler(self.shape), sampler(self.colour), self.position_scale)
 
 
-def local_offsets(canonical_offsets: Tensor, canonical_from_local: Tensor) -> Tensor:
-    """Displacements in the triangles' frames, `du = R^T dU`.
+def local_offsets(
+    canonical_offsets: Float[Tensor, "*B N 3"], canonical_from_local: Float[Tensor, "N 3 3"]
+) -> Float[Tensor, "*B N 3"]:
+    """Return displacements in the triangles' frames, `du = R^T dU`, metres.
 
     Args:
-        canonical_offsets: (..., N, 3) metres along the canonical axes.
-        canonical_from_local: (N, 3, 3) rotation of each Gaussian's triangle in the canonical pose.
-
-    Returns:
-        (..., N, 3) metres.
+        canonical_offsets: metres along the canonical axes.
+        canonical_from_local: rotation of each Gaussian's triangle in the canonical pose.
     """
     return torch.einsum("nij,...ni->...nj", canonical_from_local, canonical_offsets)
 
@@ -164,14 +162,19 @@ class Teacher(nn.Module):
         self.config = config
         self.networks = nn.ModuleDict({name: StyleUNet(c) for name, c in config.network_configs().items()})
 
-    def forward(self, positions: Tensor, semantics: Tensor, view_cosines: Tensor | None = None) -> Residuals:
-        """Residual maps of B poses.
+    def forward(
+        self,
+        positions: Float[Tensor, "B 2 S S 3"],
+        semantics: Float[Tensor, "#B 2 S S 3"],
+        view_cosines: Float[Tensor, "V 2 S S"] | None = None,
+    ) -> Residuals:
+        """Return the residual maps of B poses.
 
         Args:
-            positions: (B, 2, S, S, 3) posed coordinates without the root's motion, metres, on the front and back map of
+            positions: posed coordinates without the root's motion, metres, on the front and back map of
                 the canonical pose; 0 on the background.
-            semantics: (B, 2, S, S, 3) or (1, 2, S, S, 3) semantic colours on the same maps.
-            view_cosines: (V, 2, S, S) cosine between the posed normal and the direction to the camera; V = B, or B = 1
+            semantics: semantic colours on the same maps, one for all poses or one for each.
+            view_cosines: cosine between the posed normal and the direction to the camera; V = B, or B = 1
                 and V views of one pose. None: no view is seen.
 
         Returns:
@@ -198,8 +201,10 @@ class Teacher(nn.Module):
             (other,) = self.networks["other"](image)
         return Residuals(torch.cat([position, other], dim=-1), colour, self.config.position_scale)
 
-    def positions(self, positions: Tensor, semantics: Tensor) -> Tensor:
-        """The residuals of the position alone, (B, 2, R, R, 3) in units of `position_scale`.
+    def positions(
+        self, positions: Float[Tensor, "B 2 S S 3"], semantics: Float[Tensor, "#B 2 S S 3"]
+    ) -> Float[Tensor, "B 2 R R 3"]:
+        """Return the residuals of the position alone, in units of `position_scale`.
 
         Args:
             positions, semantics: as in `forward`.
@@ -208,7 +213,7 @@ class Teacher(nn.Module):
         return self._position(image) if "position" in self.networks else self.networks["all"](image)[0][..., :POSITION]
 
     def _image(self, positions: Tensor, semantics: Tensor) -> Tensor:
-        """(B, channels, S, S) input of the StyleUNets."""
+        """Make the input of the StyleUNets, (B, channels, S, S)."""
         if self.config.semantics == "sum":
             image = positions + semantics
         else:
@@ -216,8 +221,9 @@ class Teacher(nn.Module):
         return image.permute(0, 1, 4, 2, 3).flatten(1, 2)
 
     def _position(self, image: Tensor) -> Tensor:
-        """(B, 2, R, R, 3) of the position's own network."""
+        """Return the maps of the position's own network, (B, 2, R, R, 3)."""
         network, out = self.networks["position"], self.config.out_size
+        assert isinstance(network, StyleUNet)
         if image.shape[-1] != network.config.in_size:
             image = F.interpolate(image, size=(network.config.in_size,) * 2, mode="area")
         (maps,) = network(image)

@@ -19,11 +19,11 @@ from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.regularizers import offset_penalty, scale_penalty
 from avatar.gaussians.sampling import sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.losses.psnr import psnr_from_mse
 from avatar.losses.ssim import ssim
 from avatar.metrics.view_quality import (
     Box,
     ViewQuality,
-    decibels,
     eight_bit,
     head_box,
     head_vertices,
@@ -233,8 +233,8 @@ class FitTask(OptimizationTask):
         total = total + config.scale_penalty * scale_penalty(bound)
         total = total + config.offset_penalty * offset_penalty(bound, self.frames)
         square = (image.detach().clamp(0.0, 1.0) - real).square().mean()
-        terms = {"loss": total.item(), "l1": l1.item(), "ssim": similarity.item(), "psnr_crop": decibels(square.item())}
-        return total, terms
+        psnr = psnr_from_mse(square.item())
+        return total, {"loss": total.item(), "l1": l1.item(), "ssim": similarity.item(), "psnr_crop": psnr}
 
     def view_index(self, iteration: int) -> int:
         """Every view once an epoch, in an order that the seed and the epoch alone decide."""

@@ -174,7 +174,7 @@ def test_refused_input():
     with pytest.raises(InputError, match="pose and code"):
         random_field()(torch.zeros(2, 63), torch.zeros(1, 32))
     with pytest.raises(InputError, match="control points"):
-        random_field(control=choose_control_points(torch.rand(10, 3).numpy(), [0] * 10, count=4))
+        random_field(control=choose_control_points(torch.rand(10, 3).numpy(), torch.zeros(10).numpy(), count=4))
     with pytest.raises(InputError, match="width"):
         FieldConfig(width=0)
     with pytest.raises(InputError, match="each once"):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar.models.networks.local_pose import CARRIES, seen_joints
+from avatar.models.networks.local_pose import MIN_SKIN_WEIGHT, seen_joints
 from tests.training.dancing_doll import template
 
 
 def test_no_steps_are_the_joints_that_carry_a_vertex():
     doll = template()
-    np.testing.assert_array_equal(seen_joints(doll, 0), (doll.weights.dense() > CARRIES)[:, 1:22])
+    np.testing.assert_array_equal(seen_joints(doll, 0), (doll.weights.dense() > MIN_SKIN_WEIGHT)[:, 1:22])
 
 
 def test_a_step_adds_parents_and_children_alone():

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from smplxpp.core.errors import InputError
 
-Config = TypeVar("Config")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Config = TypeVar("Config", bound="DataclassInstance")
 
 
-def config_to_dict(config: Any) -> dict[str, Any]:
-    """Fields of a frozen dataclass by name; every value is a number, a string or a bool."""
+def config_to_dict(config: DataclassInstance) -> dict[str, Any]:
+    """Return the fields of a frozen dataclass by name; every value is a number, a string or a bool."""
     return asdict(config)
 
 
 def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
-    """The configuration that `config_to_dict` stored.
+    """Make the configuration that `config_to_dict` stored.
 
     Args:
         cls: dataclass whose fields all have defaults.
@@ -26,7 +29,7 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a field is missing, unknown or of another type, or a value is refused by the configuration itself.
     """
-    defaults = {field.name: field.default for field in fields(cls)}
+    defaults: dict[str, Any] = {field.name: field.default for field in fields(cls)}
     if set(stored) != set(defaults):
         raise InputError(
             f"stored {cls.__name__}",
@@ -42,15 +45,3 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
                 f"stored {cls.__name__}.{name}", expected=type(default).__name__, received=repr(stored[name])
             )
     return cls(**{name: type(default)(stored[name]) for name, default in defaults.items()})
-
-
-def require_choice(subject: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise `InputError` unless `value` is one of `choices`."""
-    if value not in choices:
-        raise InputError(subject, expected=" or ".join(map(repr, choices)), received=repr(value))
-
-
-def require_at_least(subject: str, value: float, least: float) -> None:
-    """Raise `InputError` unless `value >= least` (a NaN is refused too)."""
-    if not value >= least:
-        raise InputError(subject, expected=f"at least {least:g}", received=f"{value:g}")

@@ -8,9 +8,11 @@ images are not.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 SLOPE = 0.2
@@ -27,14 +29,14 @@ class _SymmetricFilter(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, image: Tensor, kernel: Tensor, padding: int) -> Tensor:
+    def forward(ctx: Any, image: Tensor, kernel: Tensor, padding: int) -> Tensor:
         ctx.save_for_backward(kernel)
         ctx.padding = padding
         weight = kernel.to(image.dtype).expand(image.shape[1], -1, -1, -1)
         return F.conv2d(image, weight, padding=padding, groups=image.shape[1])
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (kernel,) = ctx.saved_tensors
         complementary = kernel.shape[-1] - 1 - ctx.padding
         return _SymmetricFilter.apply(gradient, kernel, complementary), None, None
@@ -47,22 +49,24 @@ class FirFilter(nn.Module):
         gain: multiplies the filter; 4 keeps the brightness of an image that is doubled with zeros in between.
     """
 
+    kernel: Tensor
+
     def __init__(self, *, gain: float = 1.0) -> None:
         super().__init__()
         taps = torch.tensor(FIR_TAPS)
         kernel = torch.outer(taps, taps) * (gain / sum(FIR_TAPS) ** 2)
         self.register_buffer("kernel", kernel[None, None], persistent=False)
 
-    def forward(self, image: Tensor, *, padding: int) -> Tensor:
-        """(B, C, H + 2 padding - 3, W + 2 padding - 3): filtered."""
+    def forward(self, image: Float[Tensor, "B C H W"], *, padding: int) -> Float[Tensor, "B C h w"]:
+        """Filter images; each side becomes `2 padding - 3` pixels longer."""
         return _SymmetricFilter.apply(image, self.kernel, padding)
 
-    def halve(self, image: Tensor) -> Tensor:
-        """(B, C, H/2, W/2): filtered, then every second pixel."""
+    def halve(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
+        """Filter images, then keep every second pixel."""
         return F.conv2d(image, self._weight(image), stride=2, padding=1, groups=image.shape[1])
 
-    def double(self, image: Tensor) -> Tensor:
-        """(B, C, 2H, 2W): zeros in between, then filtered. With gain 4 this is bilinear interpolation inside."""
+    def enlarge(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
+        """Double images with zeros in between, then filter them; with gain 4 this is bilinear interpolation inside."""
         return F.conv_transpose2d(image, self._weight(image), stride=2, padding=1, groups=image.shape[1])
 
     def _weight(self, image: Tensor) -> Tensor:
@@ -72,32 +76,38 @@ class FirFilter(nn.Module):
 class EqualizedLinear(nn.Module):
     """`y = r (W x / sqrt(fan in) + b)` with W ~ N(0, 1 / r^2): r is the layer's learning-rate multiplier."""
 
-    def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, rate: float = 1.0) -> None:
+    def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, lr_multiplier: float = 1.0) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs) / rate)
+        self.weight = nn.Parameter(torch.randn(outputs, inputs) / lr_multiplier)
         self.bias = nn.Parameter(torch.full((outputs,), bias))
-        self.rate = rate
+        self.lr_multiplier = lr_multiplier
         self.scale = 1.0 / math.sqrt(inputs)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "*B I"]) -> Float[Tensor, "*B O"]:
+        """Apply the layer."""
         y = F.linear(x * self.scale, self.weight, self.bias)
-        return y if self.rate == 1.0 else self.rate * y
+        return y if self.lr_multiplier == 1.0 else self.lr_multiplier * y
 
 
-class ConvLayer(nn.Module):
-    """Equalised convolution and activation; with `down` the image is filtered and halved on the way.
+class _EqualizedConv(nn.Module):
+    """Weights and bias of a convolution with an activation behind it."""
 
-    `forward` takes (B, inputs, H, W) to (B, outputs, H, W), or (B, outputs, H/2, W/2) with `down`.
-    """
-
-    def __init__(self, inputs: int, outputs: int, *, kernel: int = 3, down: bool = False) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
         self.bias = nn.Parameter(torch.zeros(outputs))
         self.scale = GAIN / math.sqrt(inputs * kernel**2)
+
+
+class ConvLayer(_EqualizedConv):
+    """Equalised convolution and activation; with `down` the image is filtered and halved on the way."""
+
+    def __init__(self, inputs: int, outputs: int, *, kernel: int = 3, down: bool = False) -> None:
+        super().__init__(inputs, outputs, kernel)
         self.filter = FirFilter() if down else None
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "B I H W"]) -> Float[Tensor, "B O h w"]:
+        """Apply the layer; h and w are H and W, or half of them with `down`."""
         weight = self.weight * self.scale
         reach = weight.shape[-1] // 2
         if self.filter is None:
@@ -107,18 +117,18 @@ class ConvLayer(nn.Module):
         return F.leaky_relu(x, SLOPE, inplace=True)
 
 
-class JoiningConv(ConvLayer):
+class JoiningConv(_EqualizedConv):
     """`forward(x, skip(y)) = ConvLayer(cat(x, y))`: the half that sees y is computed once and used for many x."""
 
     def __init__(self, channels: int) -> None:
-        super().__init__(2 * channels, channels)
+        super().__init__(2 * channels, channels, 3)
 
-    def skip(self, y: Tensor) -> Tensor:
-        """(B, channels, H, W) -> its half of the convolution, with the bias."""
+    def skip(self, y: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+        """Return the half of the convolution that sees y, with the bias."""
         return F.conv2d(y, self.weight.chunk(2, dim=1)[1] * self.scale, self.bias, padding=1)
 
-    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        """(B, channels, H, W), with B = 1 allowed in one of the two."""
+    def forward(self, x: Float[Tensor, "#B C H W"], skip: Float[Tensor, "#B C H W"]) -> Float[Tensor, "_ C H W"]:
+        """Join x to a skip at hand; one of the two may have a batch of 1."""
         x = F.conv2d(x, self.weight.chunk(2, dim=1)[0] * self.scale, padding=1)
         return F.leaky_relu(x + skip, SLOPE, inplace=True)
 
@@ -135,12 +145,13 @@ class ModulatedWeight(nn.Module):
         self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
         self.affine = EqualizedLinear(style_size, inputs, bias=1.0)
 
-    def forward(self, style: Tensor) -> Tensor:
+    def forward(self, style: Float[Tensor, " S"]) -> Float[Tensor, "O I K K"]:
+        """Return the weights in a style."""
         return self.weight * self.affine(style)[:, None, None]
 
 
-def demodulate(weight: Tensor) -> Tensor:
-    """Filters of unit norm, `w''_oikl = w'_oikl / sqrt(sum_ikl w'_oikl^2 + 1e-8)` (Karras et al. 2020, equation 3)."""
+def demodulate(weight: Float[Tensor, "O I K K"]) -> Float[Tensor, "O I K K"]:
+    """Return filters of unit norm, `w'' = w' / sqrt(sum_ikl w'_oikl^2 + 1e-8)` (Karras et al. 2020, equation 3)."""
     return weight * torch.rsqrt(weight.square().sum((1, 2, 3), keepdim=True) + DEMODULATION_EPS)
 
 
@@ -157,6 +168,8 @@ class StyledConv(nn.Module):
         noise_size: side of the output in pixels, if noise is to be added.
     """
 
+    noise: Tensor | None
+
     def __init__(
         self, inputs: int, outputs: int, style_size: int, *, up: bool = False, noise_size: int | None = None
     ) -> None:
@@ -171,7 +184,8 @@ class StyledConv(nn.Module):
         else:
             self.noise = None
 
-    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "B I H W"], style: Float[Tensor, " S"]) -> Float[Tensor, "B O h w"]:
+        """Apply the layer; h and w are H and W, or twice as much with `up`."""
         weight = demodulate(self.modulated(style))
         if self.filter is None:
             x = F.conv2d(x, weight * GAIN, self.bias, padding=1)
@@ -184,7 +198,7 @@ class StyledConv(nn.Module):
 
 
 class ToMaps(nn.Module):
-    """Feature maps to output maps of twice the side: (B, inputs, H, W) -> (B, outputs, 2H, 2W).
+    """Takes feature maps to output maps of twice the side.
 
     Each feature pixel gives a block of 2 x 2 output pixels by a modulated linear map: four Haar coefficients and the
     inverse transform, as Animatable Gaussians has it, up to an orthonormal change of the weights.
@@ -203,6 +217,7 @@ class ToMaps(nn.Module):
         if zero:
             nn.init.zeros_(self.modulated.weight)
 
-    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "B I H W"], style: Float[Tensor, " S"]) -> Float[Tensor, "B O h w"]:
+        """Return the maps of twice the side."""
         weight = self.modulated(style) * self.scale
         return F.conv_transpose2d(x, weight.transpose(0, 1), self.bias, stride=2)

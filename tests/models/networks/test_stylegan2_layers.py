@@ -8,7 +8,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from avatar.models.networks.layers import (
+from avatar.models.networks.stylegan2_layers import (
     GAIN,
     ConvLayer,
     EqualizedLinear,
@@ -32,10 +32,10 @@ def test_filter_is_separable_binomial_and_sums_to_gain():
     torch.testing.assert_close(kernel, 4 * torch.outer(taps, taps))
 
 
-@pytest.mark.parametrize("operation", ["halve", "double"])
+@pytest.mark.parametrize("operation", ["halve", "enlarge"])
 def test_constant_image_stays_constant_inside(operation):
     image = torch.full((1, 3, 8, 8), 2.5)
-    filtered = getattr(FirFilter(gain=4.0 if operation == "double" else 1.0), operation)(image)
+    filtered = getattr(FirFilter(gain=4.0 if operation == "enlarge" else 1.0), operation)(image)
     torch.testing.assert_close(filtered[:, :, 1:-1, 1:-1], torch.full_like(filtered, 2.5)[:, :, 1:-1, 1:-1])
 
 
@@ -45,13 +45,13 @@ def test_every_pixel_gives_its_brightness_once():
     for row, column in ((3, 3), (3, 4), (4, 4)):
         impulse = torch.zeros(1, 1, 8, 8)
         impulse[0, 0, row, column] = 1.0
-        assert filter_.double(impulse).sum().item() == pytest.approx(4.0)
+        assert filter_.enlarge(impulse).sum().item() == pytest.approx(4.0)
 
 
-def test_double_is_bilinear_and_halve_is_antialiased_resizing_inside():
+def test_enlarge_is_bilinear_and_halve_is_antialiased_resizing_inside():
     image = torch.randn(2, 3, 8, 8)
     doubled = F.interpolate(image, scale_factor=2.0, mode="bilinear")
-    torch.testing.assert_close(FirFilter(gain=4.0).double(image)[:, :, 1:-1, 1:-1], doubled[:, :, 1:-1, 1:-1])
+    torch.testing.assert_close(FirFilter(gain=4.0).enlarge(image)[:, :, 1:-1, 1:-1], doubled[:, :, 1:-1, 1:-1])
     halved = F.interpolate(image, scale_factor=0.5, mode="bilinear", antialias=True)
     torch.testing.assert_close(FirFilter().halve(image)[:, :, 1:-1, 1:-1], halved[:, :, 1:-1, 1:-1])
 
@@ -105,7 +105,7 @@ def test_upsampling_conv_is_conv_of_the_doubled_image():
     layer = StyledConv(3, 2, 4, up=True)
     x, style = torch.randn(1, 3, 8, 8), torch.randn(4)
     weight = demodulate(layer.modulated(style))
-    smooth = FirFilter(gain=4.0).double(x)
+    smooth = FirFilter(gain=4.0).enlarge(x)
     # A transposed convolution turns the kernel round.
     expected = F.leaky_relu(GAIN * F.conv2d(smooth, weight.flip(2, 3), padding=1), 0.2)
     torch.testing.assert_close(layer(x, style)[..., 3:-3, 3:-3], expected[..., 3:-3, 3:-3], rtol=1e-4, atol=1e-5)
@@ -127,7 +127,9 @@ def test_joining_conv_is_the_conv_of_both():
     with torch.no_grad():
         layer.bias.normal_()
     x, y = torch.randn(3, 4, 6, 6), torch.randn(1, 4, 6, 6)
-    expected = ConvLayer.forward(layer, torch.cat([x, y.expand(3, -1, -1, -1)], dim=1))
+    whole = ConvLayer(8, 4)
+    whole.load_state_dict(layer.state_dict())
+    expected = whole(torch.cat([x, y.expand(3, -1, -1, -1)], dim=1))
     torch.testing.assert_close(layer(x, layer.skip(y)), expected)
 
 
@@ -144,7 +146,7 @@ def test_rate_multiplies_the_step_and_not_the_start():
     torch.manual_seed(1)
     plain = EqualizedLinear(6, 3)
     torch.manual_seed(1)
-    slow = EqualizedLinear(6, 3, rate=0.01)
+    slow = EqualizedLinear(6, 3, lr_multiplier=0.01)
     x = torch.randn(6)
     torch.testing.assert_close(plain(x), slow(x))
     plain(x).sum().backward()
