@@ -10,12 +10,13 @@ from PIL import Image
 
 from pipelines.figures import body_cameras, caption, encode_png, render_heat, row
 from pipelines.figures.comparison import error_colors
-from pipelines.stages.evaluate_config import SURFACE_LIMIT_MM
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.metrics import point_to_surface
 
 SURFACE_HEIGHT = 480
+SURFACE_LIMIT_MM = 40.0
+"""Distance that the colours of posed meshes end at."""
 
 
 def write_tiles(path: Path, truth: np.ndarray, rendered: Sequence[np.ndarray]) -> None:

@@ -21,7 +21,7 @@ from avatar.training.engine.loop import METRICS_FILE, Progress
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
 from pipelines.figures.comparison import write_strip
-from pipelines.runs.checks import Check
+from pipelines.runs import gates
 from pipelines.runs.digests import code_digest, sha256_file
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage, stage_key
@@ -254,32 +254,20 @@ def _output(result: FitResult, config: FitConfig, held_out: list[str], train: li
     figures = mean["held_out" if held_out else "train"]
     which = "held-out" if held_out else "training"
     checks = [
-        Check(
+        gates.SILHOUETTE.check(
             "template's silhouette on the masks",
             overlap,
-            "IoU",
-            0.95,
-            0.8,
-            higher_is_better=True,
             explanation="mean over the training views, before the fit; low: another pose, or other cameras",
         ),
-        Check(
+        gates.PSNR["novel_view"].check(
             f"{which} views: PSNR of the person",
             figures["psnr"],
-            "dB",
-            22.0,
-            16.0,
-            higher_is_better=True,
             explanation=f"mean over {len(shown)} cameras, over the union of the silhouettes",
         ),
-        Check(f"{which} views: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
-        Check(
+        gates.SSIM.check(f"{which} views: SSIM", figures["ssim"]),
+        gates.ITERATIONS.check(
             "iterations done",
             done.iteration / done.iterations,
-            "",
-            1.0,
-            0.0,
-            higher_is_better=True,
             explanation="below 1: the limit of time ended it; the same command goes on",
         ),
     ]

@@ -10,13 +10,13 @@ import numpy as np
 
 from pipelines.figures import encode_jpeg, encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend
-from pipelines.figures.evaluation import read_tiles
+from pipelines.figures.evaluation import SURFACE_LIMIT_MM, read_tiles
 from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import TEMPLATE
-from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, HELD_OUT_VIEWS, MODEL_FILES, SURFACE_LIMIT_MM
+from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, HELD_OUT_VIEWS, MODEL_FILES
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:

@@ -1,0 +1,45 @@
+"""Gates of what several stages measure: one number each, wherever it is held against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipelines.runs.checks import Check
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Bounds of a measured number.
+
+    Attributes:
+        unit: of number and bounds.
+        warn, fail: the number passes up to `warn` (from `warn` on where higher is better) and fails beyond `fail`.
+        higher_is_better: the bounds are lower ones.
+    """
+
+    unit: str
+    warn: float
+    fail: float
+    higher_is_better: bool = True
+
+    def check(self, name: str, value: float, *, explanation: str = "") -> Check:
+        """A number held against the gate."""
+        return Check(name, value, self.unit, self.warn, self.fail, self.higher_is_better, explanation)
+
+
+SILHOUETTE = Gate("IoU", 0.95, 0.8)
+"""The skinned template on the masks."""
+PSNR: Mapping[str, Gate] = {"novel_view": Gate("dB", 22.0, 16.0), "novel_pose": Gate("dB", 20.0, 15.0)}
+"""PSNR over the person by kind of view; training views of a capture without held-out cameras count as novel views."""
+SSIM = Gate("", 0.9, 0.75)
+GAIN = Gate("dB", 0.0, -1.0)
+"""PSNR gained since the start of a training."""
+AGAINST_TEACHER = Gate("dB", -0.3, -2.0)
+"""PSNR of a student less that of its teacher."""
+LOST_BY_COMPRESSION = Gate("dB", 0.3, 2.0, higher_is_better=False)
+"""PSNR of a student less that of its compact file."""
+AGAINST_SKINNING = Gate("x", 1.0, 1.5, higher_is_better=False)
+"""P2S of a garment, as a share of that of the template that follows its joints."""
+ITERATIONS = Gate("", 1.0, 0.0)
+"""Share of a training's iterations that were done."""
