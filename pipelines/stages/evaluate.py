@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -20,16 +21,19 @@ from avatar.rig.posed import AvatarModel
 from avatar.rig.rig import Rig
 from pipelines.figures import encode_png
 from pipelines.figures.evaluation import surface_picture, write_tiles
+from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.digests import code_digest, sha256_file
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import StageOutput, StageRecord, run_stage
 from pipelines.stages.evaluate_config import BEST_FIRST, EVALUATE_STAGE, MEASURED, MODEL_FILES, REPORT_FILE
+from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.train_inputs import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.validation import require_known
 
 
 def evaluate(
@@ -56,6 +60,7 @@ def evaluate(
     files = model_files(run, models)
     scene = open_scene(run, inputs)
     sets = with_people(scene.capture, view_sets(scene.capture, config.protocol))
+    known = input_protocol(run, inputs, scene.capture)
     sequence = AvatarSequence(scene.capture, scene.template, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
     digests = {
@@ -65,14 +70,17 @@ def evaluate(
         "code": code_digest("smplxpp", "avatar"),
         "torch": version("torch"),
     }
+
+    def work(folder: Path) -> StageOutput:
+        found = evaluate_models(loaded, sequence, config, files=files, progress=progress)
+        return _write(folder, replace(found, report=replace(found.report, inputs=known)), scene.overlap)
+
     with own_run_folder(run, (EVALUATE_STAGE, "report")):
         return run_stage(
             run,
             EVALUATE_STAGE,
-            lambda folder: _write(
-                folder, evaluate_models(loaded, sequence, config, files=files, progress=progress), scene.overlap
-            ),
-            config={"evaluation": config, "scale": inputs.scale, "device": device},
+            work,
+            config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device},
             inputs=digests,
             seed=config.seed,
             force=force,
@@ -80,7 +88,7 @@ def evaluate(
 
 
 def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
-    """Files of the models of a run, in the order of `MODEL_FILES`.
+    """Find the files of the models of a run, in the order of `MODEL_FILES`.
 
     Args:
         names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
@@ -90,9 +98,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
     """
     there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
     asked = list(names)
-    unknown = [name for name in asked if name not in MODEL_FILES]
-    if unknown:
-        raise InputError("models", expected=f"among {', '.join(MODEL_FILES)}", received=", ".join(unknown))
+    require_known("models", asked, MODEL_FILES)
     missing = [name for name in asked if name not in there]
     untrained = not asked and not there.keys() & set(BEST_FIRST)
     if missing or untrained:
@@ -109,7 +115,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
 
 
 def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
-    """A model of a run; the reference fit is a student without field and blend shapes.
+    """Load a model of a run; the reference fit is a student without field and blend shapes.
 
     Raises:
         InputError: a damaged file, one of another template or of a newer version.
@@ -120,7 +126,7 @@ def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
 
 
 def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
-    """Figures, tables and pictures of an evaluation as files; what the manifest and the report say of it."""
+    """Write figures, tables and pictures of an evaluation; return what the manifest and the report say of it."""
     report = found.report
     report.save(folder / REPORT_FILE)
     tables = evaluation_tables(report)
@@ -144,9 +150,13 @@ def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
         atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
         title = f"{SURFACE_SETS[surface.set]}, frame {surface.frame}: distance to the true surface"
         surfaces.append({"file": file, "title": title})
+    best = next(iter(report.models.values()))
     numbers = {
         "models": {name: summary_figures(model) for name, model in report.models.items()},
         "conventions": report.conventions,
+        "inputs": report.inputs,
+        "metric": report.metric,
+        "counts": {name: best.counts(name) for name in best.views},
         "tables": [{"caption": t.caption, "header": t.header(), "rows": t.cells()} for t in tables.values()],
         "views": views,
         "surfaces": surfaces,
@@ -156,13 +166,9 @@ def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
 
 def _checks(report: EvalReport, overlap: float) -> list[Check]:
     checks = [
-        Check(
+        gates.SILHOUETTE.check(
             "template's silhouette on the masks",
             overlap,
-            "IoU",
-            0.95,
-            0.8,
-            higher_is_better=True,
             explanation="skinning alone; low: another person, another pose, or other cameras",
         )
     ]
@@ -170,40 +176,24 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
     if name is None:
         return checks
     best = report.models[name]
-    for part, title, warn, fail in (
-        ("novel_view", "novel views", 22.0, 16.0),
-        ("novel_pose", "novel poses", 20.0, 15.0),
-    ):
+    for part, gate in gates.PSNR.items():
         if part in best.views:
-            checks.append(
-                Check(
-                    f"{name}, {title}: PSNR of the person",
-                    best.mean(part)["psnr"],
-                    "dB",
-                    warn,
-                    fail,
-                    higher_is_better=True,
-                )
-            )
+            psnr = best.mean(part)["psnr"]
+            checks.append(gate.check(f"{name}, {SETS[part]}: PSNR of the person", psnr))
             if name != "teacher" and "teacher" in report.models:
-                gain = best.mean(part)["psnr"] - report.models["teacher"].mean(part)["psnr"]
-                checks.append(
-                    Check(f"{name} against its teacher, {title}", gain, "dB", -0.3, -2.0, higher_is_better=True)
-                )
+                gain = psnr - report.models["teacher"].mean(part)["psnr"]
+                checks.append(gates.AGAINST_TEACHER.check(f"{name} against its teacher, {SETS[part]}", gain))
     for part, title in SURFACE_SETS.items():
         if part not in best.surfaces or name == "teacher":
             continue
         own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
         for label in CLOTH_LABELS:
-            if label.name in own and label.name in alone and own[label.name].p2s and alone[label.name].p2s:
-                share = own[label.name].p2s / alone[label.name].p2s
+            ours, skinned = (found[label.name].p2s if label.name in found else None for found in (own, alone))
+            if ours and skinned:
                 checks.append(
-                    Check(
+                    gates.AGAINST_SKINNING.check(
                         f"P2S of {label.name} against skinning alone, {title}",
-                        share,
-                        "x",
-                        1.0,
-                        1.5,
+                        ours / skinned,
                         explanation="below 1: the mesh that the field moves is nearer to the truth",
                     )
                 )
@@ -211,9 +201,10 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
 
 
 def _surface_digest(capture: Capture, protocol: ProtocolConfig, sets: Mapping[str, ViewSet]) -> str:
-    """SHA-256 of the true surfaces that are measured."""
+    """Compute the SHA-256 of the true surfaces that are measured."""
     digest = hashlib.sha256()
     for frame in chain(*truth_frames(capture, protocol, sets).values()):
         mesh = capture.truth_mesh(frame)
+        assert mesh is not None  # `truth_frames` chose frames that have one
         digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
     return digest.hexdigest()
