@@ -207,9 +207,9 @@ PARTS = (
         "build",
         "Template builds",
         "Scans with exact parameters and true labels; distances are to the scan as given. Parts within their face "
-        "budget keep the scan's own faces, hence zeros. Each scan of 200k faces took 14.9 s in an earlier measurement; why "
-        "every stage was slower in this one is not known. Both warnings of each build: the scan's webs under the arms "
-        "stretch.",
+        "budget keep the scan's own faces, hence zeros. Each scan of 200k faces took 14.9 s in an earlier measurement; "
+        "why every stage was slower in this one is not known. Both warnings of each build: the scan's webs under the "
+        "arms stretch.",
         build_lines,
     ),
     Part(
