@@ -115,7 +115,7 @@ def fitted(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
-def parameter_counts(model: nn.Module) -> dict[str, int]:
+def parameter_counts(model: AvatarModel | nn.Module) -> dict[str, int]:
     """Count the parameters of a module's parts, "total" last; one that parts share counts once."""
     counts: dict[str, int] = {}
     for name, value in model.named_parameters():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from avatar.evaluation.input_protocol import InputProtocol, counted
 from pipelines.figures import encode_jpeg, encode_png, row
@@ -113,7 +114,9 @@ def _side_by_side(record: StageRecord) -> Section:
     )
 
 
-def _view_pictures(shown: Mapping[str, Any], truth: np.ndarray, rendered: list[np.ndarray]) -> list[Picture]:
+def _view_pictures(
+    shown: Mapping[str, Any], truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
+) -> list[Picture]:
     """The view whole, and its head enlarged."""
     out = [Picture(shown["title"], encode_png(_with_errors(truth, rendered)))]
     if shown["head"] is not None:
@@ -125,7 +128,9 @@ def _view_pictures(shown: Mapping[str, Any], truth: np.ndarray, rendered: list[n
     return out
 
 
-def _with_errors(truth: np.ndarray, rendered: list[np.ndarray]) -> np.ndarray:
+def _with_errors(
+    truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
+) -> UInt8[np.ndarray, "_ _ 3"]:
     """Photograph and renderings in a row, errors under the renderings."""
     blank = np.full_like(truth, 255)
     errors = row([blank, *(error_colors(truth, image) for image in rendered)])
