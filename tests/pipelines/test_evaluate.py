@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from avatar.evaluation.input_protocol import InputProtocol
+from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
 from avatar.gaussians.bound_file import save_bound
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
@@ -158,6 +159,11 @@ def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     ]
     html = write_report(tmp_path / "report.html", Report("doll", sections=(figures, pictures))).read_text()
     assert "Avatar: figures" in html and "http" not in html.replace("http://www.w3.org", "")
+
+
+def test_the_command_measures_every_held_out_frame_unless_told():
+    options, protocol = command.Evaluate(Path("run"), Path("capture")), ProtocolConfig()
+    assert options.every == protocol.every == 1 and options.training_every == protocol.training_every
 
 
 def test_inputs_are_what_capture_build_and_training_say(tmp_path):
