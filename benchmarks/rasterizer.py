@@ -21,7 +21,7 @@ import torch
 import tyro
 
 from avatar.render import rasterize
-from avatar.render.native import STAGES, RasterCall, Workspace
+from avatar.render.native import STAGES, View, Workspace
 from avatar.render.reference import rasterize_reference, rotation_from_quat
 from avatar.render.settings import RasterSettings
 from benchmarks.gaussian_scene import BenchmarkScene, body_scene
@@ -81,8 +81,7 @@ class Job:
     def __init__(self, scene: BenchmarkScene, level: str | None = None):
         size = (scene.height, scene.width)
         self.scene, self.workspace = scene, Workspace(level)
-        settings = RasterSettings(scene.width, scene.height)
-        self.call = RasterCall(scene.gaussians, (scene.viewmat, scene.K, None), settings)
+        self.view = View(scene.gaussians, (scene.viewmat, scene.K, None), RasterSettings(scene.width, scene.height))
         count, channels = scene.features.shape
         self.image = torch.empty(*size, channels)
         self.outputs = (self.image, torch.empty(*size, 1), torch.empty(count, 2), torch.empty(count, 2))
@@ -93,12 +92,12 @@ class Job:
         """Milliseconds of the passes and of their stages."""
         seconds = (ctypes.c_double * len(STAGES))()
         start = time.perf_counter()
-        self.workspace.forward(self.call, self.outputs, seconds)
+        self.workspace.forward(self.view, self.outputs, seconds)
         middle = time.perf_counter()
         grads = (*(torch.empty_like(tensor) for tensor in self.scene.gaussians), None, None)
         backward_seconds = (ctypes.c_double * 2).from_buffer(seconds, 4 * ctypes.sizeof(ctypes.c_double))
         radii = self.outputs[3]
-        self.workspace.backward(self.call, radii, *self.gradients, grads, (False, False), backward_seconds)
+        self.workspace.backward(self.view, radii, *self.gradients, grads, (False, False), backward_seconds)
         end = time.perf_counter()
         stages = {f"{name}_ms": 1e3 * value for name, value in zip(STAGES, seconds, strict=True)}
         return {"forward_ms": 1e3 * (middle - start), "both_ms": 1e3 * (end - start), **stages}
@@ -115,14 +114,14 @@ def accuracy(level: str) -> dict[str, float]:
     truths = [tensor.double().requires_grad_() for tensor in scene.gaussians]
     camera = (scene.viewmat.double()[None], scene.K.double()[None], None)
     truth, alpha, _ = rasterize_reference(*truths, *camera, RasterSettings(scene.width, scene.height))
-    job.workspace.forward(job.call, job.outputs)
+    job.workspace.forward(job.view, job.outputs)
     error = (job.image - truth[0]).abs().amax(-1)
     decided_otherwise = error > 1e-3 / 255
     job.gradients = tuple(
         grad * ~decided_otherwise.view(*grad.shape[:2], *[1] * (grad.ndim - 2)) for grad in job.gradients
     )
     grads = tuple(torch.empty_like(tensor) for tensor in scene.gaussians)
-    job.workspace.backward(job.call, job.outputs[3], *job.gradients, (*grads, None, None), (False, False))
+    job.workspace.backward(job.view, job.outputs[3], *job.gradients, (*grads, None, None), (False, False))
     torch.autograd.backward([truth[0], alpha[0, ..., 0]], [grad.double() for grad in job.gradients])
     relative = [
         float((grad - leaf.grad).abs().max() / leaf.grad.abs().max()) for grad, leaf in zip(grads, truths, strict=True)

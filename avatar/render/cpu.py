@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.render.memory import pooled_empty
-from avatar.render.native import RasterCall, Workspace
+from avatar.render.native import View, Workspace
 from avatar.render.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
 
@@ -74,9 +74,9 @@ class _Rasterize(torch.autograd.Function):
         inputs = (means, quats, scales, opacities, features, viewmats, Ks, background)
         needed = any(ctx.needs_input_grad)
         ctx.workspaces = [Workspace() for _ in range(cameras if needed else 1)]
-        for camera, call in enumerate(_calls(inputs, settings)):
+        for camera, view in enumerate(_views(inputs, settings)):
             outputs = (image[camera], alpha[camera], means2d[camera], radii[camera], depths[camera])
-            ctx.workspaces[camera if needed else 0].forward(call, outputs)
+            ctx.workspaces[camera if needed else 0].forward(view, outputs)
         ctx.settings = settings
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(means2d, radii, depths)
@@ -96,9 +96,9 @@ class _Rasterize(torch.autograd.Function):
         poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
         grad_background = torch.empty_like(background) if ctx.needs_input_grad[7] else None
         own_features = features.ndim == 3
-        for camera, (call, workspace) in enumerate(zip(_calls(inputs, ctx.settings), ctx.workspaces, strict=True)):
+        for camera, (view, workspace) in enumerate(zip(_views(inputs, ctx.settings), ctx.workspaces, strict=True)):
             workspace.backward(
-                call,
+                view,
                 radii[camera],
                 *(None if grad is None else grad[camera] for grad in (grad_image, grad_alpha)),
                 (
@@ -115,11 +115,11 @@ class _Rasterize(torch.autograd.Function):
         return (*grads, grad_viewmats, None, grad_background, None)
 
 
-def _calls(inputs: tuple[Tensor | None, ...], settings: RasterSettings) -> list[RasterCall]:
+def _views(inputs: tuple[Tensor | None, ...], settings: RasterSettings) -> list[View]:
     """What the library needs to know of each camera."""
     *gaussians, features, viewmats, Ks, background = inputs
     return [
-        RasterCall(
+        View(
             (*gaussians, features if features.ndim == 2 else features[camera]),
             (viewmats[camera], Ks[camera], None if background is None else background[camera]),
             settings,

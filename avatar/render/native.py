@@ -38,7 +38,7 @@ class _Gradients(ctypes.Structure):
     _fields_ += [("accumulate", ctypes.c_int32), ("accumulate_features", ctypes.c_int32)]
 
 
-class RasterCall:
+class View:
     """One camera's call: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
 
     def __init__(
@@ -75,17 +75,17 @@ class Workspace:
         if getattr(self, "_handle", None):
             _POOL.give_back(self._library, self._handle)
 
-    def forward(self, call: RasterCall, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
+    def forward(self, view: View, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
         """Writes image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N)."""
         with self._lock:
             failed = self._library.gaussian_forward(
-                self._handle, call.scene, call.camera, *map(address, outputs), torch.get_num_threads(), seconds
+                self._handle, view.scene, view.camera, *map(address, outputs), torch.get_num_threads(), seconds
             )
         _check_memory(failed)
 
     def backward(
         self,
-        call: RasterCall,
+        view: View,
         radii: Tensor,
         grad_image: Tensor | None,
         grad_alpha: Tensor | None,
@@ -102,8 +102,8 @@ class Workspace:
         with self._lock:
             failed = self._library.gaussian_backward(
                 self._handle,
-                call.scene,
-                call.camera,
+                view.scene,
+                view.camera,
                 address(radii),
                 address(grad_image),
                 address(grad_alpha),

@@ -21,7 +21,7 @@ from pipelines.synth.person_file import load_person
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
 from pipelines.synth.soft_light import LightConfig, vertex_light
-from pipelines.synth.views import LitFrame, RenderedView, normal_map, render_view
+from pipelines.synth.views import LitFrame, View, normal_map, render_view
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import write_gray_png, write_jpeg, write_normal_png
@@ -214,7 +214,7 @@ def _write_views(
         progress("views", (frame + 1) / config.frames)
 
 
-def _write_view(root: Path, camera: str, frame: int, view: RenderedView, config: SynthConfig) -> None:
+def _write_view(root: Path, camera: str, frame: int, view: View, config: SynthConfig) -> None:
     write_jpeg(_view_path(root, "rgbs", "rgb", camera, frame, "jpg"), view.image, quality=config.quality)
     write_gray_png(_view_path(root, "masks", "mask", camera, frame, "png"), view.mask)
     if config.layout == "simple":

@@ -30,7 +30,7 @@ class LitFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedView:
+class View:
     """Pixels of one camera: image (H, W, 3) on black, mask (H, W), labels (H, W), all uint8."""
 
     image: np.ndarray
@@ -38,7 +38,7 @@ class RenderedView:
     labels: np.ndarray
 
 
-def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersampling: int) -> RenderedView:
+def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersampling: int) -> View:
     """Colours averaged over `supersampling`^2 samples a pixel in linear light; labels from one sample at its centre."""
     s = supersampling
     K = camera.K.copy()
@@ -53,7 +53,7 @@ def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersamplin
     alpha = count[..., 0] / s**2
     srgb = srgb8_from_linear(linear).astype(np.float64)
     image = np.round(srgb * alpha[..., None]).astype(np.uint8)
-    return RenderedView(image, np.round(255 * alpha).astype(np.uint8), label_map(person, frame, camera))
+    return View(image, np.round(255 * alpha).astype(np.uint8), label_map(person, frame, camera))
 
 
 def label_map(person: Person, frame: LitFrame, camera: Camera) -> np.ndarray:
