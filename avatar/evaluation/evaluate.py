@@ -22,7 +22,7 @@ from avatar.losses.perceptual import PerceptualDistance, load_metric
 from avatar.metrics.speed import CONVENTION as SPEED_CONVENTION
 from avatar.metrics.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
 from avatar.metrics.surface_quality import CONVENTION as SURFACE_CONVENTION
-from avatar.metrics.surface_quality import HEAD, SAMPLES, SurfaceQuality, mean_surface, surface_quality
+from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface, surface_quality
 from avatar.metrics.view_quality import (
     CONVENTION,
     PERCEPTUAL_CONVENTION,
@@ -245,8 +245,7 @@ class _Run:
 
     def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
         if id(rig) not in self._head_faces:
-            template = rig.template
-            self._head_faces[id(rig)] = head_faces(template) if HEAD in template.joint_names else None
+            self._head_faces[id(rig)] = _faces_of_head(rig)
         return surface_quality(
             mesh,
             rig.template.vertex_labels,
@@ -280,6 +279,14 @@ def _params(sequence: AvatarSequence, frame: int) -> BodyParams:
     params = sequence.capture.params(frame)
     assert params is not None  # `view_sets` refused frames without them, `truth_frames` left them out
     return params
+
+
+def _faces_of_head(rig: Rig) -> Bool[np.ndarray, " F"] | None:
+    """Return the template's faces that are the head's; None for a body without a head."""
+    try:
+        return head_faces(rig.template)
+    except InputError:
+        return None
 
 
 def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
