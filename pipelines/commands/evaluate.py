@@ -34,7 +34,7 @@ class Evaluate:
     every: int = 1
     """Every n-th frame of what is held out: of held-out frames, and of training frames as held-out cameras see them."""
     training_every: int = 4
-    """Every n-th training frame of the training views and of the true surfaces; at least as many as --every skips."""
+    """Every n-th training frame of the training views and of the true surfaces; never more often than --every."""
     hold_out: tuple[str, ...] = ()
     """Cameras that count as held out, in the place of the capture's."""
     hold_out_frames: tuple[int, ...] = ()

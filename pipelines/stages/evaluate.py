@@ -180,6 +180,14 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
         if part in best.views:
             psnr = best.mean(part)["psnr"]
             checks.append(gate.check(f"{name}, {SETS[part]}: PSNR of the person", psnr))
+            if "reference-fit" in report.models:
+                checks.append(
+                    gates.GAIN.check(
+                        f"{name} against one frame's Gaussians, {SETS[part]}",
+                        psnr - report.models["reference-fit"].mean(part)["psnr"],
+                        explanation="gain of PSNR over the reference fit, which skinning alone moves",
+                    )
+                )
             if name != "teacher" and "teacher" in report.models:
                 gain = psnr - report.models["teacher"].mean(part)["psnr"]
                 checks.append(gates.AGAINST_TEACHER.check(f"{name} against its teacher, {SETS[part]}", gain))

@@ -18,6 +18,7 @@ from avatar.export.splats import write_splat_ply
 from avatar.gaussians.bound_file import save_bound
 from avatar.metrics.view_quality import CONVENTION, mean_quality
 from avatar.training.engine.loop import METRICS_FILE, Progress
+from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
 from pipelines.figures.comparison import write_strip
@@ -240,10 +241,16 @@ def _fit(
     train = [view.name for view in scene.train]
     for name in (*held_out, *_spread(train, PREVIEWED_TRAINING_VIEWS)):
         write_strip(folder / "previews" / f"{name}.png", views[name].photograph(scene.background), result.images[name])
-    return _output(result, config, held_out, train, overlap)
+    start = next(line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation")
+    return _output(result, held_out, train, overlap=overlap, start=start["mean"]["psnr"])
 
 
-def _output(result: FitResult, config: FitConfig, held_out: list[str], train: list[str], overlap: float) -> StageOutput:
+def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap: float, start: float) -> StageOutput:
+    """Make numbers and checks.
+
+    Args:
+        overlap: of the template and the masks. start: PSNR of the same views before the first step, dB.
+    """
     done = result.progress
     shown = held_out or train
     mean = {
@@ -265,6 +272,11 @@ def _output(result: FitResult, config: FitConfig, held_out: list[str], train: li
             explanation=f"mean over {len(shown)} cameras, over the union of the silhouettes",
         ),
         gates.SSIM.check(f"{which} views: SSIM", figures["ssim"]),
+        gates.GAIN.check(
+            f"{which} views: gain of PSNR since the start",
+            figures["psnr"] - start,
+            explanation="the start: colours of the photographs laid on the template",
+        ),
         gates.ITERATIONS.check(
             "iterations done",
             done.iteration / done.iterations,
