@@ -6,7 +6,16 @@ import runpy
 import sys
 from pathlib import Path
 
-SUPPORT = {"__init__", "__main__", "machine", "capture_truth", "rin23", "gaussian_scene", "rasterizer_peers"}
+SUPPORT = {
+    "__init__",
+    "__main__",
+    "machine",
+    "capture_truth",
+    "rin23",
+    "page_tables",
+    "gaussian_scene",
+    "rasterizer_peers",
+}
 
 
 def main() -> int:

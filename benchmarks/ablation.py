@@ -21,8 +21,8 @@ from pipelines.commands.options import OptionalPath
 from pipelines.runs.layout import ABLATION
 from smplxpp.core.errors import InputError
 
-SHOWN = ("psnr", "ssim", "perceptual", "psnr_head")
-"""Figures of views that are stored; those of surfaces and of training all are."""
+SHOWN = ("psnr", "ssim", "perceptual", "psnr_head", "images", "frames", "spread")
+"""Ends of the figures of views that are stored; those of surfaces and of training all are."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def figures(results: dict[str, Any]) -> dict[str, Any]:
         row["title"]: {
             "what": row["note"],
             **{
-                key: value if value is None else float(f"{value:.5g}")
+                key: float(f"{value:.5g}") if isinstance(value, float) else value
                 for key, value in row["figures"].items()
                 if "." not in key or key.startswith("surface.") or key.split(".")[-1] in SHOWN
             },
@@ -89,6 +89,7 @@ def figures(results: dict[str, Any]) -> dict[str, Any]:
         "gaussians": preset["fit"]["sampling"]["count"],
         "iterations": {name: preset[name]["iterations"] for name in ("fit", "teacher", "bake", "compensate")},
         "perceptual": results["evaluation"]["metric"],
+        "inputs": results["evaluation"]["inputs"],
         "rows": rows,
     }
 

@@ -19,6 +19,7 @@ import tyro
 from torch.profiler import ProfilerActivity, profile
 
 from avatar.data.sequence import AvatarSequence
+from avatar.evaluation.report import EvalReport
 from avatar.gaussians.bound_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.tracked_surface import TrackedAvatar
@@ -65,6 +66,7 @@ class TrainingBenchmark:
             "preset": self.preset,
             "threads": torch.get_num_threads(),
             "stages": {name: stage_figures(self.run_folder / name) for name in STAGES},
+            **evaluation_conditions(self.run_folder / "95_evaluate" / "metrics.json"),
             "evaluation": evaluation_figures(self.run_folder / "95_evaluate" / "metrics.json"),
             "share_of_a_step": profiles(self.run_folder, self.capture, training_preset(self.preset)),
         }
@@ -77,7 +79,7 @@ class TrainingBenchmark:
 
 
 def stage_figures(folder: Path) -> dict[str, Any]:
-    """Of one training.
+    """Collect the figures of one training.
 
     Raises:
         InputError: it has not been finished.
@@ -112,22 +114,15 @@ def stage_figures(folder: Path) -> dict[str, Any]:
 
 
 def evaluation_figures(path: Path) -> dict[str, Any]:
-    """Of every model: images, surfaces by label, speed, bytes.
+    """Collect images, surfaces by label, speed and bytes of every model.
 
     Raises:
         InputError: the run has not been evaluated.
     """
-    if not path.is_file():
-        raise InputError(
-            "evaluation of the run",
-            expected=str(path),
-            received="no such file",
-            remedy="make it with `smplxpp evaluate RUN --capture DIR`",
-        )
-    stored = json.loads(path.read_text())
+    stored = _stored_evaluation(path)
     figures = {
         name: {
-            "views": model["mean"],
+            "views": {part: _with_counts(model, part) for part in model["mean"]},
             "surfaces": _surfaces(model["surfaces"]),
             "speed": model["speed"],
             "bytes": model["bytes"],
@@ -138,11 +133,39 @@ def evaluation_figures(path: Path) -> dict[str, Any]:
     return _rounded(figures)
 
 
+def evaluation_conditions(path: Path) -> dict[str, Any]:
+    """Collect what the figures of an evaluation rest on, and the name of the perceptual distance.
+
+    Raises:
+        InputError: the run has not been evaluated.
+    """
+    stored = _stored_evaluation(path)
+    return {"inputs": stored["inputs"], "perceptual": stored["metric"]}
+
+
+def _with_counts(model: Mapping[str, Any], part: str) -> dict[str, Any]:
+    """Return the means of a set with their standard deviations over frames, and what they were taken over."""
+    spread = {f"{name} SD": value for name, value in model["spread"][part].items()}
+    return {**model["mean"][part], **spread, **model["counts"][part]}
+
+
+def _stored_evaluation(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(
+            "evaluation of the run",
+            expected=str(path),
+            received="no such file",
+            remedy="make it with `smplxpp evaluate RUN --capture DIR`",
+        )
+    return EvalReport.load(path).as_dict()
+
+
 def _surfaces(surfaces: Mapping[str, Any]) -> dict[str, Any]:
     out = {}
     for part, found in surfaces.items():
         mean = found["mean"]
-        out[part] = {"p2s": mean["p2s"], "chamfer": mean["chamfer"]}
+        out[part] = {"frames": len(found["frames"]), "p2s": mean["p2s"], "p2s SD": found["spread"]["p2s"]}
+        out[part] |= {"chamfer": mean["chamfer"]}
         out[part] |= {f"p2s {label}": figures["p2s"] for label, figures in mean["labels"].items()}
     return out
 

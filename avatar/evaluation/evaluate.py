@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
+from avatar.evaluation.summary import SPREAD_CONVENTION
+from avatar.gaussians.sampling import head_faces
 from avatar.losses.perceptual import PerceptualDistance, load_metric
 from avatar.metrics.speed import CONVENTION as SPEED_CONVENTION
 from avatar.metrics.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
@@ -35,6 +38,8 @@ from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
 from avatar.rig.rig import Motion, Rig
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +66,12 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         for name in ("samples", "seed", "speed_pictures", "shown"):
-            if getattr(self, name) < 0:
-                raise InputError(f"evaluation: {name}", expected="at least 0", received=str(getattr(self, name)))
+            require_at_least(f"evaluation: {name}", getattr(self, name), 0)
 
 
 @dataclass(frozen=True, eq=False)
 class ShownView:
-    """Pictures of one view, (H, W, 3) uint8 on the capture's background.
+    """Pictures of one view on the capture's background.
 
     Attributes:
         set: of views, among `protocol.SETS`.
@@ -77,8 +81,8 @@ class ShownView:
     set: str
     camera: str
     frame: int
-    truth: np.ndarray
-    rendered: dict[str, np.ndarray]
+    truth: UInt8[np.ndarray, "H W 3"]
+    rendered: dict[str, UInt8[np.ndarray, "H W 3"]]
     head: Box | None
 
 
@@ -143,7 +147,7 @@ def evaluate_models(
 
 
 class _Run:
-    """An evaluation under way: what was found so far."""
+    """An evaluation under way, with what was found so far."""
 
     def __init__(
         self,
@@ -164,9 +168,10 @@ class _Run:
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
         self._kept = {(name, *pair) for name, one in sets.items() for pair in one.spread(config.shown)}
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
+        self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
 
     def measure(self, frame: int) -> None:
-        """All sets' views and the surface of one frame."""
+        """Measure all sets' views and the surface of one frame."""
         sequence = self.sequence
         cameras = list(dict.fromkeys(c for one in self.sets.values() for c, f in one.views if f == frame))
         views = [sequence.whole_view(camera, frame) for camera in cameras]
@@ -176,6 +181,7 @@ class _Run:
         truth = alone = None
         if any(frame in frames for frames in self.truths.values()):
             truth = sequence.capture.truth_mesh(frame)
+            assert truth is not None  # `truth_frames` chose frames that have one
             mesh = _mesh(skinned, sequence.rig)
             alone = self.skinning_alone[frame] = self._surface(mesh, sequence.rig, truth)
             if frame in self._middle:
@@ -188,7 +194,7 @@ class _Run:
                 posed = model(_motion(model, sequence, frame), camera_centers)
                 for index, (view, head) in enumerate(zip(views, heads, strict=True)):
                     self._see(name, posed, index, view=view, frame=frame, head=head)
-            if truth is not None:
+            if truth is not None and alone is not None:
                 if model.rig is sequence.rig and torch.equal(posed.vertices, skinned):
                     self.surfaces[name][frame] = alone
                     continue
@@ -198,7 +204,7 @@ class _Run:
                     self.meshes[self._middle[frame]].posed[name] = mesh
 
     def result(self, files: Mapping[str, Path]) -> Evaluation:
-        """The report of all frames, with speed and size."""
+        """Make the report of all frames, with speed and size."""
         models = {
             name: ModelFigures(
                 views=self.views[name],
@@ -212,6 +218,7 @@ class _Run:
         metric = None if self.metric is None else self.metric.name
         conventions = {
             "images": CONVENTION,
+            "spread": SPREAD_CONVENTION,
             **({} if metric is None else {metric: PERCEPTUAL_CONVENTION}),
             **({"surface": SURFACE_CONVENTION} if self.truths else {}),
             **({"speed": SPEED_CONVENTION} if self.config.speed_pictures else {}),
@@ -237,8 +244,15 @@ class _Run:
                 self.shown[key].rendered[name] = eight_bit(drawn.image).numpy()
 
     def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
+        if id(rig) not in self._head_faces:
+            self._head_faces[id(rig)] = _faces_of_head(rig)
         return surface_quality(
-            mesh, rig.template.vertex_labels, truth, samples=self.config.samples, seed=self.config.seed
+            mesh,
+            rig.template.vertex_labels,
+            truth,
+            head=self._head_faces[id(rig)],
+            samples=self.config.samples,
+            seed=self.config.seed,
         )
 
     def _by_set(self, frames: Mapping[int, SurfaceQuality]) -> dict[str, Surfaces]:
@@ -246,13 +260,13 @@ class _Run:
         return {name: Surfaces(mean_surface(list(part.values())), part) for name, part in parts.items()}
 
     def _speed(self, model: AvatarModel) -> Speed | None:
-        """Pictures of the first set's first camera, through the poses of that set."""
+        """Time pictures of the first set's first camera, through the poses of that set."""
         if not self.config.speed_pictures:
             return None
         capture, first = self.sequence.capture, next(iter(self.sets.values()))
         return measure_speed(
             model,
-            [capture.params(frame) for frame in first.frames],
+            [_params(self.sequence, frame) for frame in first.frames],
             capture.cameras[first.views[0][0]],
             size=self.config.speed_size,
             pictures=self.config.speed_pictures,
@@ -260,16 +274,31 @@ class _Run:
         )
 
 
-def _mesh(vertices: Tensor, rig: Rig) -> TriangleMesh:
+def _params(sequence: AvatarSequence, frame: int) -> BodyParams:
+    """Return the parameters of a measured frame."""
+    params = sequence.capture.params(frame)
+    assert params is not None  # `view_sets` refused frames without them, `truth_frames` left them out
+    return params
+
+
+def _faces_of_head(rig: Rig) -> Bool[np.ndarray, " F"] | None:
+    """Return the template's faces that are the head's; None for a body without a head."""
+    try:
+        return head_faces(rig.template)
+    except InputError:
+        return None
+
+
+def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
     return TriangleMesh(vertices.double().cpu().numpy(), rig.template.faces)
 
 
 def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
-    """The pose of a frame for a model's own template."""
+    """Pose a frame for a model's own template."""
     motion = sequence.motion(frame)
     if model.rig is sequence.rig:
         return motion
-    return model.rig.motion(sequence.capture.params(frame), frame=motion.frame)
+    return model.rig.motion(_params(sequence, frame), frame=motion.frame)
 
 
 def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -> None:

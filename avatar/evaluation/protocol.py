@@ -6,11 +6,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from smplxpp.capture import Capture
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.spread import spread
+from smplxpp.core.validation import require_at_least, require_known
 
 SETS: Mapping[str, str] = {
     "training": "training views",
@@ -27,24 +27,30 @@ class ProtocolConfig:
 
     Attributes:
         sets: names among `SETS`; empty: all that the capture has views for.
-        every: every n-th frame of the training frames, and of the held-out ones, from the first on.
+        every: every n-th frame of what is held out, from the first on: of the held-out frames, and of the training
+            frames as held-out cameras see them.
+        training_every: every n-th training frame of the training views and of the true surfaces; never more of them
+            than `every` takes.
         cameras_a_frame: of the training cameras, which take turns from frame to frame; held-out ones are all taken.
         held_out_cameras, held_out_frames: in the place of those that the capture's splits hold out.
     """
 
     sets: tuple[str, ...] = ()
-    every: int = 4
+    every: int = 1
+    training_every: int = 4
     cameras_a_frame: int = 2
     held_out_cameras: tuple[str, ...] = ()
     held_out_frames: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.sets if name not in SETS]
-        if unknown:
-            raise InputError("evaluation sets", expected=f"among {', '.join(SETS)}", received=", ".join(unknown))
-        for name in ("every", "cameras_a_frame"):
-            if getattr(self, name) < 1:
-                raise InputError(f"evaluation: {name}", expected="at least 1", received=str(getattr(self, name)))
+        require_known("evaluation sets", self.sets, SETS)
+        for name in ("every", "training_every", "cameras_a_frame"):
+            require_at_least(f"evaluation: {name}", getattr(self, name), 1)
+
+    @property
+    def training_step(self) -> int:
+        """Every n-th training frame is seen from training cameras, and has its surface measured."""
+        return max(self.every, self.training_every)
 
 
 @dataclass(frozen=True)
@@ -60,17 +66,17 @@ class ViewSet:
 
     @property
     def title(self) -> str:
+        """The set's name for readers."""
         return SETS[self.name]
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Ascending, each once."""
+        """The frames of the views, ascending, each once."""
         return tuple(sorted({frame for _, frame in self.views}))
 
     def spread(self, count: int) -> tuple[tuple[str, int], ...]:
         """At most `count` of the views, evenly from first to last."""
-        picked = np.unique(np.linspace(0, len(self.views) - 1, min(count, len(self.views))).round().astype(int))
-        return tuple(self.views[k] for k in picked)
+        return tuple(spread(self.views, count))
 
 
 def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
@@ -82,10 +88,12 @@ def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
     """
     splits = measured_splits(capture, config)
     pairs = {
-        "training": _taking_turns(capture, splits.train_cameras, splits.train_frames, config),
+        "training": _taking_turns(capture, splits.train_cameras, splits.train_frames[:: config.training_step], config),
         "novel_view": capture.views(splits.novel_view_cameras, splits.train_frames[:: config.every]),
         "novel_pose": capture.views(splits.novel_view_cameras, splits.novel_pose_frames[:: config.every]),
-        "novel_pose_training_view": _taking_turns(capture, splits.train_cameras, splits.novel_pose_frames, config),
+        "novel_pose_training_view": _taking_turns(
+            capture, splits.train_cameras, splits.novel_pose_frames[:: config.every], config
+        ),
     }
     wanted = config.sets or tuple(name for name in SETS if pairs[name])
     sets = {name: ViewSet(name, tuple(pairs[name])) for name in SETS if name in wanted}
@@ -125,17 +133,20 @@ def with_people(capture: Capture, sets: Mapping[str, ViewSet]) -> dict[str, View
 def truth_frames(capture: Capture, config: ProtocolConfig, sets: Mapping[str, ViewSet]) -> dict[str, tuple[int, ...]]:
     """Frames whose true surface is measured, "training" and "held_out", as far as the sets look at either.
 
-    Of every `every` frames in a row the first that has a surface and parameters: surfaces need not be there for the
-    frames that views are measured on.
+    Of every `every` held-out frames in a row, and of every `training_step` training frames, the first that has a
+    surface and parameters: surfaces need not be there for the frames that views are measured on.
     """
     if capture.recording.meshes is None:
         return {}
     splits = measured_splits(capture, config)
     wanted = {"held_out" if name.startswith("novel_pose") else "training" for name in sets}
     out = {}
-    for name, frames in (("training", splits.train_frames), ("held_out", splits.novel_pose_frames)):
+    for name, frames, step in (
+        ("training", splits.train_frames, config.training_step),
+        ("held_out", splits.novel_pose_frames, config.every),
+    ):
         if name in wanted:
-            blocks = [frames[k : k + config.every] for k in range(0, len(frames), config.every)]
+            blocks = [frames[k : k + step] for k in range(0, len(frames), step)]
             found = [next((f for f in block if _has_truth(capture, f)), None) for block in blocks]
             out[name] = tuple(f for f in found if f is not None)
     return {name: frames for name, frames in out.items() if frames}
@@ -147,22 +158,16 @@ def _has_truth(capture: Capture, frame: int) -> bool:
 
 def measured_splits(capture: Capture, config: ProtocolConfig) -> Splits:
     """The capture's splits with the user's choice of what is held out."""
-    for what, chosen, known in (
-        ("cameras", config.held_out_cameras, capture.cameras),
-        ("frames", config.held_out_frames, capture.frames),
-    ):
-        unknown = [str(one) for one in chosen if one not in known]
-        if unknown:
-            have = ", ".join(map(str, list(known)[:40]))
-            raise InputError(f"held-out {what}", expected=f"among {have}", received=", ".join(unknown))
+    require_known("held-out cameras", config.held_out_cameras, capture.cameras)
+    require_known("held-out frames", config.held_out_frames, capture.frames)
     splits = capture.splits
     if config.held_out_cameras:
         train = tuple(name for name in capture.cameras if name not in config.held_out_cameras)
         splits = replace(splits, train_cameras=train, novel_view_cameras=config.held_out_cameras)
     if config.held_out_frames:
         chosen = tuple(sorted(config.held_out_frames))
-        train = tuple(frame for frame in splits.train_frames if frame not in chosen)
-        splits = replace(splits, train_frames=train, novel_pose_frames=chosen)
+        frames = tuple(frame for frame in splits.train_frames if frame not in chosen)
+        splits = replace(splits, train_frames=frames, novel_pose_frames=chosen)
     return splits
 
 
@@ -171,7 +176,7 @@ def _taking_turns(
 ) -> list[tuple[str, int]]:
     """A few cameras a frame, the next ones in the next frame, so that all of them are looked through."""
     out, turn = [], 0
-    for frame in frames[:: config.every]:
+    for frame in frames:
         there = [name for name in cameras if capture.file(name, frame) is not None]
         chosen = {there[(turn + k) % len(there)] for k in range(min(config.cameras_a_frame, len(there)))}
         out += [(name, frame) for name in there if name in chosen]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from avatar.evaluation.input_protocol import InputProtocol
 from avatar.metrics.speed import Speed
-from avatar.metrics.surface_quality import SurfaceQuality
-from avatar.metrics.view_quality import ViewQuality, mean_quality
+from avatar.metrics.surface_quality import SurfaceQuality, surface_spread
+from avatar.metrics.view_quality import ViewQuality, mean_quality, spread_over_frames
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_values import jsonable
@@ -22,8 +23,17 @@ SURFACE_SETS: Mapping[str, str] = {"training": "training frames", "held_out": "h
 
 
 def view_key(camera: str, frame: int) -> str:
-    """Name of a view in reports and files."""
+    """Return the name of a view in reports and files."""
     return f"{camera}_{frame:06d}"
+
+
+@dataclass(frozen=True)
+class ViewCounts:
+    """The numbers of what a set of views holds."""
+
+    images: int
+    frames: int
+    cameras: int
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,11 @@ class Surfaces:
 
     mean: SurfaceQuality
     frames: dict[int, SurfaceQuality]
+
+    @property
+    def spread(self) -> SurfaceQuality:
+        """Standard deviations over the frames; None for fewer than two."""
+        return surface_spread(list(self.frames.values()))
 
 
 @dataclass(frozen=True)
@@ -52,8 +67,21 @@ class ModelFigures:
     bytes: int | None = None
 
     def mean(self, name: str) -> dict[str, float]:
-        """Means of a set's figures over the views that have them; empty for a set that was not measured."""
+        """Return the means of a set's figures over the views that have them; none for a set that was not measured."""
         return mean_quality(self.views.get(name, {}))
+
+    def spread(self, name: str) -> dict[str, float]:
+        """Return the standard deviations over frames of a set's figures, each the mean over a frame's cameras."""
+        by_frame: dict[str, dict[str, ViewQuality]] = {}
+        for key, quality in self.views.get(name, {}).items():
+            camera, frame = key.rsplit("_", 1)
+            by_frame.setdefault(frame, {})[camera] = quality
+        return spread_over_frames(by_frame.values())
+
+    def counts(self, name: str) -> ViewCounts:
+        """Return the numbers of images, frames and cameras of a set."""
+        cameras, frames = ({key.rsplit("_", 1)[k] for key in self.views.get(name, {})} for k in (0, 1))
+        return ViewCounts(len(self.views.get(name, {})), len(frames), len(cameras))
 
 
 @dataclass(frozen=True)
@@ -65,6 +93,7 @@ class EvalReport:
         models: by name, in the order of tables.
         skinning_alone: distances of the template that follows its joints, as `ModelFigures.surfaces`.
         conventions: what the figures mean, in words.
+        inputs: what the figures rest on, as far as it is known.
     """
 
     capture: str
@@ -72,17 +101,21 @@ class EvalReport:
     models: dict[str, ModelFigures]
     skinning_alone: dict[str, Surfaces] = field(default_factory=dict)
     conventions: dict[str, str] = field(default_factory=dict)
+    inputs: InputProtocol = field(default_factory=InputProtocol)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON, with the means; infinite figures are null, as JSON has none."""
+        """Make what JSON holds, with counts, means and spreads; infinite figures are null, as JSON has none."""
         out = jsonable(self)
         for name, model in self.models.items():
-            out["models"][name]["mean"] = jsonable({part: model.mean(part) for part in model.views})
+            for what in ("mean", "spread", "counts"):
+                out["models"][name][what] = jsonable({part: getattr(model, what)(part) for part in model.views})
+            _add_spreads(out["models"][name]["surfaces"], model.surfaces)
+        _add_spreads(out["skinning_alone"], self.skinning_alone)
         return {"schema": SCHEMA, **out}
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> EvalReport:
-        """What `as_dict` gave.
+        """Make the report that `as_dict` was called on; files from before counts and inputs were kept are read too.
 
         Raises:
             InputError: something else.
@@ -94,16 +127,27 @@ class EvalReport:
                 received=str(values.get("schema")),
                 remedy="evaluate again with this version",
             )
-        return EvalReport(
-            capture=values["capture"],
-            metric=values["metric"],
-            models={name: _model(model) for name, model in values["models"].items()},
-            skinning_alone=_surfaces(values["skinning_alone"]),
-            conventions=dict(values["conventions"]),
-        )
+        try:
+            return EvalReport(
+                capture=values["capture"],
+                metric=values["metric"],
+                models={name: _model(model) for name, model in values["models"].items()},
+                skinning_alone=_surfaces(values["skinning_alone"]),
+                conventions=dict(values["conventions"]),
+                inputs=InputProtocol.from_dict(values.get("inputs", {})),
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                "evaluation report",
+                expected=f"the content of schema {SCHEMA}",
+                received=f"{type(error).__name__}: {error}",
+                remedy="evaluate again with this version",
+            ) from None
 
     def save(self, path: Path) -> None:
-        """Write as JSON, whole or not at all."""
+        """Write the report as JSON, whole or not at all."""
         atomic_write_text(path, json.dumps(self.as_dict(), indent=1))
 
     @staticmethod
@@ -143,5 +187,10 @@ def _surfaces(values: Mapping[str, Any]) -> dict[str, Surfaces]:
 
 
 def _surface(values: Mapping[str, Any]) -> SurfaceQuality:
-    quality = SurfaceQuality(**values)
-    return replace(quality, labels={name: _surface(part) for name, part in quality.labels.items()})
+    figures = {name: value for name, value in values.items() if name != "labels"}
+    return SurfaceQuality(**figures, labels={name: _surface(part) for name, part in values["labels"].items()})
+
+
+def _add_spreads(out: dict[str, Any], surfaces: Mapping[str, Surfaces]) -> None:
+    for name, one in surfaces.items():
+        out[name]["spread"] = jsonable(one.spread)

@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from avatar.evaluation.input_protocol import counted
 from avatar.evaluation.protocol import SETS
 from avatar.evaluation.report import SKINNING_ALONE, SURFACE_SETS, EvalReport, ModelFigures, Surfaces
 from avatar.evaluation.tables import Column, FigureTable
-from smplxpp.core.labels import CLOTH_LABELS
+from avatar.metrics.surface_quality import HEAD
+from smplxpp.core.labels import CLOTH_LABELS, SKIN
 
 MEGABYTE = 1e6
 
 
+SPREAD = ".spread"
+"""End of the key of a standard deviation over frames."""
+SPREAD_TITLE = "SD"
+SPREAD_CONVENTION = (
+    "SD: standard deviation over frames, by n - 1, each frame counted with the mean over its cameras; "
+    "none for fewer than two frames."
+)
+
+
 def summary_figures(model: ModelFigures) -> dict[str, float | None]:
-    """Every mean figure of a model under one key each.
+    """Return every mean figure of a model under one key each.
 
     `SET.FIGURE` of the views (`novel_view.psnr`), `surface.training.p2s`, `surface.held_out.lower.p2s`, `fps`,
-    `pose_ms`, `deform_ms`, `render_ms`, `gaussians`, `parameters`, `megabytes`.
+    `pose_ms`, `deform_ms`, `render_ms`, `gaussians`, `parameters`, `megabytes`; behind the first two kinds also
+    `.spread`, a standard deviation over frames; `SET.images`, `SET.frames` and `surface.SET.frames` are counts.
     """
-    out: dict[str, float | None] = {
-        f"{name}.{key}": value for name in model.views for key, value in model.mean(name).items()
-    }
+    out: dict[str, float | None] = {}
+    for name in model.views:
+        counts = model.counts(name)
+        out |= {f"{name}.{key}": value for key, value in model.mean(name).items()}
+        out |= {f"{name}.{key}{SPREAD}": value for key, value in model.spread(name).items()}
+        out |= {f"{name}.images": counts.images, f"{name}.frames": counts.frames}
     out |= surface_figures(model.surfaces)
     if model.speed is not None:
         out |= {key: getattr(model.speed, key) for key in ("fps", "pose_ms", "deform_ms", "render_ms", "gaussians")}
@@ -27,75 +44,95 @@ def summary_figures(model: ModelFigures) -> dict[str, float | None]:
     return out
 
 
-def surface_figures(surfaces: dict[str, Surfaces]) -> dict[str, float | None]:
-    """Mean distances by `surface.SET.FIGURE`, of a label by `surface.SET.LABEL.FIGURE`."""
+def surface_figures(surfaces: Mapping[str, Surfaces]) -> dict[str, float | None]:
+    """Return mean distances by `surface.SET.FIGURE`, of a label by `surface.SET.LABEL.FIGURE`, with their spreads."""
     out: dict[str, float | None] = {}
     for name, one in surfaces.items():
-        for prefix, quality in (("", one.mean), *((f"{label}.", q) for label, q in one.mean.labels.items())):
-            for key in ("p2s", "truth_to_mesh", "chamfer", "p95"):
-                out[f"surface.{name}.{prefix}{key}"] = getattr(quality, key)
+        for quality, end in ((one.mean, ""), (one.spread, SPREAD)):
+            for prefix, part in (("", quality), *((f"{label}.", q) for label, q in quality.labels.items())):
+                for key in ("p2s", "truth_to_mesh", "chamfer", "p95"):
+                    out[f"surface.{name}.{prefix}{key}{end}"] = getattr(part, key)
+        out[f"surface.{name}.frames"] = len(one.frames)
     return out
 
 
 def summary_table(report: EvalReport) -> FigureTable:
-    """The line that a paper prints of every model: novel views, novel poses, surface, cost."""
+    """Make the line that a paper prints of every model: novel views, novel poses, surface, cost."""
     metric = report.metric or ""
     columns = []
     for name in ("novel_view", "novel_pose"):
         columns += [
             Column(f"{name}.psnr", "PSNR", SETS[name], 2, "higher"),
+            Column(f"{name}.psnr{SPREAD}", SPREAD_TITLE, SETS[name], 2),
             Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),
             Column(f"{name}.perceptual", metric, SETS[name], 4, "lower"),
+            Column(f"{name}.psnr_head", "head", SETS[name], 2, "higher"),
+            Column(f"{name}.images", "images", SETS[name], 0),
         ]
     for name, title in SURFACE_SETS.items():
         columns.append(Column(f"surface.{name}.p2s", "P2S", f"{title}, mm", 2, "lower"))
         columns.append(Column(f"surface.{name}.chamfer", "Chamfer", f"{title}, mm", 2, "lower"))
+        columns.append(Column(f"surface.{name}.{SKIN.name}.p2s", "P2S skin", f"{title}, mm", 2, "lower"))
     columns += [Column("fps", "FPS", "", 1, "higher"), Column("megabytes", "MB", "", 2, "lower")]
     rows = {name: summary_figures(model) for name, model in report.models.items()}
-    return FigureTable(tuple(columns), rows, f"Evaluation on {report.capture}")
+    return FigureTable(tuple(columns), rows, f"Evaluation on {report.capture}: {report.inputs.sentence()}")
 
 
 def image_table(report: EvalReport, name: str) -> FigureTable:
-    """Image figures of one set of views."""
+    """Make the table of the image figures of one set of views."""
     metric = report.metric or ""
     columns = (
-        Column("views", "views", "", 0),
+        Column("images", "images", "", 0),
+        Column("frames", "frames", "", 0),
         Column("psnr", "PSNR", "person", 2, "higher"),
+        Column(f"psnr{SPREAD}", SPREAD_TITLE, "person", 2),
         Column("psnr_image", "PSNR", "whole image", 2, "higher"),
         Column("ssim", "SSIM", "whole image", 4, "higher"),
+        Column(f"ssim{SPREAD}", SPREAD_TITLE, "whole image", 4),
         Column("perceptual", metric, "whole image", 4, "lower"),
+        Column(f"perceptual{SPREAD}", SPREAD_TITLE, "whole image", 4),
         Column("psnr_head", "PSNR", "head", 2, "higher"),
+        Column(f"psnr_head{SPREAD}", SPREAD_TITLE, "head", 2),
         Column("ssim_head", "SSIM", "head", 4, "higher"),
         Column("perceptual_head", metric, "head", 4, "lower"),
     )
-    rows = {
-        model: {"views": len(figures.views[name]), **figures.mean(name)}
-        for model, figures in report.models.items()
-        if name in figures.views
-    }
-    return FigureTable(columns, rows, SETS[name])
+    rows = {model: _of_set(figures, name) for model, figures in report.models.items() if name in figures.views}
+    counts = next(figures.counts(name) for figures in report.models.values() if name in figures.views)
+    held = (
+        f"{counted(counts.images, 'image')}, {counted(counts.frames, 'frame')} of {counted(counts.cameras, 'camera')}"
+    )
+    return FigureTable(columns, rows, f"{SETS[name]}: {held}; {report.inputs.sentence()}")
+
+
+def _of_set(model: ModelFigures, name: str) -> dict[str, float | None]:
+    """Return the figures of one set without its name in the keys."""
+    start = f"{name}."
+    return {key.removeprefix(start): value for key, value in summary_figures(model).items() if key.startswith(start)}
 
 
 def surface_table(report: EvalReport) -> FigureTable:
-    """Distances to the true surface, of all and of each cloth, skinning alone in the first row."""
+    """Make the table of distances to the true surface, of all, head, skin and each cloth, skinning alone first."""
     columns = []
     for name, title in SURFACE_SETS.items():
         group = f"{title}, mm"
         columns += [
+            Column(f"surface.{name}.frames", "frames", group, 0),
             Column(f"surface.{name}.p2s", "P2S", group, 2, "lower"),
+            Column(f"surface.{name}.p2s{SPREAD}", SPREAD_TITLE, group, 2),
             Column(f"surface.{name}.truth_to_mesh", "truth to mesh", group, 2, "lower"),
             Column(f"surface.{name}.chamfer", "Chamfer", group, 2, "lower"),
         ]
         columns += [
-            Column(f"surface.{name}.{label.name}.p2s", f"P2S {label.name}", group, 2, "lower") for label in CLOTH_LABELS
+            Column(f"surface.{name}.{part}.p2s", f"P2S {part}", group, 2, "lower")
+            for part in (HEAD, SKIN.name, *(label.name for label in CLOTH_LABELS))
         ]
     rows = {SKINNING_ALONE: surface_figures(report.skinning_alone)} if report.skinning_alone else {}
     rows |= {name: surface_figures(model.surfaces) for name, model in report.models.items() if model.surfaces}
-    return FigureTable(tuple(columns), rows, "Posed mesh and true surface")
+    return FigureTable(tuple(columns), rows, f"Posed mesh and true surface: {report.inputs.sentence()}")
 
 
 def cost_table(report: EvalReport) -> FigureTable:
-    """Speed and size."""
+    """Make the table of speed and size."""
     speed = next((m.speed for m in report.models.values() if m.speed is not None), None)
     where = "" if speed is None else f" at {speed.width} x {speed.height}, {speed.device}"
     if speed is not None and speed.threads:
@@ -114,7 +151,7 @@ def cost_table(report: EvalReport) -> FigureTable:
 
 
 def evaluation_tables(report: EvalReport) -> dict[str, FigureTable]:
-    """Every table by the name of its file; those without a row are left out."""
+    """Make every table by the name of its file; those without a row are left out."""
     tables = {"summary": summary_table(report)}
     measured = [name for name in SETS if any(name in model.views for model in report.models.values())]
     tables |= {name: image_table(report, name) for name in measured}

@@ -115,8 +115,8 @@ def fitted(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
-def parameter_counts(model: nn.Module) -> dict[str, int]:
-    """Parameters by the module's parts, "total" last; one that parts share counts once."""
+def parameter_counts(model: AvatarModel | nn.Module) -> dict[str, int]:
+    """Count the parameters of a module's parts, "total" last; one that parts share counts once."""
     counts: dict[str, int] = {}
     for name, value in model.named_parameters():
         part = name.split(".")[0]
@@ -125,7 +125,7 @@ def parameter_counts(model: nn.Module) -> dict[str, int]:
 
 
 def bytes_on_disk(path: Path) -> int:
-    """Size of a model file, or of all files of a folder."""
+    """Return the size of a model file, or of all files of a folder."""
     path = Path(path)
     return sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
 
@@ -137,7 +137,7 @@ def _blank(camera: Camera) -> View:
 
 
 def _clock(device: torch.device) -> Callable[[], float]:
-    """Seconds, after the device has done what it was given."""
+    """Make a clock that waits until the device has done what it was given; it gives seconds."""
 
     def now() -> float:
         if device.type == "cuda":

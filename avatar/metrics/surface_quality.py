@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.metrics import CompareConfig, MeshComparison, compare
+from smplxpp.metrics import CompareConfig, DirectedDistances, MeshComparison, directed_distances, summarize
+from smplxpp.metrics.conventions import DEFAULT, convention_named
 
 CONVENTION = (
     "P2S: mean distance of points of the posed mesh to the nearest point of the true surface. Truth to mesh: the other "
     "direction. Chamfer: the mean of both. Points are area-weighted samples that a view from outside can see; "
     "distances in mm, not squared, to the whole other surface; nothing is aligned. "
-    "Of a label: the mesh's own points of that label, and points of the truth whose nearest point of the mesh has it."
+    "Of a label: the mesh's own points of that label, and points of the truth whose nearest point of the mesh has it. "
+    'Head: likewise the faces that follow the joint "head" by more than half their weight, hair included.'
 )
+HEAD = "head"
+"""Name of the head among the labels: a region of the mesh, whose faces have labels of their own."""
 SAMPLES = 100_000
 """Points a mesh, before the choice of visible ones."""
 
@@ -28,7 +34,7 @@ class SurfaceQuality:
     Attributes:
         p2s: posed mesh to truth. truth_to_mesh: the other direction. chamfer: mean of both.
         p95: 95th percentile of the distances that `p2s` is the mean of.
-        labels: the same for each label of the template.
+        labels: the same for each label of the template, and for the region `HEAD` where the mesh has a head.
     """
 
     p2s: float | None
@@ -40,30 +46,40 @@ class SurfaceQuality:
 
 def surface_quality(
     mesh: TriangleMesh,
-    vertex_labels: np.ndarray,
+    vertex_labels: Int[np.ndarray, " V"],
     truth: TriangleMesh,
     *,
+    head: Bool[np.ndarray, " F"] | None = None,
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> SurfaceQuality:
     """Compare a posed mesh with the truth over the surfaces that can be seen; see `CONVENTION`.
 
     Args:
-        mesh: posed. vertex_labels: (V,) ids of `smplxpp.core.labels` on it.
+        mesh: posed. vertex_labels: ids of `smplxpp.core.labels` on it. head: its faces that are the head's.
         truth: the surface that the images show.
 
     Raises:
         InputError: a mesh without area, or none of it to be seen.
     """
-    found = compare(
-        mesh,
-        truth,
-        samples=samples,
-        seed=seed,
-        pred_labels=vertex_labels,
-        config=CompareConfig(visible_only=True),
+    config = CompareConfig(visible_only=True)
+    forth = directed_distances(mesh, truth, samples=samples, seed=seed, source_labels=vertex_labels, config=config)
+    back = directed_distances(truth, mesh, samples=samples, seed=seed, target_labels=vertex_labels, config=config)
+    quality = _quality(_summary(forth, back))
+    if head is None or not head.any():
+        return quality
+    region, rest = LABELS[-1].id + 1, LABELS[-1].id + 2
+    parts = (
+        replace(forth, label=np.where(head[forth.samples.face], region, rest)),
+        replace(back, label=np.where(head[back.face], region, rest)),
     )
-    return _quality(found)
+    found = _quality(_summary(*parts)).labels.get(str(region))
+    return quality if found is None else replace(quality, labels={**quality.labels, HEAD: found})
+
+
+def _summary(forth: DirectedDistances, back: DirectedDistances) -> MeshComparison:
+    config = CompareConfig()
+    return summarize(forth, back, convention=convention_named(DEFAULT), threshold_mm=config.threshold_mm)
 
 
 def mean_surface(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
@@ -74,12 +90,26 @@ def mean_surface(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
     """
     if not frames:
         raise InputError("surfaces to average", expected="at least one frame", received="none")
-    figures = {}
-    for name in ("p2s", "truth_to_mesh", "chamfer", "p95"):
-        known = [getattr(one, name) for one in frames if getattr(one, name) is not None]
-        figures[name] = float(np.mean(known)) if known else None
+    return _over_frames(frames, lambda known: float(np.mean(known)) if known else None)
+
+
+def surface_spread(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
+    """Standard deviations over the frames that have each figure, by n - 1; None for fewer than two frames."""
+    return _over_frames(frames, lambda known: float(np.std(known, ddof=1)) if len(known) > 1 else None)
+
+
+def _over_frames(
+    frames: Sequence[SurfaceQuality], statistic: Callable[[Sequence[float]], float | None]
+) -> SurfaceQuality:
+    """A statistic of every figure over the frames that have it, of all and of each label."""
+    figures = {
+        name: statistic([value for one in frames if (value := getattr(one, name)) is not None])
+        for name in ("p2s", "truth_to_mesh", "chamfer", "p95")
+    }
     labels = dict.fromkeys(name for one in frames for name in one.labels)
-    parts = {name: mean_surface([one.labels[name] for one in frames if name in one.labels]) for name in labels}
+    parts = {
+        name: _over_frames([one.labels[name] for one in frames if name in one.labels], statistic) for name in labels
+    }
     return SurfaceQuality(**figures, labels=parts)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from avatar.data.views import View
@@ -19,7 +21,7 @@ from smplxpp.template.template import Template
 
 OPACITY_THRESHOLD = 0.02
 HEAD_MARGIN = 0.08
-"""Of the head's box, added on every side."""
+"""Share of the head's box that is added on every side."""
 CONVENTION = (
     "Images are composited on the capture's plain background, rendered colours clamped to [0, 1]. "
     "PSNR: over pixels where mask or rendered opacity exceed 0.02. Image: over all pixels. "
@@ -40,7 +42,7 @@ class ViewQuality:
         psnr_image: dB over the whole composited image.
         ssim: mean over the whole composited image.
         psnr_head: as `psnr`, within the box of the head; None where the head is not in the image.
-        ssim_head: of the box alone, zero padded as an image is; None as `psnr_head`.
+        ssim_head: SSIM of the box alone, zero padded as an image is; None as `psnr_head`.
         perceptual: distance of the whole composited images; None without a metric.
         perceptual_head: of the box alone; None too where it is under 32 pixels a side.
     """
@@ -56,9 +58,9 @@ class ViewQuality:
 
 def view_quality(
     view: View,
-    image: Tensor,
-    alpha: Tensor,
-    background: Tensor,
+    image: Float32[Tensor, "H W 3"],
+    alpha: Float32[Tensor, "H W"],
+    background: Float32[Tensor, " 3"],
     *,
     head: Box | None,
     metric: PerceptualDistance | None = None,
@@ -66,8 +68,8 @@ def view_quality(
     """Compare a rendered image with the view's.
 
     Args:
-        image: (H, W, 3), clamped to [0, 1] as a screen would. alpha: (H, W) rendered opacity.
-        background: (3,) that both are on.
+        image: sRGB, clamped to [0, 1] here as a screen would. alpha: rendered opacity.
+        background: sRGB that both are on.
         head: x0, y0, x1, y1 in pixels.
         metric: perceptual distance to measure too.
     """
@@ -107,14 +109,31 @@ def mean_quality(views: Mapping[str, ViewQuality]) -> dict[str, float]:
     return {name: sum(values) / len(values) for name, values in known.items() if values}
 
 
-def head_vertices(template: Template) -> np.ndarray:
-    """(n,) vertices of the head's faces; all that faces use on a body without a joint "head"."""
+def spread_over_frames(frames: Iterable[Mapping[str, ViewQuality]]) -> dict[str, float]:
+    """Standard deviations, by n - 1, over frames of each figure's mean over a frame's views.
+
+    Figures that fewer than two frames have, and those that are infinite in one, are left out.
+
+    Args:
+        frames: the views of each frame by name.
+    """
+    means = [mean_quality(views) for views in frames]
+    columns = {f.name: [mean[f.name] for mean in means if f.name in mean] for f in fields(ViewQuality)}
+    return {
+        name: float(np.std(values, ddof=1))
+        for name, values in columns.items()
+        if len(values) > 1 and all(map(math.isfinite, values))
+    }
+
+
+def head_vertices(template: Template) -> Int[np.ndarray, " N"]:
+    """Return the vertices of the head's faces; all that faces use on a body without a joint "head"."""
     faces = template.faces[head_faces(template)] if "head" in template.body.joint_names else template.faces
     return np.unique(faces)
 
 
-def head_box(points: np.ndarray, camera: Camera) -> Box | None:
-    """x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing of it is in the image."""
+def head_box(points: Float[np.ndarray, "N 3"], camera: Camera) -> Box | None:
+    """Return x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing is in the image."""
     x, y, depth = camera.screen_from_world(points).T[:3]
     if not (depth > 0).all():
         return None
@@ -125,6 +144,6 @@ def head_box(points: np.ndarray, camera: Camera) -> Box | None:
     return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None
 
 
-def eight_bit(image: Tensor) -> Tensor:
-    """(H, W, 3) in [0, 1] as uint8 on the CPU."""
+def eight_bit(image: Float32[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    """Return colours in [0, 1] as bytes on the CPU."""
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()

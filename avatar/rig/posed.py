@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -34,9 +34,10 @@ class PosedAvatar:
 
 
 class AvatarModel(Protocol):
-    """Anything that can be posed and drawn: teacher, student, baselines."""
+    """Any module that can be posed and drawn: teacher, student, baselines."""
 
     rig: Rig
+    training: bool
 
     def __call__(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
         """The avatar in a pose.
@@ -45,9 +46,18 @@ class AvatarModel(Protocol):
             camera_centers: (C, 3) centres of projection in the world, metres.
         """
 
+    def train(self, mode: bool = True) -> Any:
+        """Go into the training mode or out of it, as modules do."""
+
+    def eval(self) -> Any:
+        """Go into the evaluation mode, as modules do."""
+
+    def named_parameters(self) -> Iterable[tuple[str, Tensor]]:
+        """Return what is learned, by name, as modules do."""
+
 
 @contextmanager
-def at_rest(model: nn.Module) -> Iterator[None]:
+def at_rest(model: AvatarModel | nn.Module) -> Iterator[None]:
     """No gradients, and the module in its evaluation mode; afterwards it trains as before."""
     was_training = model.training
     model.eval()

@@ -30,8 +30,10 @@ class Evaluate:
     before its blend shapes. compact: its file for players."""
     sets: tuple[Literal["training", "novel_view", "novel_pose", "novel_pose_training_view"], ...] = ()
     """Which views; by default all that the capture holds out something for, and training views."""
-    every: int = 4
-    """Every n-th frame of the training frames and of the held-out ones."""
+    every: int = 1
+    """Every n-th frame of what is held out: of held-out frames, and of training frames as held-out cameras see them."""
+    training_every: int = 4
+    """Every n-th training frame of the training views and of the true surfaces; never more often than --every."""
     hold_out: tuple[str, ...] = ()
     """Cameras that count as held out, in the place of the capture's."""
     hold_out_frames: tuple[int, ...] = ()
@@ -55,7 +57,7 @@ class Evaluate:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Of the points on the surfaces."""
+    """Seed of the points on the surfaces."""
     force: bool = False
     """Measure anew even if the evaluation stands."""
     no_report: bool = False
@@ -76,7 +78,12 @@ class Evaluate:
         from pipelines.stages.evaluate_config import REPORT_FILE
         from pipelines.stages.scene import TrainInputs
 
-        protocol = ProtocolConfig(sets=self.sets, every=self.every, held_out_frames=self.hold_out_frames)
+        protocol = ProtocolConfig(
+            sets=self.sets,
+            every=self.every,
+            training_every=self.training_every,
+            held_out_frames=self.hold_out_frames,
+        )
         if min(self.speed_size) < 1:
             raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
         config = EvaluationConfig(

@@ -6,9 +6,7 @@
 
 from pipelines.figures.colors import (
     blend_joint_colors,
-    category_colors,
     colormap,
-    dominant_joints,
     heat_colors,
     joint_palette,
 )
@@ -24,11 +22,9 @@ __all__ = [
     "blend_joint_colors",
     "body_cameras",
     "caption",
-    "category_colors",
     "color_bar",
     "colormap",
     "contact_sheet",
-    "dominant_joints",
     "encode_jpeg",
     "encode_png",
     "fit_cameras",

@@ -8,6 +8,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.skin_weights import SkinWeights
@@ -37,8 +38,10 @@ _LAB_FROM_LMS = np.array(
 )
 
 
-def linear_from_srgb(color: np.ndarray) -> np.ndarray:
-    """sRGB values in 0..1 (uint8 in 0..255) to linear light in 0..1, float32 (IEC 61966-2-1)."""
+def linear_from_srgb(
+    color: Float[np.ndarray, "*shape"] | UInt8[np.ndarray, "*shape"],
+) -> Float32[np.ndarray, "*shape"]:
+    """Turn sRGB values in 0..1 (bytes in 0..255) into linear light in 0..1 (IEC 61966-2-1)."""
     color = np.asarray(color)
     if color.dtype == np.uint8:
         return _linear_table()[color]
@@ -46,8 +49,8 @@ def linear_from_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def srgb8_from_linear(color: np.ndarray) -> np.ndarray:
-    """Linear light, clipped to 0..1, to sRGB uint8; exact to half a step from 1/255 up."""
+def srgb8_from_linear(color: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Turn linear light, clipped to 0..1, into sRGB; exact to half a step from 1/255 up."""
     table = _srgb_table()
     return table[(np.clip(color, 0.0, 1.0) * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.int32)]
 
@@ -64,19 +67,19 @@ def _srgb_table() -> np.ndarray:
     return np.round(255.0 * y).astype(np.uint8)
 
 
-def oklab_from_linear(color: np.ndarray) -> np.ndarray:
-    """(..., 3) linear sRGB to OKLab."""
+def oklab_from_linear(color: Float[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3"]:
+    """Turn linear sRGB into OKLab."""
     return np.cbrt(np.asarray(color, dtype=np.float64) @ _LMS_FROM_RGB.T) @ _LAB_FROM_LMS.T
 
 
-def linear_from_oklab(lab: np.ndarray) -> np.ndarray:
-    """(..., 3) OKLab to linear sRGB (may leave 0..1)."""
+def linear_from_oklab(lab: Float[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3"]:
+    """Turn OKLab into linear sRGB, which may leave 0..1."""
     return (np.asarray(lab) @ np.linalg.inv(_LAB_FROM_LMS).T) ** 3 @ np.linalg.inv(_LMS_FROM_RGB).T
 
 
 @cache
-def colormap(name: str) -> np.ndarray:
-    """(256, 3) uint8 colours of "weight" (pale to violet), "error" (pale to dark) or "signed" (blue, pale, red)."""
+def colormap(name: str) -> UInt8[np.ndarray, "256 3"]:
+    """Return the colours of "weight" (pale to violet), "error" (pale to dark) or "signed" (blue, pale, red)."""
     if name not in _ANCHORS:
         raise InputError("colour map", expected=f"one of {', '.join(_ANCHORS)}", received=repr(name))
     anchors = np.array([[int(code[i : i + 2], 16) for i in (1, 3, 5)] for code in _ANCHORS[name]], dtype=np.uint8)
@@ -94,8 +97,8 @@ def colormap(name: str) -> np.ndarray:
     return table
 
 
-def heat_colors(values: np.ndarray, *, cmap: str, limits: tuple[float, float]) -> np.ndarray:
-    """(N,) values to (N, 3) uint8; clipped to `limits`, grey where not finite."""
+def heat_colors(values: Float[np.ndarray, " N"], *, cmap: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "N 3"]:
+    """Colour values, clipped to `limits`; grey where they are not finite."""
     low, high = limits
     if not high > low:
         raise InputError("limits of the colour map", expected="low < high", received=f"{low}, {high}")
@@ -108,8 +111,8 @@ def heat_colors(values: np.ndarray, *, cmap: str, limits: tuple[float, float]) -
 
 
 @cache
-def joint_palette(count: int) -> np.ndarray:
-    """(count, 3) uint8 colours in which neighbours in the list, and so mostly in the skeleton, look different."""
+def joint_palette(count: int) -> UInt8[np.ndarray, "J 3"]:
+    """Return `count` colours in which neighbours in the list, and so mostly in the skeleton, look different."""
     k = np.arange(count)
     # The golden angle never repeats a hue; three lightness levels separate the hues that come near each other.
     hue = 2.0 * np.pi * ((0.08 + k * 0.61803398875) % 1.0)
@@ -121,16 +124,8 @@ def joint_palette(count: int) -> np.ndarray:
     return table
 
 
-def category_colors(ids: np.ndarray) -> np.ndarray:
-    """(N,) ids (parts, components) to (N, 3) uint8; the colour of an id does not depend on the others."""
-    ids = np.asarray(ids, dtype=np.int64)
-    if ids.size and ids.min() < 0:
-        raise InputError("category ids", expected="0 or more", received=str(int(ids.min())))
-    return joint_palette(64)[ids % 64]
-
-
-def blend_joint_colors(weights: SkinWeights | np.ndarray) -> np.ndarray:
-    """Skinning weights (dense (N, J) or `SkinWeights`) to (N, 3) uint8: the joints' colours mixed by weight."""
+def blend_joint_colors(weights: SkinWeights | Float[np.ndarray, "N J"]) -> UInt8[np.ndarray, "N 3"]:
+    """Mix the joints' colours by skinning weights, sparse or dense."""
     if isinstance(weights, SkinWeights):
         palette = linear_from_srgb(joint_palette(weights.joint_count))
         mixed = np.einsum("nk,nkd->nd", weights.joint_weights, palette[weights.joint_indices])
@@ -138,9 +133,3 @@ def blend_joint_colors(weights: SkinWeights | np.ndarray) -> np.ndarray:
         weights = np.asarray(weights)
         mixed = weights @ linear_from_srgb(joint_palette(weights.shape[1]))
     return srgb8_from_linear(mixed)
-
-
-def dominant_joints(weights: SkinWeights | np.ndarray) -> np.ndarray:
-    """(N,) the joint with the largest weight; the lowest index wins a tie."""
-    dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights)
-    return np.argmax(dense, axis=1)

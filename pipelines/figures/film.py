@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import encode_png
@@ -16,8 +17,8 @@ FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)
 
 
-def write_film(path: Path, frames: Iterable[np.ndarray], *, fps: float, size: tuple[int, int]) -> None:
-    """Write (H, W, 3) uint8 `frames` as the kind of film that the suffix of `path` names.
+def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps: float, size: tuple[int, int]) -> None:
+    """Write frames as the kind of film that the suffix of `path` names.
 
     Args:
         size: width and height in pixels, even for MP4.

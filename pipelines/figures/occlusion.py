@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float32
 
 from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
@@ -19,8 +20,8 @@ _GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)
 
 def unoccluded(
     maps: MeshMaps, camera: Camera, normals_at: Callable[[np.ndarray], np.ndarray], *, style: ShadeStyle
-) -> np.ndarray:
-    """(H, W) float32 share of the surroundings that each output pixel sees, 1 on the background.
+) -> Float32[np.ndarray, "H W"]:
+    """Return the share of the surroundings that each output pixel sees, 1 on the background.
 
     `maps` and `camera` are supersampled; the first sample of each output pixel stands for all of them.
 

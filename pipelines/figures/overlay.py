@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import UInt8
 
 from pipelines.figures.colors import linear_from_srgb
 from pipelines.figures.shading import resolve, shade_layer
@@ -16,18 +17,18 @@ def render_overlay(
     ghost: TriangleMesh,
     camera: Camera,
     *,
-    solid_colors: np.ndarray | None = None,
+    solid_colors: UInt8[np.ndarray, "N 3"] | None = None,
     ghost_color: tuple[int, int, int] = (52, 128, 214),
     opacity: float = 0.30,
     style: ShadeStyle | None = None,
-) -> np.ndarray:
-    """`ghost` as tinted glass over and around `solid`: (H, W, 3) uint8.
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw `ghost` as tinted glass over and around `solid`.
 
     Where the ghost lies in front it tints the solid, most at its rim, where a thin shell is thickest along the view;
     where it lies behind, it is hidden. So a solid that sticks out of the ghost keeps its own colour.
 
     Args:
-        solid_colors: (N, 3) uint8 of the solid's vertices.
+        solid_colors: sRGB of the solid's vertices.
         opacity: of the ghost where it faces the camera, 0 to 1.
     """
     style = style or ShadeStyle()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from pipelines.figures.colors import heat_colors
 from pipelines.figures.shading import resolve, shade_layer
@@ -19,14 +20,14 @@ def render_shaded(
     mesh: TriangleMesh,
     camera: Camera,
     *,
-    vertex_colors: np.ndarray | None = None,
-    face_colors: np.ndarray | None = None,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
+    face_colors: UInt8[np.ndarray, "M 3"] | None = None,
     style: ShadeStyle | None = None,
-) -> np.ndarray:
-    """A lit picture of `mesh`: (H, W, 3) uint8.
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a lit picture of a mesh.
 
     Args:
-        vertex_colors: (N, 3) uint8 sRGB, interpolated in linear light. face_colors: (M, 3) uint8, one a face.
+        vertex_colors: sRGB, interpolated in linear light. face_colors: sRGB, one a face.
         style: see `ShadeStyle`.
     """
     style = style or ShadeStyle()
@@ -37,15 +38,15 @@ def render_shaded(
 def render_heat(
     mesh: TriangleMesh,
     camera: Camera,
-    values: np.ndarray,
+    values: Float[np.ndarray, " K"],
     *,
     cmap: str = "error",
     limits: tuple[float, float],
     unit: str = "",
     bar: bool = True,
     style: ShadeStyle | None = None,
-) -> np.ndarray:
-    """`mesh` coloured by `values`, (N,) a vertex or (M,) a face, with a colour bar on the right: (H, W', 3) uint8.
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a mesh coloured by values, one a vertex or one a face, with a colour bar on the right.
 
     Values outside `limits` take the end colours, values that are not finite are grey. Vertex values are interpolated
     after colouring, so a picture is exact at vertices only.

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipelines.figures.colors import linear_from_srgb, srgb8_from_linear
 from pipelines.figures.occlusion import unoccluded
@@ -30,27 +31,26 @@ class Layer:
     """A shaded surface before it is put on a background, at the supersampled size.
 
     Attributes:
-        color: (H, W, 3) float32 linear light, 0 where nothing is hit.
-        mask: (H, W) bool.
-        depth: (H, W) float32 metres, inf where nothing is hit.
-        facing: (H, W) float32, |cos| between normal and view, 1 where nothing is hit.
+        color: linear light, 0 where nothing is hit. mask: where something is.
+        depth: metres, inf where nothing is hit.
+        facing: |cos| between normal and view, 1 where nothing is hit.
     """
 
-    color: np.ndarray
-    mask: np.ndarray
-    depth: np.ndarray
-    facing: np.ndarray
+    color: Float32[np.ndarray, "H W 3"]
+    mask: Bool[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]
+    facing: Float32[np.ndarray, "H W"]
 
 
 def shade_layer(
     mesh: TriangleMesh,
     camera: Camera,
     *,
-    vertex_colors: np.ndarray | None = None,
-    face_colors: np.ndarray | None = None,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
+    face_colors: UInt8[np.ndarray, "M 3"] | None = None,
     style: ShadeStyle,
 ) -> Layer:
-    """Rasterise and shade `mesh`; colours are (N, 3) a vertex or (M, 3) a face, uint8."""
+    """Rasterise and shade a mesh; colours are one a vertex or one a face."""
     for name, colors, count in (
         ("vertex colours", vertex_colors, mesh.vertex_count),
         ("face colours", face_colors, mesh.face_count),
@@ -95,12 +95,17 @@ def shade_layer(
     return Layer(color.reshape(*shape, 3), maps.face_id >= 0, maps.depth, facing.reshape(shape))
 
 
-def resolve(color: np.ndarray, alpha: np.ndarray, *, style: ShadeStyle) -> np.ndarray:
-    """Premultiplied linear `color` (sH, sW, 3) with `alpha` (sH, sW), averaged in linear light: (H, W, 3) uint8."""
+def resolve(
+    color: Float[np.ndarray, "sH sW 3"],
+    alpha: Float[np.ndarray, "sH sW"] | Bool[np.ndarray, "sH sW"],
+    *,
+    style: ShadeStyle,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Average premultiplied linear colours in linear light, on the style's background."""
     s = style.supersampling
 
-    def average(x: np.ndarray) -> np.ndarray:
-        return sum(x[i::s, j::s] for i in range(s) for j in range(s)) * np.float32(1.0 / s**2)
+    def average(x: Float[np.ndarray, "sH sW ..."]) -> Float[np.ndarray, "H W ..."]:
+        return np.asarray(sum(x[i::s, j::s] for i in range(s) for j in range(s))) * np.float32(1.0 / s**2)
 
     background = linear_from_srgb(np.array(style.background, np.uint8))
     return srgb8_from_linear(average(color) + (1.0 - average(alpha.astype(np.float32)))[..., None] * background)
@@ -108,25 +113,33 @@ def resolve(color: np.ndarray, alpha: np.ndarray, *, style: ShadeStyle) -> np.nd
 
 @dataclass(frozen=True)
 class _Surface:
-    """What every pixel's shading reads; `shade` works on blocks that fit the processor's cache."""
+    """What every pixel's shading reads; `shade` works on blocks that fit the processor's cache.
+
+    Attributes:
+        back: faces that turn their inner side to the camera. normals: of vertices or faces, in camera axes.
+        vertex_albedo, face_albedo: linear light; a single face's stands for all.
+        edge_heights: pixels.
+    """
 
     mesh: TriangleMesh
     camera: Camera
     maps: MeshMaps
-    back: np.ndarray  # (M,) bool
-    normals: np.ndarray  # (N, 3) or (M, 3) float32 in camera axes
-    vertex_albedo: np.ndarray | None  # (N, 3) float32 linear
-    face_albedo: np.ndarray  # (M, 3), or (1, 3) for all
-    edge_heights: np.ndarray | None  # (M, 3) float32 pixels
+    back: Bool[np.ndarray, " M"]
+    normals: Float32[np.ndarray, "K 3"]
+    vertex_albedo: Float32[np.ndarray, "N 3"] | None
+    face_albedo: Float32[np.ndarray, "L 3"]
+    edge_heights: Float32[np.ndarray, "M 3"] | None
     style: ShadeStyle
 
-    def normals_at(self, pixels: np.ndarray) -> np.ndarray:
-        """(P, 3) float32 unit normals towards the camera, in camera axes, at flat pixel indices."""
+    def normals_at(self, pixels: Int[np.ndarray, " P"]) -> Float[np.ndarray, "P 3"]:
+        """Return unit normals towards the camera, in camera axes, at flat pixel indices."""
         face, bary, corners = self._gather(pixels)
         return self._normals(face, bary, corners)
 
-    def shade(self, pixels: np.ndarray, open_sky: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Linear colour (P, 3) and |cos| to the view (P,) at flat pixel indices."""
+    def shade(
+        self, pixels: Int[np.ndarray, " P"], open_sky: Float32[np.ndarray, "H W"]
+    ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
+        """Return linear colour and |cos| to the view at flat pixel indices."""
         face, bary, corners = self._gather(pixels)
         normal = self._normals(face, bary, corners)
         if self.vertex_albedo is not None:

@@ -6,6 +6,7 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from pipelines.figures.colors import colormap
@@ -15,24 +16,24 @@ INK = (38, 42, 51)
 WHITE = (255, 255, 255)
 
 
-def encode_png(image: np.ndarray) -> bytes:
-    """(H, W, 3) uint8 as PNG: lossless."""
-    return _encode(image, "PNG", optimize=False, compress_level=6)
-
-
-def encode_jpeg(image: np.ndarray, *, quality: int = 88) -> bytes:
-    """(H, W, 3) uint8 as JPEG with full colour resolution: about a fifth of the PNG for shaded scans."""
-    return _encode(image, "JPEG", quality=quality, subsampling=0, optimize=True)
-
-
-def _encode(image: np.ndarray, kind: str, **options) -> bytes:
+def encode_png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """Encode a picture as PNG, without loss."""
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(buffer, kind, **options)
+    Image.fromarray(np.ascontiguousarray(image)).save(buffer, "PNG", optimize=False, compress_level=6)
     return buffer.getvalue()
 
 
-def caption(image: np.ndarray, text: str, *, size: int = 20, background: tuple[int, int, int] = WHITE) -> np.ndarray:
-    """The picture with a line of text under it."""
+def encode_jpeg(image: UInt8[np.ndarray, "H W 3"], *, quality: int = 88) -> bytes:
+    """Encode a picture as JPEG with full colour resolution: about a fifth of the PNG for shaded scans."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(buffer, "JPEG", quality=quality, subsampling=0, optimize=True)
+    return buffer.getvalue()
+
+
+def caption(
+    image: UInt8[np.ndarray, "H W 3"], text: str, *, size: int = 20, background: tuple[int, int, int] = WHITE
+) -> UInt8[np.ndarray, "H2 W 3"]:
+    """Put a line of text under a picture."""
     strip = Image.new("RGB", (image.shape[1], round(1.9 * size)), background)
     ImageDraw.Draw(strip).text(
         (strip.width / 2, strip.height / 2), text, fill=INK, font=ImageFont.load_default(size), anchor="mm"
@@ -40,8 +41,10 @@ def caption(image: np.ndarray, text: str, *, size: int = 20, background: tuple[i
     return np.concatenate([image, np.asarray(strip)], axis=0)
 
 
-def row(images: Sequence[np.ndarray], *, gap: int = 12, background: tuple[int, int, int] = WHITE) -> np.ndarray:
-    """Pictures side by side, their upper edges aligned."""
+def row(
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]], *, gap: int = 12, background: tuple[int, int, int] = WHITE
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Put pictures side by side, their upper edges aligned."""
     if not images:
         raise InputError("pictures of a row", expected="at least one", received="none")
     height = max(len(image) for image in images)
@@ -56,14 +59,14 @@ def row(images: Sequence[np.ndarray], *, gap: int = 12, background: tuple[int, i
 
 
 def contact_sheet(
-    images: Sequence[np.ndarray],
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
     *,
     captions: Sequence[str] = (),
     columns: int = 4,
     gap: int = 12,
     background: tuple[int, int, int] = WHITE,
-) -> np.ndarray:
-    """Pictures in a grid of `columns`, each centred in a cell of the largest picture's size."""
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Put pictures in a grid of `columns`, each centred in a cell of the largest picture's size."""
     if captions and len(captions) != len(images):
         raise InputError("captions", expected=f"one a picture ({len(images)})", received=str(len(captions)))
     cells = list(images)
@@ -90,8 +93,8 @@ def color_bar(
     unit: str,
     height: int,
     background: tuple[int, int, int] = WHITE,
-) -> np.ndarray:
-    """A vertical colour bar with five labelled ticks: (height, W, 3) uint8."""
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a vertical colour bar of a height in pixels, with five labelled ticks."""
     low, high = limits
     values = np.linspace(low, high, 5)
     size = max(14, height // 36)  # still readable when the picture is shown at half its size

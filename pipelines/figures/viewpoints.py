@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_known
 
 # From the body to the camera. The body stands along +y and faces +z; its left is +x.
 VIEWS: dict[str, tuple[float, float, float]] = {
@@ -27,32 +29,32 @@ FIELD_OF_VIEW_DEG = 22.0  # long lens: little perspective, still a sense of dept
 def body_cameras(
     mesh: TriangleMesh, *, views: Sequence[str] = ("front", "side", "back"), height: int = 900, margin: float = 0.04
 ) -> list[Camera]:
-    """One camera a view, `height` pixels high and as wide as the body needs; see `VIEWS` for the names."""
-    unknown = [name for name in views if name not in VIEWS]
-    if unknown:
-        raise InputError("view", expected=f"one of {', '.join(VIEWS)}", received=", ".join(unknown))
+    """Make a camera a view, `height` pixels high and as wide as the body needs; see `VIEWS` for the names."""
+    require_known("view", views, VIEWS)
     used = mesh.vertices[np.unique(mesh.faces)]
     return fit_cameras(used, directions=[VIEWS[name] for name in views], names=views, height=height, margin=margin)
 
 
-def turntable_cameras(points: np.ndarray, *, count: int, height: int = 900, width: int | None = None) -> list[Camera]:
-    """`count` cameras on a circle about `points` (N, 3), one turn from the front to the body's left and on."""
+def turntable_cameras(
+    points: Float[np.ndarray, "N 3"], *, count: int, height: int = 900, width: int | None = None
+) -> list[Camera]:
+    """Make `count` cameras on a circle about points, one turn from the front to the body's left and on."""
     angles = 2.0 * np.pi * np.arange(count) / max(count, 1)
     directions = np.stack([np.sin(angles), np.full(count, 0.08), np.cos(angles)], axis=1)
-    return fit_cameras(points, directions=directions, height=height, width=width, common_width=True)
+    return fit_cameras(points, directions=list(directions), height=height, width=width, common_width=True)
 
 
 def fit_cameras(
-    points: np.ndarray,
+    points: Float[np.ndarray, "N 3"],
     *,
-    directions: Sequence,
+    directions: Sequence[Float[np.ndarray, " 3"] | tuple[float, float, float]],
     names: Sequence[str] = (),
     height: int = 900,
     width: int | None = None,
     margin: float = 0.04,
     common_width: bool = False,
 ) -> list[Camera]:
-    """Perspective cameras that see all `points` (N, 3) along each of `directions`, from one common distance.
+    """Make perspective cameras that see all points along each of `directions`, from one common distance.
 
     Args:
         directions: vectors from the points to the camera.
@@ -94,8 +96,8 @@ def fit_cameras(
     return cameras
 
 
-def _view_basis(direction: np.ndarray) -> np.ndarray:
-    """(3, 3) rows: the camera's x (right), y (down) and z (forward) in the world, for a camera along `direction`."""
+def _view_basis(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return rows: the camera's x (right), y (down) and z (forward) in the world, for a camera along `direction`."""
     z = -direction / np.linalg.norm(direction)
     up = np.array([0.0, 1.0, 0.0]) if abs(z[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
     x = np.cross(z, up)

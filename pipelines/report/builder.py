@@ -12,7 +12,16 @@ import numpy as np
 from markupsafe import Markup
 
 from pipelines.report.charts import curve_svg, histogram_statistics, histogram_svg, timings_svg
-from pipelines.report.model import STATUSES, CheckRow, Report, count_statuses, format_value, worst_status
+from pipelines.report.model import (
+    STATUSES,
+    CheckRow,
+    Curve,
+    Histogram,
+    Report,
+    count_statuses,
+    format_value,
+    worst_status,
+)
 from smplxpp.core.atomic import atomic_write_text
 
 _VERDICTS = {
@@ -33,13 +42,11 @@ def write_report(path: str | Path, report: Report) -> Path:
         loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
     )
     environment.filters |= {"value": format_value, "flat": _flatten, "worst": worst_status}
-    environment.tests["number"] = lambda value: (
-        isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    )
+    environment.tests["number"] = _is_number
     environment.globals |= {
-        "histogram_svg": lambda histogram: Markup(histogram_svg(histogram)),
-        "curve_svg": lambda curve: Markup(curve_svg(curve)),
-        "timings_svg": lambda seconds: Markup(timings_svg(seconds)),
+        "histogram_svg": _histogram,
+        "curve_svg": _curve,
+        "timings_svg": _timings,
         "statistics": histogram_statistics,
     }
     worst = worst_status(report.checks)
@@ -63,6 +70,18 @@ def _by_stage(checks: tuple[CheckRow, ...]) -> dict[str, list[CheckRow]]:
     for check in checks:
         out.setdefault(check.stage, []).append(check)
     return out
+
+
+def _histogram(histogram: Histogram) -> Markup:
+    return Markup(histogram_svg(histogram))
+
+
+def _curve(curve: Curve) -> Markup:
+    return Markup(curve_svg(curve))
+
+
+def _timings(seconds: Mapping[str, float]) -> Markup:
+    return Markup(timings_svg(seconds))
 
 
 def _is_number(value: Any) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from html import escape
 
 import numpy as np
+from jaxtyping import Num
 
 from pipelines.report.model import Curve, Histogram, format_value
 from smplxpp.core.errors import InputError
@@ -15,7 +16,7 @@ _WIDTH, _HEIGHT = 560, 250
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 44, 40
 
 
-def histogram_statistics(values: np.ndarray) -> dict[str, float]:
+def histogram_statistics(values: Num[np.ndarray, "*shape"]) -> dict[str, float]:
     """Count and, of the finite values, mean, percentiles, min and max; count of the others."""
     values = np.asarray(values, dtype=np.float64).ravel()
     finite = values[np.isfinite(values)]
@@ -128,9 +129,9 @@ def curve_svg(curve: Curve) -> str:
         f'aria-label="{escape(curve.title)}, at the end: {escape(ends + unit)}">'
     ]
     for tick in _ticks(bottom, top, 4):
-        y = place(low, tick)[1]
-        out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        out.append(f'<text class="tick" x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:g}</text>')
+        level = place(low, tick)[1]
+        out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - right}" y1="{level:.1f}" y2="{level:.1f}"/>')
+        out.append(f'<text class="tick" x="{_LEFT - 6}" y="{level + 4:.1f}" text-anchor="end">{tick:g}</text>')
     out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - right}" y1="{base}" y2="{base}"/>')
     for tick in _ticks(low, high, 6):
         at = place(tick, bottom)[0]
@@ -172,7 +173,7 @@ def timings_svg(seconds: Mapping[str, float]) -> str:
     return "".join([*out, "</svg>"])
 
 
-def _range(histogram: Histogram, values: np.ndarray) -> tuple[float, float]:
+def _range(histogram: Histogram, values: Num[np.ndarray, " N"]) -> tuple[float, float]:
     """The axis: from 0 for values without a sign, symmetric otherwise; never empty."""
     signed = values.min() < 0
     reach = histogram.upper

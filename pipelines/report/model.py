@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Num
 
 from pipelines.runs.checks import Check
 from smplxpp.core.errors import InputError
@@ -40,16 +41,15 @@ class CheckRow:
 
     @staticmethod
     def of(check: Check | Mapping[str, Any], *, stage: str = "") -> CheckRow:
-        """From a `Check`, or from its record in a manifest or in metrics.json."""
+        """Make a row of a `Check`, or of its record in a manifest or in metrics.json."""
         record = check.as_dict() if isinstance(check, Check) else check
         missing = [key for key in ("name", "status") if key not in record]
         if missing:
             raise InputError("record of a check", expected="a name and a status", received=f"keys {sorted(record)}")
         value = record.get("value")
-        finite = value is not None and math.isfinite(value)
         return CheckRow(
             name=str(record["name"]),
-            value=float(value) if finite else None,
+            value=float(value) if value is not None and math.isfinite(value) else None,
             unit=str(record.get("unit", "")),
             status=str(record["status"]),
             gate=str(record.get("gate", "")),
@@ -110,13 +110,13 @@ class Histogram:
     """A distribution with its gates.
 
     Attributes:
-        values: any shape; values that are not finite are counted and named, not drawn.
+        values: of the distribution; values that are not finite are counted and named, not drawn.
         gates: (label, value) drawn as dashed lines.
         upper: end of the axis; the rest is counted in the last bar. Default: the 99.5th percentile, gates included.
     """
 
     title: str
-    values: np.ndarray
+    values: Num[np.ndarray, "*shape"]
     unit: str = "mm"
     gates: tuple[tuple[str, float], ...] = ()
     upper: float | None = None
@@ -127,12 +127,12 @@ class Curve:
     """Quantities over one axis, a line each.
 
     Attributes:
-        lines: name -> (x, y), each (N,), x ascending; points that are not finite are left out.
+        lines: name -> (x, y), x ascending; points that are not finite are left out.
         x_label, unit: of the axes.
     """
 
     title: str
-    lines: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    lines: Mapping[str, tuple[Num[np.ndarray, " N"], Num[np.ndarray, " N"]]]
     x_label: str
     unit: str = ""
 
@@ -192,27 +192,29 @@ class Report:
 
 
 def count_statuses(checks: Iterable[CheckRow]) -> dict[str, int]:
-    """How many checks fail, warn and pass."""
+    """Count the checks that fail, warn and pass."""
     statuses = [check.status for check in checks]
     return {status: statuses.count(status) for status in STATUSES}
 
 
 def worst_status(checks: Iterable[CheckRow]) -> str:
-    """`fail`, `warn` or `pass`; `pass` for no checks."""
+    """Return `fail`, `warn` or `pass`; `pass` for no checks."""
     present = {check.status for check in checks}
     return next((status for status in STATUSES if status in present), "pass")
 
 
 def format_value(value: Any) -> str:
-    """A number for readers: three to four significant digits, thousands separated; other values as text."""
+    """Write a number for readers: three to four significant digits, thousands separated; other values as text."""
     if value is None:
         return "-"
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{int(value):,}"
-    if not isinstance(value, float | np.floating):
-        return str(value)
+    return _format_float(float(value)) if isinstance(value, float | np.floating) else str(value)
+
+
+def _format_float(value: float) -> str:
     if not math.isfinite(value):
         return "not a number" if math.isnan(value) else ("∞" if value > 0 else "-∞")
     if value == 0:

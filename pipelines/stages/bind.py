@@ -18,11 +18,12 @@ from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.metrics.view_quality import CONVENTION, mean_quality
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
+from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
 from avatar.training.train import Session
 from pipelines.figures.comparison import write_strip
-from pipelines.runs.checks import Check
+from pipelines.runs import gates
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
@@ -122,7 +123,8 @@ class BindStage(ModelStage):
         train = [view.name for view in scene.train]
         shown = (*held_out, *spread(train, PREVIEWED_TRAINING_VIEWS))
         _write_strips(folder, {name: result.images[name] for name in shown}, views, scene.background)
-        output = _output(result, held_out, train, overlap)
+        start = next(line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation")
+        output = _output(result, held_out, train, overlap=overlap, start=start["mean"]["psnr"])
         output.numbers["by_hand"] = self.by_hand
         return output
 
@@ -143,7 +145,12 @@ def _write_strips(
         write_strip(folder / "previews" / f"{name}.png", views[name].photograph(background), image)
 
 
-def _output(result: FitResult, held_out: list[str], train: list[str], overlap: float) -> StageOutput:
+def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap: float, start: float) -> StageOutput:
+    """Make numbers and checks.
+
+    Args:
+        overlap: of the template and the masks. start: PSNR of the same views before the first step, dB.
+    """
     done = result.progress
     shown = held_out or train
     mean = {
@@ -154,32 +161,25 @@ def _output(result: FitResult, held_out: list[str], train: list[str], overlap: f
     figures = mean["held_out" if held_out else "train"]
     which = "held-out" if held_out else "training"
     checks = [
-        Check(
+        gates.SILHOUETTE.check(
             "template's silhouette on the masks",
             overlap,
-            "IoU",
-            0.95,
-            0.8,
-            higher_is_better=True,
             explanation="mean over the training views, before the fit; low: another pose, or other cameras",
         ),
-        Check(
+        gates.PSNR["novel_view"].check(
             f"{which} views: PSNR of the person",
             figures["psnr"],
-            "dB",
-            22.0,
-            16.0,
-            higher_is_better=True,
             explanation=f"mean over {len(shown)} cameras, over the union of the silhouettes",
         ),
-        Check(f"{which} views: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
-        Check(
+        gates.SSIM.check(f"{which} views: SSIM", figures["ssim"]),
+        gates.GAIN.check(
+            f"{which} views: gain of PSNR since the start",
+            figures["psnr"] - start,
+            explanation="the start: colours of the photographs laid on the template",
+        ),
+        gates.ITERATIONS.check(
             "iterations done",
             done.iteration / done.iterations,
-            "",
-            1.0,
-            0.0,
-            higher_is_better=True,
             explanation="below 1: the limit of time ended it; the same command goes on",
         ),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -26,18 +27,21 @@ from avatar.rig.posed import AvatarModel
 from avatar.rig.rig import Rig
 from pipelines.figures import encode_png
 from pipelines.figures.evaluation import surface_picture, write_tiles
+from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.digests import TRAINING, sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
+from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.validation import require_known
 
 
 def evaluate(
@@ -64,6 +68,7 @@ def evaluate(
     files = model_files(run, models)
     scene = open_scene(run, inputs)
     with_people(scene.capture, view_sets(scene.capture, config.protocol))  # a bad file ends it before work starts
+    known = input_protocol(run, inputs, scene.capture)
     sequence = AvatarSequence(scene.capture, scene.template, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
     refuse_seen(
@@ -73,7 +78,7 @@ def evaluate(
     )
     stage = Stage(
         name=EVALUATE_STAGE,
-        config={"evaluation": config, "scale": inputs.scale, "device": device},
+        config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device},
         inputs={
             **scene.digests,
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
@@ -86,14 +91,14 @@ def evaluate(
 
     def work(folder: Path) -> StageOutput:
         found = evaluate_models(loaded, sequence, config, files=files, progress=progress)
-        return _write(folder, found, scene.overlap)
+        return _write(folder, replace(found, report=replace(found.report, inputs=known)), scene.overlap)
 
     with own_run_folder(run, (EVALUATE_STAGE, "report")):
         return run_stage(run, stage, work, force=force)
 
 
 def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
-    """Files of the models of a run, in the order of `MODEL_FILES`.
+    """Find the files of the models of a run, in the order of `MODEL_FILES`.
 
     Args:
         names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
@@ -103,9 +108,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
     """
     there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
     asked = list(names)
-    unknown = [name for name in asked if name not in MODEL_FILES]
-    if unknown:
-        raise InputError("models", expected=f"among {', '.join(MODEL_FILES)}", received=", ".join(unknown))
+    require_known("models", asked, MODEL_FILES)
     missing = [name for name in asked if name not in there]
     untrained = not asked and not there.keys() & set(BEST_FIRST)
     if missing or untrained:
@@ -122,7 +125,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
 
 
 def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
-    """A model of a run; the reference fit is a student without field and blend shapes.
+    """Load a model of a run; the reference fit is a student without field and blend shapes.
 
     Raises:
         InputError: a damaged file, one of another template or of a newer version.
@@ -133,7 +136,7 @@ def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
 
 
 def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
-    """Figures, tables and pictures of an evaluation as files; what the manifest and the report say of it."""
+    """Write figures, tables and pictures of an evaluation; return what the manifest and the report say of it."""
     report = found.report
     report.save(folder / REPORT_FILE)
     tables = evaluation_tables(report)
@@ -157,9 +160,13 @@ def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
         atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
         title = f"{SURFACE_SETS[surface.set]}, frame {surface.frame}: distance to the true surface"
         surfaces.append({"file": file, "title": title})
+    best = next(iter(report.models.values()))
     numbers = {
         "models": {name: summary_figures(model) for name, model in report.models.items()},
         "conventions": report.conventions,
+        "inputs": report.inputs,
+        "metric": report.metric,
+        "counts": {name: best.counts(name) for name in best.views},
         "tables": [{"caption": t.caption, "header": t.header(), "rows": t.cells()} for t in tables.values()],
         "views": views,
         "surfaces": surfaces,
@@ -169,13 +176,9 @@ def _write(folder: Path, found: Evaluation, overlap: float) -> StageOutput:
 
 def _checks(report: EvalReport, overlap: float) -> list[Check]:
     checks = [
-        Check(
+        gates.SILHOUETTE.check(
             "template's silhouette on the masks",
             overlap,
-            "IoU",
-            0.95,
-            0.8,
-            higher_is_better=True,
             explanation="skinning alone; low: another person, another pose, or other cameras",
         )
     ]
@@ -183,40 +186,32 @@ def _checks(report: EvalReport, overlap: float) -> list[Check]:
     if name is None:
         return checks
     best = report.models[name]
-    for part, title, warn, fail in (
-        ("novel_view", "novel views", 22.0, 16.0),
-        ("novel_pose", "novel poses", 20.0, 15.0),
-    ):
+    for part, gate in gates.PSNR.items():
         if part in best.views:
-            checks.append(
-                Check(
-                    f"{name}, {title}: PSNR of the person",
-                    best.mean(part)["psnr"],
-                    "dB",
-                    warn,
-                    fail,
-                    higher_is_better=True,
-                )
-            )
-            if name != "teacher" and "teacher" in report.models:
-                gain = best.mean(part)["psnr"] - report.models["teacher"].mean(part)["psnr"]
+            psnr = best.mean(part)["psnr"]
+            checks.append(gate.check(f"{name}, {SETS[part]}: PSNR of the person", psnr))
+            if "reference-fit" in report.models:
                 checks.append(
-                    Check(f"{name} against its teacher, {title}", gain, "dB", -0.3, -2.0, higher_is_better=True)
+                    gates.GAIN.check(
+                        f"{name} against one frame's Gaussians, {SETS[part]}",
+                        psnr - report.models["reference-fit"].mean(part)["psnr"],
+                        explanation="gain of PSNR over the reference fit, which skinning alone moves",
+                    )
                 )
+            if name != "teacher" and "teacher" in report.models:
+                gain = psnr - report.models["teacher"].mean(part)["psnr"]
+                checks.append(gates.AGAINST_TEACHER.check(f"{name} against its teacher, {SETS[part]}", gain))
     for part, title in SURFACE_SETS.items():
         if part not in best.surfaces or name == "teacher":
             continue
         own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
         for label in CLOTH_LABELS:
-            if label.name in own and label.name in alone and own[label.name].p2s and alone[label.name].p2s:
-                share = own[label.name].p2s / alone[label.name].p2s
+            ours, skinned = (found[label.name].p2s if label.name in found else None for found in (own, alone))
+            if ours and skinned:
                 checks.append(
-                    Check(
+                    gates.AGAINST_SKINNING.check(
                         f"P2S of {label.name} against skinning alone, {title}",
-                        share,
-                        "x",
-                        1.0,
-                        1.5,
+                        ours / skinned,
                         explanation="below 1: the mesh that the field moves is nearer to the truth",
                     )
                 )
@@ -228,5 +223,6 @@ def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
     digest = hashlib.sha256()
     for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
         mesh = capture.truth_mesh(frame)
+        assert mesh is not None  # `truth_frames` chose frames that have one
         digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
     return digest.hexdigest()

@@ -20,5 +20,3 @@ MEASURED = ("reference-fit", "teacher", "student")
 BEST_FIRST = ("student", "compact", "baked", "teacher")
 """What an evaluation is about: the first of these that was measured."""
 HELD_OUT_VIEWS = ("novel_view", "novel_pose")
-SURFACE_LIMIT_MM = 40.0
-"""Distance that the colours of posed meshes end at."""

@@ -19,6 +19,7 @@ from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.prune import pruned_to
 from avatar.training.train import PRETRAIN, TRACK, Session
+from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.layout import COMPACT_STUDENT, STUDENT
 from pipelines.runs.stage import StageOutput
@@ -139,39 +140,31 @@ def _output(
 
 def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
     checks = [
-        Check(
+        gates.SILHOUETTE.check(
             "template's silhouette on the masks",
             overlap,
-            "IoU",
-            0.95,
-            0.8,
-            higher_is_better=True,
             explanation="mean over some training views; low: another pose, or other cameras",
         ),
     ]
-    for kind, gates in (("novel_view", (22.0, 16.0)), ("novel_pose", (20.0, 14.0))):
+    for kind, gate in gates.PSNR.items():
         if kind not in numbers:
             continue
         name, figures = kind_name(kind, held_out=numbers["held_out_cameras"]), numbers[kind]
         checks += [
-            Check(f"{name}: PSNR of the person", figures["psnr"], "dB", *gates, higher_is_better=True),
-            Check(f"{name}: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
+            gate.check(f"{name}: PSNR of the person", figures["psnr"]),
+            gates.SSIM.check(f"{name}: SSIM", figures["ssim"]),
         ]
         if kind in numbers["start"]:
             gain = figures["psnr"] - numbers["start"][kind]["psnr"]
-            checks.append(Check(f"{name}: gain of PSNR since the start", gain, "dB", 0.0, -1.0, higher_is_better=True))
+            checks.append(gates.GAIN.check(f"{name}: gain of PSNR since the start", gain))
         if kind in numbers.get("compact", {}):
             loss = figures["psnr"] - numbers["compact"][kind]["psnr"]
-            checks.append(Check(f"{name}: PSNR lost in the compact file", loss, "dB", 0.3, 2.0))
+            checks.append(gates.LOST_BY_COMPRESSION.check(f"{name}: PSNR lost in the compact file", loss))
     done = numbers["iterations_done"] / numbers["iterations"]
     checks.append(
-        Check(
+        gates.ITERATIONS.check(
             "iterations done",
             done,
-            "",
-            1.0,
-            0.0,
-            higher_is_better=True,
             explanation="below 1: the limit of time ended it; the same command goes on",
         )
     )

@@ -241,6 +241,11 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:
         "seed": config.seed,
         "background": [0, 0, 0],
         "label_set": "capture",
+        "inputs": {
+            "parameters": {"params.npz": "exact", "params_noisy.npz": "tracked"},
+            "labels": "true",
+            "normals": "true",
+        },
         **splits,
         "train_views": [item.camera.name for item in rig if not item.novel],
         "novel_views": [item.camera.name for item in rig if item.novel],

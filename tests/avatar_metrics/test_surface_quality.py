@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
-from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality
+from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality, surface_spread
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LOWER, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
@@ -86,3 +88,27 @@ def test_means_are_over_the_frames_that_have_a_figure():
     assert mean.labels == {"upper": frames[0].labels["upper"], "lower": frames[1].labels["lower"]}
     with pytest.raises(InputError, match="one frame"):
         mean_surface([])
+
+
+def test_the_head_is_a_region_beside_the_labels():
+    left, right = plate(), plate(x=2.0, z=0.01)
+    truth = concatenate_meshes([plate(), plate(x=2.0)])
+    mesh = concatenate_meshes([left, right])
+    labels = np.full(mesh.vertex_count, SKIN.id)
+    head = np.arange(mesh.face_count) >= left.face_count
+    quality = surface_quality(mesh, labels, truth, head=head, samples=SAMPLES)
+    assert set(quality.labels) == {"skin", "head"}
+    assert quality.labels["head"].p2s == pytest.approx(10.0) == quality.labels["head"].truth_to_mesh
+    assert quality.labels["skin"].p2s == quality.p2s == pytest.approx(5.0, rel=0.02)
+    plain = surface_quality(mesh, labels, truth, samples=SAMPLES)
+    assert plain == replace(quality, labels={"skin": quality.labels["skin"]})
+
+
+def test_spread_is_a_standard_deviation_over_frames():
+    frames = [
+        SurfaceQuality(2.0, 4.0, 3.0, 5.0, {"upper": SurfaceQuality(1.0, None, None, 2.0)}),
+        SurfaceQuality(4.0, 4.0, 4.0, 9.0, {"lower": SurfaceQuality(7.0, 1.0, 4.0, 8.0)}),
+    ]
+    spread = surface_spread(frames)
+    assert spread.p2s == pytest.approx(2.0 / np.sqrt(2.0)) and spread.truth_to_mesh == 0.0
+    assert spread.labels["upper"].p2s is None and spread.labels["lower"].chamfer is None

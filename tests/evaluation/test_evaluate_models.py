@@ -14,12 +14,14 @@ from torch import nn
 
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import EvaluationConfig, evaluate_models
+from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import SETS, ProtocolConfig
-from avatar.evaluation.report import SKINNING_ALONE, EvalReport
+from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, ViewCounts, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.losses import perceptual as metric_names
 from avatar.losses.perceptual import MissingPackageError, load_metric
 from avatar.metrics.speed import bytes_on_disk, fitted, measure_speed, parameter_counts
+from avatar.metrics.view_quality import ViewQuality
 from avatar.rig.posed import at_rest
 from avatar.rig.rig import Rig
 from smplxpp.core.camera import Camera
@@ -104,6 +106,59 @@ def test_the_report_survives_its_file(found, tmp_path):
     for name in ("other.json", "newer.json", "none.json"):
         with pytest.raises(InputError, match="report"):
             EvalReport.load(tmp_path / name)
+
+
+def test_reports_from_before_counts_and_inputs_are_read(found):
+    values = json.loads(json.dumps(found.report.as_dict()))
+    del values["inputs"]
+    for model in values["models"].values():
+        del model["counts"], model["spread"]
+    for surfaces in (values["skinning_alone"], *(model["surfaces"] for model in values["models"].values())):
+        for one in surfaces.values():
+            del one["spread"]
+    report = EvalReport.from_dict(values)
+    assert report == found.report and report.inputs == InputProtocol()
+    del values["models"]["still"]["parameters"]
+    with pytest.raises(InputError, match=r"evaluation report.*parameters.*Evaluate again"):
+        EvalReport.from_dict(values)
+
+
+def test_counts_and_spread_over_frames():
+    views = {
+        view_key("A", 1): ViewQuality(20.0, 30.0, 0.90),
+        view_key("B_x", 1): ViewQuality(22.0, 30.0, 0.92, psnr_head=25.0),
+        view_key("A", 7): ViewQuality(26.0, math.inf, 0.97),
+    }
+    model = ModelFigures(views={"novel_pose": views})
+    assert model.counts("novel_pose") == ViewCounts(images=3, frames=2, cameras=2)
+    assert model.counts("training") == ViewCounts(0, 0, 0)
+    # The frames' means are 21 and 26 dB, .91 and .97; the head is in one frame alone, the image is infinite in one.
+    spread = model.spread("novel_pose")
+    assert spread == {"psnr": pytest.approx(np.std([21, 26], ddof=1)), "ssim": pytest.approx(0.06 / math.sqrt(2))}
+    figures = summary_figures(model)
+    assert figures["novel_pose.images"] == 3 and figures["novel_pose.frames"] == 2
+    assert figures["novel_pose.psnr"] == pytest.approx(68 / 3)
+    assert figures["novel_pose.psnr.spread"] == spread["psnr"]
+
+
+def test_tables_print_counts_spreads_and_inputs(found):
+    inputs = InputProtocol("tracked", "true", "none", 36, 12)
+    views = {key: replace(q, psnr=q.psnr + k) for k, (key, q) in enumerate(_two_frames(found).items())}
+    report = replace(found.report, models={"one": ModelFigures(views={"novel_view": views})}, inputs=inputs)
+    tables = evaluation_tables(report)
+    text = tables["novel_view"].text()
+    assert "2 images, 2 frames of 1 camera;" in text and " SD" in text
+    assert "parameters tracked, labels true, normals none, trained on 36 frames of 12 cameras" in text
+    assert "not known" in evaluation_tables(replace(report, inputs=InputProtocol()))["summary"].text()
+    assert tables["novel_view"].rows["one"]["psnr.spread"] == pytest.approx(1 / math.sqrt(2))
+    assert EvalReport.from_dict(json.loads(json.dumps(report.as_dict()))).inputs == inputs
+    with pytest.raises(InputError, match="parameters"):
+        InputProtocol(parameters="fine")
+
+
+def _two_frames(found) -> dict[str, ViewQuality]:
+    quality = found.report.models["still"].views["novel_view"]["Held0_000000"]
+    return {view_key("Held0", frame): quality for frame in (0, 1)}
 
 
 def test_tables_hold_what_was_measured(found):

@@ -19,7 +19,7 @@ def capture(tmp_path_factory):
 
 
 def test_sets_are_apart_in_cameras_and_frames(capture):
-    sets = view_sets(capture, ProtocolConfig(every=1))
+    sets = view_sets(capture, ProtocolConfig(every=1, training_every=1))
     assert list(sets) == list(SETS)
     for name, cameras, frames in (
         ("training", TRAIN, range(4)),
@@ -34,29 +34,47 @@ def test_sets_are_apart_in_cameras_and_frames(capture):
 
 
 def test_every_nth_frame_and_training_cameras_in_turn(capture):
-    sets = view_sets(capture, ProtocolConfig(every=2, cameras_a_frame=3))
+    config = ProtocolConfig(every=2, training_every=2, cameras_a_frame=3)
+    sets = view_sets(capture, config)
     assert sets["novel_view"].frames == (0, 2) and sets["novel_pose"].frames == (4,)
     by_frame = {f: {c for c, g in sets["training"].views if g == f} for f in (0, 2)}
     assert len(by_frame[0]) == len(by_frame[2]) == 3 and not by_frame[0] & by_frame[2]
-    all_of_them = view_sets(capture, ProtocolConfig(every=1, cameras_a_frame=99))["training"].views
+    all_of_them = view_sets(capture, ProtocolConfig(training_every=1, cameras_a_frame=99))["training"].views
     assert len(all_of_them) == 4 * len(TRAIN)
-    assert view_sets(capture, ProtocolConfig(every=2, cameras_a_frame=3)) == sets
+    assert view_sets(capture, config) == sets
 
 
 def test_the_users_choice_replaces_the_splits(capture):
-    config = ProtocolConfig(every=1, held_out_cameras=("Ring0",), held_out_frames=(2, 1))
+    config = ProtocolConfig(every=1, training_every=1, held_out_cameras=("Ring0",), held_out_frames=(2, 1))
     sets = view_sets(capture, config)
     assert sets["novel_pose"].views == (("Ring0", 1), ("Ring0", 2))
     assert sets["training"].frames == (0, 3) and "Ring0" not in {c for c, _ in sets["training"].views}
     assert list(view_sets(capture, ProtocolConfig(sets=("novel_pose",)))) == ["novel_pose"]
 
 
+def test_every_held_out_frame_of_every_held_out_camera_by_default(capture):
+    sets = view_sets(capture, ProtocolConfig())
+    assert set(sets["novel_pose"].views) == {(camera, frame) for camera in HELD_OUT for frame in NOVEL}
+    assert set(sets["novel_view"].views) == {(camera, frame) for camera in HELD_OUT for frame in range(4)}
+    assert sets["novel_pose_training_view"].frames == NOVEL
+    assert sets["training"].frames == (0,)
+    # Of the held-out frames 4 and 5, and of the training frames 0 to 3, odd ones have a surface.
+    assert truth_frames(capture, ProtocolConfig(), sets) == {"training": (1,), "held_out": (5,)}
+
+
+def test_training_frames_are_never_taken_more_often_than_held_out_ones():
+    assert ProtocolConfig().training_step == 4
+    assert ProtocolConfig(every=8).training_step == 8
+    assert ProtocolConfig(every=8, training_every=10).training_step == 10
+
+
 def test_surfaces_are_looked_for_where_views_need_not_be(capture):
     # Odd frames have a surface: the first of every two frames has none.
-    sets = view_sets(capture, ProtocolConfig(every=2))
-    assert truth_frames(capture, ProtocolConfig(every=2), sets) == {"training": (1, 3), "held_out": (5,)}
+    config = ProtocolConfig(every=2, training_every=2)
+    sets = view_sets(capture, config)
+    assert truth_frames(capture, config, sets) == {"training": (1, 3), "held_out": (5,)}
     only = view_sets(capture, ProtocolConfig(every=2, sets=("novel_view",)))
-    assert truth_frames(capture, ProtocolConfig(every=2), only) == {"training": (1, 3)}
+    assert truth_frames(capture, config, only) == {"training": (1, 3)}
 
 
 def test_an_empty_set_is_an_error_if_it_was_asked_for(tmp_path):
@@ -102,7 +120,7 @@ def test_an_image_of_another_size_is_told_before_work_starts(tmp_path):
         with_people(capture, view_sets(capture, ProtocolConfig()))
 
 
-@pytest.mark.parametrize("options", [{"sets": ("novel",)}, {"every": 0}, {"cameras_a_frame": 0}])
+@pytest.mark.parametrize("options", [{"sets": ("novel",)}, {"every": 0}, {"training_every": 0}, {"cameras_a_frame": 0}])
 def test_unusable_choices_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options)).split("_")[0]):
         ProtocolConfig(**options)

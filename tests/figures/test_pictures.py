@@ -11,11 +11,9 @@ from pipelines.figures import (
     blend_joint_colors,
     body_cameras,
     caption,
-    category_colors,
     color_bar,
     colormap,
     contact_sheet,
-    dominant_joints,
     encode_jpeg,
     encode_png,
     fit_cameras,
@@ -254,10 +252,6 @@ def test_joint_colours_differ_between_neighbours_and_mix_by_weight():
     np.testing.assert_array_equal(colors[1], srgb8_from_linear(mean))
     sparse = SkinWeights.from_dense(dense)
     np.testing.assert_allclose(blend_joint_colors(sparse).astype(int), colors, atol=1)
-    np.testing.assert_array_equal(dominant_joints(sparse), [0, 1, 1])
-    np.testing.assert_array_equal(category_colors(np.array([3, 67])), joint_palette(64)[[3, 3]])
-    with pytest.raises(InputError, match="category"):
-        category_colors(np.array([-1]))
 
 
 def test_sheets_keep_their_pictures():

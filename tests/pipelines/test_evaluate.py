@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from pipelines.stages.train_inputs import TrainInputs
 
+from avatar.evaluation.input_protocol import InputProtocol
+from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
 from avatar.gaussians.bound_file import save_bound
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
@@ -26,7 +29,10 @@ from pipelines.report import Report, write_report
 from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import read_manifest
+from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES
+from pipelines.stages.evaluate_inputs import input_protocol
+from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
@@ -133,7 +139,13 @@ def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path
 def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
     figures, pictures = evaluation_sections(record)
-    assert [table.caption for table in figures.tables][:2] == ["Evaluation on doll", "training views"]
+    assert [table.caption for table in figures.tables][:2] == [
+        "Evaluation on doll: parameters not known, labels not known, normals none, "
+        "trained on a number of frames that is not known",
+        "training views: 2 images, 1 frame of 2 cameras; parameters not known, labels not known, normals none, "
+        "trained on a number of frames that is not known",
+    ]
+    assert any("Perceptual distance: none was measured" in text for text in figures.text)
     assert figures.tables[0].header[1] == "novel views: PSNR" and len(figures.tables[0].rows) == 2
     assert len(figures.pictures) == 2 and "skinning alone" in str(figures.tables[-2].rows)
     captions = [picture.caption for picture in pictures.pictures]
@@ -147,6 +159,54 @@ def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     ]
     html = write_report(tmp_path / "report.html", Report("doll", sections=(figures, pictures))).read_text()
     assert "Avatar: figures" in html and "http" not in html.replace("http://www.w3.org", "")
+
+
+def test_the_command_measures_every_held_out_frame_unless_told():
+    options, protocol = command.Evaluate(Path("run"), Path("capture")), ProtocolConfig()
+    assert options.every == protocol.every == 1 and options.training_every == protocol.training_every
+
+
+def test_inputs_are_what_capture_build_and_training_say(tmp_path):
+    root, run = write_frames(tmp_path / "capture"), tmp_path / "run"
+    run.mkdir()
+
+    def known(params: Path | None = None) -> InputProtocol:
+        capture = open_capture(root)
+        return input_protocol(run, TrainInputs(root, params), capture)
+
+    def say(**said: object) -> None:
+        content = json.loads((root / "capture.json").read_text()) | {"inputs": said}
+        (root / "capture.json").write_text(json.dumps(content))
+
+    assert known() == InputProtocol(normals="none")
+    say(parameters="exact", labels="true", normals="estimated")
+    assert known() == InputProtocol("exact", normals="none")  # labels: nobody says what the run was built from
+    (root / "scan.ply").touch()
+    (root / "params" / "params_noisy.npz").touch()
+    save_build(run, BuildInputs("doll", root / "scan.ply", root / "params" / "000000.npz"), BuildConfig())
+    assert known() == InputProtocol("exact", "true", "none")
+    assert known(root / "params" / "params_noisy.npz").parameters == "not known"
+    say(parameters={"params.npz": "exact", "params_noisy.npz": "tracked"}, labels="estimated")
+    for path in (Path("params_noisy.npz"), root / "params" / "params_noisy.npz"):
+        assert known(path) == InputProtocol("tracked", "estimated", "none")
+    (tmp_path / "params_noisy.npz").touch()
+    assert known(tmp_path / "params_noisy.npz").parameters == "not known"
+    save_build(run, BuildInputs("doll", tmp_path / "other.ply", root / "params" / "000000.npz"), BuildConfig())
+    assert known().labels == "not known"
+    (run / "85_bake").mkdir()
+    manifest = {"schema": 1, "numbers": {"training_frames": 4, "training_cameras": 6}}
+    (run / "85_bake" / "manifest.json").write_text(json.dumps(manifest))
+    assert known().sentence().endswith("trained on 4 frames of 6 cameras")
+    say(parameters="good")
+    with pytest.raises(InputError, match="'exact' or 'tracked'"):
+        known()
+
+
+def test_the_fixture_says_that_its_inputs_are_exact(tmp_path):
+    capture = open_capture(FIXTURE)
+    assert input_protocol(tmp_path, TrainInputs(FIXTURE), capture) == InputProtocol("exact", "not known", "true")
+    noisy = TrainInputs(FIXTURE, Path("params_noisy.npz"))
+    assert input_protocol(tmp_path, noisy, capture).parameters == "tracked"
 
 
 def test_an_evaluation_of_other_models_does_not_stand(evaluated, tmp_path):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from pipelines.figures import (
     blend_joint_colors,
@@ -27,10 +29,12 @@ from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_body, load_params
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.core.camera import Camera
 from smplxpp.core.json_values import jsonable
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
 from smplxpp.metrics import point_to_surface
 from smplxpp.metrics.distance import MM
 from smplxpp.template.template import Template
@@ -127,11 +131,21 @@ def rewrite_report(run: Path) -> Path | None:
     return write_build_report(run, *build, {name: require_stage(run, name) for name in BUILD_STAGES})
 
 
-def _sheet(mesh: TriangleMesh, cameras: list, **colors) -> bytes:
-    return encode_jpeg(row([render_shaded(mesh, camera, **colors) for camera in cameras]))
+def _sheet(
+    mesh: TriangleMesh,
+    cameras: Sequence[Camera],
+    *,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
+    face_colors: UInt8[np.ndarray, "M 3"] | None = None,
+) -> bytes:
+    """Draw a mesh through cameras, side by side, as JPEG."""
+    pictures = [render_shaded(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors) for camera in cameras]
+    return encode_jpeg(row(pictures))
 
 
-def _scan_section(run: Path, scan: TriangleMesh, colors: np.ndarray, cameras: list, checks: tuple) -> Section:
+def _scan_section(
+    run: Path, scan: TriangleMesh, colors: UInt8[np.ndarray, "N 3"], cameras: list[Camera], checks: tuple[CheckRow, ...]
+) -> Section:
     with np.load(run / "20_segment" / "labels.npz") as data:
         labels, confidence = data["face_labels"], data["confidence"]
     heat = [
@@ -155,7 +169,7 @@ def _scan_section(run: Path, scan: TriangleMesh, colors: np.ndarray, cameras: li
     )
 
 
-def _parts_section(run: Path, record: StageRecord, cameras: list, checks: tuple) -> Section:
+def _parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     parts = load_parts(run)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
@@ -183,7 +197,7 @@ def _parts_section(run: Path, record: StageRecord, cameras: list, checks: tuple)
     )
 
 
-def _weights_section(run: Path, record: StageRecord, cameras: list, checks: tuple) -> Section:
+def _weights_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     parts, weights = load_parts(run), load_weights(run)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
@@ -208,7 +222,7 @@ def _weights_section(run: Path, record: StageRecord, cameras: list, checks: tupl
     )
 
 
-def _template_section(template: Template, checks: tuple) -> Section:
+def _template_section(template: Template, checks: tuple[CheckRow, ...]) -> Section:
     cameras = body_cameras(template.mesh, views=("front", "back"), height=POSE_HEIGHT)
     return Section(
         title="Template in the T-pose",
@@ -228,9 +242,9 @@ def _fidelity_section(
     template: Template,
     posed: TriangleMesh,
     scan: TriangleMesh,
-    colors: np.ndarray,
-    cameras: list,
-    checks: tuple,
+    colors: UInt8[np.ndarray, "N 3"],
+    cameras: list[Camera],
+    checks: tuple[CheckRow, ...],
 ) -> Section:
     distance = point_to_surface(posed.vertices, scan)[0] * MM
     errors = load_arrays(run / "65_validate" / "errors.npz")
@@ -275,7 +289,7 @@ def _poses_section(template: Template, reference: BodyParams, inputs: BuildInput
         pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
     if inputs.motion is not None:
         motion = load_params(inputs.motion, body=load_body(inputs.body))
-        chosen = np.unique(np.linspace(0, len(motion) - 1, MOTION_PICTURES).round().astype(int))
+        chosen = np.array(spread(range(len(motion)), MOTION_PICTURES))
         for k, vertices in zip(chosen, template.pose(motion.select(chosen)), strict=True):
             pictures.append(_pose_picture(template, vertices, f"motion, frame {k}"))
     return Section(
@@ -287,7 +301,7 @@ def _poses_section(template: Template, reference: BodyParams, inputs: BuildInput
     )
 
 
-def _pose_picture(template: Template, vertices: np.ndarray, name: str) -> Picture:
+def _pose_picture(template: Template, vertices: Float[np.ndarray, "V 3"], name: str) -> Picture:
     mesh = template.mesh.with_vertices(vertices)
     cameras = body_cameras(mesh, views=("front", "side"), height=POSE_HEIGHT)
     return Picture(name, _sheet(mesh, cameras, vertex_colors=template.vertex_colors))

@@ -7,16 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
+from avatar.evaluation.input_protocol import InputProtocol, counted
 from pipelines.figures import encode_jpeg, encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend
-from pipelines.figures.evaluation import read_tiles
+from pipelines.figures.evaluation import SURFACE_LIMIT_MM, read_tiles
 from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES, SURFACE_LIMIT_MM
+from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:
@@ -24,6 +26,8 @@ def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:
     manifest = read_manifest(run / EVALUATE_STAGE)
     if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
         return None
+    if "counts" not in manifest["numbers"]:
+        return None  # of a version that did not count its images: the next evaluation writes it anew
     measured = {name: digest for name, digest in manifest["inputs"].items() if name in MODEL_FILES.values()}
     if any(not (run / name).is_file() or sha256_file(run / name) != digest for name, digest in measured.items()):
         return None
@@ -39,11 +43,17 @@ def evaluation_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
     figures, out = models[name], []
     for part, title in zip(HELD_OUT_VIEWS, ("novel views", "novel poses"), strict=True):
         if figures.get(f"{part}.psnr") is not None:
-            note = f"{name}, SSIM {figures[f'{part}.ssim']:.3f}"
+            note = f"{name}, SSIM {figures[f'{part}.ssim']:.3f}, {_counted(record.manifest['numbers'], part)}"
             out.append(KeyNumber(title, f"{figures[f'{part}.psnr']:.1f} dB", note))
     if figures.get("fps") is not None:
         out.append(KeyNumber("pictures a second", f"{figures['fps']:.1f}", f"{name}, deform and render"))
     return tuple(out)
+
+
+def _counted(numbers: Mapping[str, Any], part: str) -> str:
+    """The images of a set in words."""
+    counts = numbers["counts"][part]
+    return f"{counted(counts['images'], 'image')} of {counted(counts['frames'], 'frame')}"
 
 
 def evaluation_sections(record: StageRecord) -> tuple[Section, Section]:
@@ -53,12 +63,15 @@ def evaluation_sections(record: StageRecord) -> tuple[Section, Section]:
 
 def _figures(record: StageRecord) -> Section:
     numbers = record.manifest["numbers"]
+    inputs = InputProtocol.from_dict(numbers["inputs"])
+    distance = numbers["metric"] or "none was measured"
     return Section(
         title="Avatar: figures",
         text=(
             f"{_listed(list(numbers['models']))} on the same views. Training views: cameras and frames that were "
             "trained on. Novel views: held-out cameras at training frames. Novel poses: held-out cameras at held-out "
             f"frames. All figures, and these tables as text, CSV and LaTeX, lie in {EVALUATE_STAGE}.",
+            f"What they rest on: {inputs.sentence()}. Perceptual distance: {distance}.",
             *(f"{name[0].upper()}{name[1:]}: {words}" for name, words in numbers["conventions"].items()),
         ),
         pictures=tuple(
@@ -101,7 +114,9 @@ def _side_by_side(record: StageRecord) -> Section:
     )
 
 
-def _view_pictures(shown: Mapping[str, Any], truth: np.ndarray, rendered: list[np.ndarray]) -> list[Picture]:
+def _view_pictures(
+    shown: Mapping[str, Any], truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
+) -> list[Picture]:
     """The view whole, and its head enlarged."""
     out = [Picture(shown["title"], encode_png(_with_errors(truth, rendered)))]
     if shown["head"] is not None:
@@ -113,7 +128,9 @@ def _view_pictures(shown: Mapping[str, Any], truth: np.ndarray, rendered: list[n
     return out
 
 
-def _with_errors(truth: np.ndarray, rendered: list[np.ndarray]) -> np.ndarray:
+def _with_errors(
+    truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
+) -> UInt8[np.ndarray, "_ _ 3"]:
     """Photograph and renderings in a row, errors under the renderings."""
     blank = np.full_like(truth, 255)
     errors = row([blank, *(error_colors(truth, image) for image in rendered)])

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from pipelines.figures import encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, read_strip
@@ -84,7 +85,7 @@ def _shown(numbers: dict[str, Any]) -> tuple[str, list[str]]:
     return which, list(numbers[which])
 
 
-def _head_picture(name: str, parts: tuple[np.ndarray, ...], box: list[int]) -> Picture:
+def _head_picture(name: str, parts: tuple[UInt8[np.ndarray, "H W 3"], ...], box: list[int]) -> Picture:
     x0, y0, x1, y1 = box
     factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
     crops = [enlarge(part[y0:y1, x0:x1], factor) for part in parts]

@@ -59,7 +59,7 @@ def standing_trainings(run: Path, records: Iterable[StageRecord]) -> dict[str, S
 
 
 def training_key_numbers(records: Mapping[str, StageRecord]) -> tuple[KeyNumber, ...]:
-    """Of the last training, for the head of the report."""
+    """Return the numbers of the last training for the head of the report."""
     if not records:
         return ()
     stage, record = list(records.items())[-1]
@@ -178,7 +178,7 @@ def _curves(lines: list[dict[str, Any]], *, held_out: bool) -> tuple[Curve, ...]
 
 
 def _entries(path: Path) -> list[dict[str, Any]]:
-    """Of a log; none where training ended before its first step."""
+    """Return the lines of a log; none where training ended before its first step."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 

@@ -1,0 +1,96 @@
+"""Stored figures as Markdown tables, whatever their nesting: nothing that is stored is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+WIDE = 14
+"""Columns beyond which a table is turned on its side."""
+JOINED = 4
+"""Figures that are printed in one cell, with strokes between them."""
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    """Return the lines of a Markdown table, numbers in four digits."""
+    lines = [_line(header), _line(["---"] * len(header))]
+    return [*lines, *(_line([shown(cell) for cell in row]) for row in rows), ""]
+
+
+def shown(value: Any) -> str:
+    """Return a stored value for readers: text as it is, numbers in four significant digits, "-" where there is none."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    if isinstance(value, int):
+        return f"{value:,}" if abs(value) >= 1e4 else str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(shown, value))
+    return str(value).replace("|", "\\|")
+
+
+def tables_of(figures: Any, *, level: int = 3) -> list[str]:
+    """Return everything of a nested value as tables under headings of a level.
+
+    Values beside each other make one table of two columns; mappings beside each other make one table with a row each,
+    and a third nesting is joined in the cells.
+    """
+    figures = _by_name(figures)
+    if not isinstance(figures, Mapping):
+        return [shown(figures), ""]
+    single = {name: value for name, value in figures.items() if not isinstance(value, Mapping)}
+    nested = {name: value for name, value in figures.items() if isinstance(value, Mapping)}
+    lines = table(("", ""), list(single.items())) if single else []
+    if not nested:
+        return lines
+    if all(_depth(value) == 1 for value in nested.values()):
+        return [*lines, *_grid(nested)]
+    if all(_joins(value) for value in nested.values()):
+        parts = dict.fromkeys(key for row in nested.values() for cell in row.values() for key in cell)
+        cells = {name: {column: _cell(cell) for column, cell in row.items()} for name, row in nested.items()}
+        return [*lines, f"In each cell: {' / '.join(parts)}.", "", *_grid(cells)]
+    for name, value in nested.items():
+        lines += [f"{'#' * level} {name}", "", *tables_of(value, level=min(level + 1, 6))]
+    return lines
+
+
+def _grid(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a table with a row a name, on its side where it would be too wide."""
+    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+    if len(columns) > max(WIDE, len(rows)):
+        return table(("", *rows), [(key, *(row.get(key) for row in rows.values())) for key in columns])
+    return table(("", *columns), [(name, *(row.get(key) for key in columns)) for name, row in rows.items()])
+
+
+def _by_name(value: Any) -> Any:
+    """Return lists of mappings as mappings: by their first text, or by their place."""
+    if isinstance(value, Mapping):
+        return {str(name): _by_name(one) for name, one in value.items()}
+    if isinstance(value, list) and value and all(isinstance(one, Mapping) for one in value):
+        names = [next((text for text in one.values() if isinstance(text, str)), None) for one in value]
+        distinct = None not in names and len(set(names)) == len(names)
+        titles = names if distinct else [str(k + 1) for k in range(len(value))]
+        return {title: _by_name(one) for title, one in zip(titles, value, strict=True)}
+    return value
+
+
+def _depth(value: Any) -> int:
+    if not isinstance(value, Mapping):
+        return 0
+    return 1 + max((_depth(one) for one in value.values()), default=0)
+
+
+def _joins(row: Mapping[str, Any]) -> bool:
+    """Whether every cell of a row is a few figures that fit beside each other."""
+    return all(_depth(cell) == 1 and len(cell) <= JOINED for cell in row.values())
+
+
+def _cell(cell: Mapping[str, Any]) -> str:
+    return " / ".join(shown(value) for value in cell.values())
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,64 @@
+"""docs/benchmarks.md: what the stored results give, with every row of them, whatever a result looks like."""
+
+from __future__ import annotations
+
+import json
+
+from benchmarks.machine import RESULTS
+from benchmarks.page import PAGE, PARTS, main, page
+from benchmarks.page_tables import shown, tables_of
+
+
+def test_the_stored_page_is_what_the_stored_results_give():
+    assert PAGE.read_text() == page(), "run `python -m benchmarks.page`"
+    assert main(["--check"]) == 0
+
+
+def test_every_stored_result_is_described():
+    assert {path.stem for path in RESULTS.glob("*.json")} == {part.name for part in PARTS}
+    assert all(len(part.conditions) > 20 for part in PARTS)
+
+
+def test_every_row_of_the_ablation_is_printed():
+    rows = json.loads((RESULTS / "ablation_woman_casual.json").read_text())["figures"]["rows"]
+    text = page()
+    for name, row in rows.items():
+        (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} | {row['what']}")]
+        assert (
+            f"| {shown(row['novel_view.psnr'])} |" in line and f"| {shown(row['surface.training.skin.p2s'])} |" in line
+        )
+    assert "P2S skin 2.26 against 1.36 (**worse**)" in text and "head, PSNR 29.8 against 30.2 (**worse**)" in text
+
+
+def test_the_page_says_what_its_figures_rest_on():
+    text = page()
+    for words in ("All inputs are exact", "tracked surface", "L_non", "L_sem", "24 images", "ST-LPIPS"):
+        assert words in text
+
+
+def test_a_result_that_nobody_described_is_printed_too(tmp_path):
+    content = {
+        "command": "python -m benchmarks.new",
+        "date": "2026-01-01",
+        "machine": {"cpu": "some", "cores": 2, "memory_gib": 4.0},
+        "figures": {"deep": {"a": {"b": {"c": {"d": 1.23456}}}}, "rows": [{"name": "first", "value": None}]},
+    }
+    (tmp_path / "new.json").write_text(json.dumps(content))
+    text = page(tmp_path)
+    assert "## new" in text and "Not described" in text and "1.235" in text and "| first |" in text
+
+
+def test_nested_values_become_tables():
+    wide = {"x": {str(k): k for k in range(20)}}
+    assert "| 19 | 19 |" in tables_of(wide)
+    joined = tables_of({"ours": {"squat": {"mean": 1.0, "p95": 2.0}, "twist": {"mean": 3.0, "p95": 4.5}}})
+    assert "In each cell: mean / p95." in joined and "| ours | 1 / 2 | 3 / 4.5 |" in joined
+    assert [shown(value) for value in (None, True, 12345, 1.23456, 123456.7, [1, 2.5], "a|b")] == [
+        "-",
+        "yes",
+        "12,345",
+        "1.235",
+        "123,457",
+        "1, 2.5",
+        "a\\|b",
+    ]
