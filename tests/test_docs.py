@@ -21,8 +21,7 @@ HISTORY = "CHANGELOG.md"  # names what was, too
 
 def code_of(text: str) -> Iterator[str]:
     """Fenced blocks, indented blocks and what stands between backticks."""
-    for block in re.findall(r"^```.*?^```", text, re.MULTILINE | re.DOTALL):
-        yield block
+    yield from re.findall(r"^```.*?^```", text, re.MULTILINE | re.DOTALL)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     yield from re.findall(r"^ {4}.*$", prose, re.MULTILINE)
     yield from re.findall(r"`([^`]+)`", prose)
