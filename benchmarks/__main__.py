@@ -6,7 +6,10 @@ import runpy
 import sys
 from pathlib import Path
 
-SUPPORT = {"__init__", "__main__", "machine", "capture_truth", "rin23", "gaussian_scene", "rasterizer_peers"}
+SUPPORT = {"__init__", "__main__", "machine", "capture_truth", "rin23", "gaussian_scene", "rasterizer_peers"} | {
+    "gpu_parts",
+    "gpu_student",
+}
 
 
 def main() -> int:
