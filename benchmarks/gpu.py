@@ -24,9 +24,8 @@ from typing import Any
 import torch
 import tyro
 
-from benchmarks.gpu_parts import PARTS, ROOT, Job
+from benchmarks.gpu_parts import PARTS, ROOT, TEMPLATE, Job
 from benchmarks.machine import RESULTS, store_results
-from pipelines.stages.build_config import TEMPLATE
 
 SHARES = {"mapping": 2.0, "template": 0.7, "fit": 1.0, "training": 3.0, "paper_step": 1.5, "student": 1.3, "nccl": 0.5}
 """Of the time, by part: gsplat compiles its kernels in the first."""

@@ -83,7 +83,7 @@ def mapping(job: Job, note: Note) -> None:
     code = subprocess.run([*tool, *chosen], cwd=ROOT, check=False).returncode
     cases = list(ET.parse(results).iter("testcase"))
     outcome = {
-        tag: [case.get("name") for case in cases if case.find(tag) is not None] for tag in ("failure", "skipped")
+        tag: [case.get("name", "") for case in cases if case.find(tag) is not None] for tag in ("failure", "skipped")
     }
     note(tests=len(cases), failed=outcome["failure"], skipped=outcome["skipped"])
     if code:
@@ -239,6 +239,7 @@ def enlarge(source: Path, folder: Path, size: tuple[int, int], *, frames: int = 
         for frame in shown:
             pictures = {"rgb": capture.image(name, frame), "mask": capture.mask(name, frame)}
             for tag, image in pictures.items():
+                assert image is not None, f"{name} has no mask of frame {frame}"
                 path = folder / f"{tag}s" / name / f"{name}_{tag}{frame:06d}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 eight = image if image.dtype == np.uint8 else np.round(255.0 * image).astype(np.uint8)
