@@ -95,7 +95,8 @@ def test_every_page_and_file_in_backticks_exists(page):
         for code in re.findall(r"`([^`\n]+)`", page.read_text())
         for name in re.findall(r"^(?:docs|tests|benchmarks|examples|tools|smplxpp|avatar|pipelines)/[\w./-]+$", code)
     }
-    missing = sorted(path for path in paths if not (ROOT / path).exists())
+    # NAME and the like stand for a name that the reader chooses.
+    missing = sorted(path for path in paths if not re.search(r"\b[A-Z]{4,}\b", path) and not (ROOT / path).exists())
     assert not missing, f"{page.name} names files that are not there: {', '.join(missing)}"
 
 
