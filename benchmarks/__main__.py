@@ -6,10 +6,7 @@ import runpy
 import sys
 from pathlib import Path
 
-SUPPORT = {"__init__", "__main__", "machine", "capture_truth", "rin23", "gaussian_scene", "rasterizer_peers"} | {
-    "gpu_parts",
-    "gpu_student",
-}
+SUPPORT = {"__init__", "__main__", "machine", "capture_truth", "rin23", "gaussian_scene", "rasterizer_peers"}
 
 
 def main() -> int:

@@ -24,8 +24,8 @@ from typing import Any
 import torch
 import tyro
 
-from benchmarks.gpu_parts import PARTS, ROOT, TEMPLATE, Job
 from benchmarks.machine import RESULTS, store_results
+from benchmarks.on_gpu.parts import PARTS, ROOT, TEMPLATE, Job
 
 SHARES = {"mapping": 2.0, "template": 0.7, "fit": 1.0, "training": 3.0, "paper_step": 1.5, "student": 1.3, "nccl": 0.5}
 """Of the time, by part: gsplat compiles its kernels in the first."""
@@ -98,7 +98,7 @@ def run_part(name: str, job: Job) -> dict[str, Any]:
     job.save(order)
     with log.open("w") as words:
         process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.gpu_parts", name, str(order)],
+            [sys.executable, "-m", "benchmarks.on_gpu.parts", name, str(order)],
             cwd=ROOT,
             stdout=words,
             stderr=subprocess.STDOUT,

@@ -10,7 +10,7 @@ import torch
 
 from benchmarks import gpu
 from benchmarks.gpu import GpuBenchmark, run_part
-from benchmarks.gpu_parts import PARTS, Job, enlarge
+from benchmarks.on_gpu.parts import PARTS, Job, enlarge
 from smplxpp.capture import open_capture
 from tests.training.dancing_doll import write_dance, write_dance_run
 

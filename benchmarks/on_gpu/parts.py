@@ -1,6 +1,6 @@
 """The parts of `python -m benchmarks.gpu`, each run in a process of its own.
 
-    python -m benchmarks.gpu_parts PART JOB.json
+    python -m benchmarks.on_gpu.parts PART JOB.json
 
 JOB.json holds a `Job`; what the part finds goes to `PART.json` in the job's folder, anew with every figure, so that a
 part that is stopped leaves what it had.
@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.gpu_student import Deformer, Replayed, frames_a_second, largest_difference_mm
+from benchmarks.on_gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
 from pipelines.stages.build_config import TEMPLATE
 from smplxpp.capture import open_capture
 from smplxpp.core.atomic import atomic_write_text
@@ -34,7 +34,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.json_values import jsonable
 from smplxpp.template.template import Template
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
