@@ -32,14 +32,14 @@ def describe_machine() -> dict[str, object]:
     }
 
 
-def store_results(name: str, command: str, figures: object) -> Path:
-    """Write `benchmarks/results/<name>.json` with the command, the date and the machine."""
+def store_results(name: str, command: str, figures: object, *, folder: Path = RESULTS) -> Path:
+    """Write `<name>.json` into `benchmarks/results`, or another folder, with the command, the date and the machine."""
     content = {
         "command": command,
         "date": datetime.date.today().isoformat(),
         "machine": describe_machine(),
         "figures": jsonable(figures),
     }
-    path = RESULTS / f"{name}.json"
+    path = folder / f"{name}.json"
     atomic_write_text(path, json.dumps(content, indent=1) + "\n")
     return path

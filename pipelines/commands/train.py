@@ -39,8 +39,8 @@ class Train:
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
-    """paper: every number as published, for a GPU; gpu: smaller and some hours; cpu: two cores, half an hour;
-    demo: minutes, to see whether all fits together."""
+    """paper: the numbers that the paper states (docs/training.md lists the others), for a GPU; gpu: smaller and some
+    hours; cpu: two cores, half an hour; demo: minutes, to see whether all fits together."""
     stage: Annotated[
         Literal["teacher", "bake", "compensate"] | None,
         tyro.conf.arg(metavar="{teacher,bake,compensate}", help_behavior_hint="(optional)"),

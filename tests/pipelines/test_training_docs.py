@@ -11,11 +11,11 @@ from avatar.models.networks.teacher import Teacher
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.presets import TRAINING_PRESETS, TrainingPreset
 
-GUIDE = Path(__file__).resolve().parents[2] / "docs" / "avatar_training.md"
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 
 
 def rows() -> list[str]:
-    """Of the table, a column for every preset."""
+    """The rows of the table, a column for every preset."""
     columns = [_column(preset) for preset in TRAINING_PRESETS.values()]
     return [f"| {name} | " + " | ".join(column[name] for column in columns) + " |" for name in columns[0]]
 
@@ -64,5 +64,5 @@ def test_the_table_is_that_of_the_presets():
         track = preset.teacher.track
         assert track is None or track.control_points == preset.control_points
     missing = [row for row in rows() if row not in text]
-    assert not missing, "docs/avatar_training.md lacks:\n" + "\n".join(missing)
+    assert not missing, "docs/training.md lacks:\n" + "\n".join(missing)
     assert "| | " + " | ".join(TRAINING_PRESETS) + " |" in text

@@ -65,4 +65,4 @@ PRESETS: dict[str, FitConfig] = {
     "paper": FitConfig(sampling=SamplingConfig(count=270_000, head_share=70 / 270), iterations=10_000),
 }
 """quick shows whether all fits together; default ends where a dozen cameras have no more to give to views held out;
-paper has TaoAvatar's numbers."""
+paper has the numbers that TaoAvatar states (270k Gaussians, 10k iterations); docs/training.md lists the others."""

@@ -1,0 +1,161 @@
+"""A student's frames a second: as it is, with networks in half precision, and with its deformation as a CUDA graph.
+
+The parts of a frame that a graph can hold are written out here without what asks the GPU for an answer: checks of
+triangles without area, and the row of a frame's code. gsplat sorts into lists of unknown length, so that drawing stays
+outside of the graph.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from avatar.gaussians.binding import world_from_frames_reference
+from avatar.gaussians.frames import MIN_EDGE, TriangleFrames
+from avatar.gaussians.quaternions import quat_from_matrix
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.models.student import Student
+from avatar.render import rasterize
+from avatar.rig.rig import Motion
+from smplxpp.core.camera import Camera
+
+MOVING = ("pose", "expression", "jaw", "rest", "world_from_rest", "root_from_world")
+"""What of a `Motion` changes from frame to frame."""
+WARM_UP = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Drawable:
+    """The tensors of one frame that the rasteriser takes."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+def plain_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
+    """The frames of triangles that all have an area."""
+    corners = vertices[faces]
+    v1, v2, v3 = corners.unbind(-2)
+    cross = torch.linalg.cross(v2 - v1, v3 - v1)
+    toward = 0.5 * (v2 + v3) - v1
+    n = cross / cross.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+    q = toward / toward.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+    rotations = torch.stack([n, q, torch.linalg.cross(n, q)], -1)
+    lengths = ((v2 - v1).norm(dim=-1) + (v3 - v1).norm(dim=-1) + (v3 - v2).norm(dim=-1)) / 3.0
+    return TriangleFrames(corners, rotations, quat_from_matrix(rotations), lengths.clamp_min(MIN_EDGE))
+
+
+class Deformer:
+    """What a student does between a pose and the rasteriser, its networks in `dtype`.
+
+    Args:
+        student: with a field and blend shapes.
+        dtype: of the field, its codes and the blend shapes; geometry and colours stay in float32.
+    """
+
+    def __init__(self, student: Student, dtype: torch.dtype = torch.float32) -> None:
+        assert student.field is not None and student.codes is not None and student.blend_shapes is not None
+        self.rig, self.bound, self.dtype = student.rig, student.gaussians(), dtype
+        self.field = copy.deepcopy(student.field).to(dtype)
+        self.shapes = copy.deepcopy(student.blend_shapes).to(dtype)
+        self.code = student.codes.codes[:1].detach().to(dtype)
+
+    @torch.no_grad()
+    def __call__(self, motion: Motion, camera_center: Tensor) -> Drawable:
+        """The Gaussians of a pose as a camera at (1, 3) metres sees them."""
+        pose = motion.pose[None].to(self.dtype)
+        vertices = self.rig.pose(motion, self.field(pose, self.code)[0].float())
+        frames = plain_frames(vertices, self.rig.faces)
+        jaw = motion.jaw[None].to(self.dtype) if self.shapes.config.jaw else None
+        z = self.shapes.coefficients(motion.expression[None].to(self.dtype), pose, jaw)
+        du, dc = self.shapes(z)
+        bound = replace(self.bound, offset=self.bound.offset + du[0].float(), dc=self.bound.dc + dc[0].float())
+        world = world_from_frames_reference(bound, frames)
+        colors = view_colors(bound, frames, world.means, camera_center)[0]
+        return Drawable(world.means, world.quats, world.scales, world.opacities, colors)
+
+
+class Replayed:
+    """A deformer recorded once as a CUDA graph, and replayed for every frame."""
+
+    def __init__(self, deformer: Deformer, motion: Motion, camera_center: Tensor) -> None:
+        self.motion = replace(motion, **{name: getattr(motion, name).clone() for name in MOVING})
+        self.center = camera_center.clone()
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):  # what is set up at a first call must not be part of the graph
+            for _ in range(WARM_UP):
+                deformer(self.motion, self.center)
+        torch.cuda.current_stream().wait_stream(aside)
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph):
+            self.out = deformer(self.motion, self.center)
+
+    def __call__(self, motion: Motion, camera_center: Tensor) -> Drawable:
+        for name in MOVING:
+            getattr(self.motion, name).copy_(getattr(motion, name))
+        self.center.copy_(camera_center)
+        self.graph.replay()
+        return self.out
+
+
+def draw(frame: Drawable, camera: Camera, device: torch.device) -> Tensor:
+    """(H, W, 3) of a frame on black, in [0, 1]."""
+    viewmat, K = (torch.tensor(m, dtype=torch.float32, device=device) for m in (camera.cam_from_world, camera.K))
+    image, _, _ = rasterize(
+        frame.means,
+        frame.quats,
+        frame.scales,
+        frame.opacities,
+        frame.colors[None],
+        viewmat[None],
+        K[None],
+        camera.width,
+        camera.height,
+        eps2d=0.1,
+        check=False,
+    )
+    return image[0].clamp(0.0, 1.0)
+
+
+def frames_a_second(
+    deform: Callable[[Motion, Tensor], Drawable], motions: Sequence[Motion], camera: Camera, *, pictures: int
+) -> dict[str, float]:
+    """Median milliseconds of deformation and drawing, and of both as frames a second; poses are at hand."""
+    device = motions[0].pose.device
+    center = torch.tensor(camera.position[None], dtype=torch.float32, device=device)
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    times = []
+    with torch.no_grad():
+        for motion in itertools.islice(itertools.cycle(motions), WARM_UP + pictures):
+            begin = now()
+            frame = deform(motion, center)
+            deformed = now()
+            draw(frame, camera, device)
+            times.append((deformed - begin, now() - deformed))
+    times = times[WARM_UP:]
+    return {
+        "deform_ms": 1e3 * median(deform for deform, _ in times),
+        "render_ms": 1e3 * median(render for _, render in times),
+        "fps": 1.0 / median(sum(both) for both in times),
+    }
+
+
+def largest_difference_mm(one: Drawable, other: Drawable) -> float:
+    """How far the same Gaussian lies apart in two frames, at most."""
+    return 1e3 * float((one.means - other.means).norm(dim=-1).max())

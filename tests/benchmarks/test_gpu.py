@@ -1,0 +1,111 @@
+"""What `python -m benchmarks.gpu` would do with a GPU, done on the CPU at toy size; and what it does without one."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import gpu
+from benchmarks.gpu import GpuBenchmark, run_part
+from benchmarks.on_gpu.parts import PARTS, Job, enlarge
+from smplxpp.capture import open_capture
+from tests.training.dancing_doll import write_dance, write_dance_run
+
+NETWORK = ("MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE", "RANK", "LOCAL_RANK")
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory) -> Job:
+    """Toys: a doll's capture and a run with its template."""
+    folder = tmp_path_factory.mktemp("gpu")
+    run, capture = write_dance_run(folder / "run"), write_dance(folder / "capture")
+    (folder / "work").mkdir()
+    return Job(folder / "work", run, capture, 900.0, "cpu")
+
+
+def found_by(name: str, job: Job) -> dict:
+    """What a part notes, run in this process."""
+    found: dict = {}
+    PARTS[name](job, found.update)
+    return found
+
+
+def test_every_part_has_a_share_of_the_time():
+    assert list(gpu.SHARES) == list(PARTS)
+    assert set(gpu.NEEDS_TEMPLATE) <= set(PARTS)
+    left = list(PARTS)
+    assert sum(gpu._seconds(name, left, 600.0) for name in left) == pytest.approx(600.0)
+    assert gpu._seconds("nccl", ["nccl"], 42.0) == 42.0
+
+
+def test_the_fit_is_measured(job):
+    assert found_by("fit", job)["iterations_done"] == 2
+
+
+@pytest.mark.parametrize("part", ["training", "paper_step"])
+def test_all_stages_take_their_steps(job, part):
+    found = found_by(part, job)
+    stages = found["short"]["stages"] if part == "training" else found["stages"]
+    assert list(stages) == ["fit", "teacher", "bake", "compensate"]
+    assert all(stage["steps"] >= 1 and stage["steps_a_second"] > 0 for stage in stages.values())
+    if part == "paper_step":
+        assert (found["width"], found["height"]) == (60, 80)
+
+
+def test_the_student_is_the_same_in_half_precision_and_without_checks(job):
+    rows = found_by("student", job)["rows"]
+    assert rows["float32"]["difference_mm"] < 1e-3
+    assert 0 < rows["half"]["difference_mm"] < 5.0
+    assert all(row["eager 48x64"]["fps"] > 0 for row in rows.values())
+
+
+def test_messages_come_back(job, monkeypatch):
+    for name in NETWORK:  # so that what the part sets is taken back
+        monkeypatch.setenv(name, "")
+    found = found_by("nccl", job)
+    assert found["right"] and found["backend"] == "gloo"
+
+
+def test_enlarged_views_show_the_same_through_their_cameras(job, tmp_path):
+    large, capture = open_capture(enlarge(job.capture, tmp_path / "large", (90, 160))), open_capture(job.capture)
+    assert large.splits.novel_view_cameras == ("Held0",) and len(large.frames) == 2
+    name = large.splits.train_cameras[0]
+    assert large.image(name, 0).shape == (160, 90, 3)
+    point = np.array([[0.05, 0.5, 0.0]])
+    there, here = (it.cameras[name].screen_from_world(point)[0, :2] for it in (large, capture))
+    pixels = [
+        np.asarray(it.image(name, 0))[tuple(xy.astype(int)[::-1])] for it, xy in ((large, there), (capture, here))
+    ]
+    np.testing.assert_allclose(*(pixel.astype(float) for pixel in pixels), atol=40)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is there")
+def test_without_a_gpu_it_says_what_it_would_run(capsys):
+    assert GpuBenchmark(minutes=10.0).run() == 2
+    words = capsys.readouterr().out
+    assert "no CUDA device" in words and all(name in words for name in PARTS)
+
+
+def test_a_part_of_another_name_is_refused(capsys):
+    assert GpuBenchmark(parts=("everything",)).run() == 2
+    assert "no such part: everything" in capsys.readouterr().out
+
+
+def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
+    work = tmp_path / "work"
+    options = {"capture": job.capture, "run_folder": tmp_path / "none", "work": work, "dry_run": True}
+    assert GpuBenchmark(parts=("fit", "nccl"), minutes=15.0, **options).run() == 1
+    stored = json.loads((work / "gpu.json").read_text())["figures"]
+    assert stored["parts"]["fit"]["state"] == "failed" and "template" in stored["parts"]["fit"]["error"]
+    assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]
+
+
+def test_a_part_that_crashes_or_takes_too_long_leaves_its_words(job, tmp_path):
+    lost = Job(tmp_path, job.run, tmp_path / "no capture", 900.0, "cpu")
+    result = run_part("fit", lost)
+    assert result["state"] == "failed" and "no capture" in result["error"] and "Traceback" in result["log"]
+    late = run_part("nccl", Job(tmp_path, job.run, job.capture, 0.05, "cpu"))
+    assert late["state"] == "stopped" and "longer than" in late["error"]
