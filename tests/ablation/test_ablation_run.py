@@ -17,7 +17,8 @@ from pipelines.ablation.pieces import BakePiece, SamePiece, TeacherPiece, Worksh
 from pipelines.ablation.rows import PAPER_ROWS, PRUNED_SHARE, ROWS, ablation_pieces, ablation_rows
 from pipelines.ablation.run import Ablation, AblationResult, WithoutCode, ablation_table, unfinished
 from smplxpp.core.errors import InputError
-from tests.baselines.moving_doll import open_moving, template, tiny_preset
+from tests.dolls.swaying import open_moving, template
+from tests.dolls.tiny import tiny_preset
 
 MEASURED = EvaluationConfig(
     protocol=ProtocolConfig(every=2, sets=("novel_view", "novel_pose")),

@@ -14,7 +14,8 @@ from pipelines.ablation.rows import ablation_pieces
 from pipelines.ablation.run import Ablation, Observer
 from pipelines.stages.train import TrainConfig, TrainOptions, train
 from pipelines.stages.train_inputs import TrainInputs, open_scene
-from tests.baselines.moving_doll import tiny_preset, write_moving_capture, write_moving_run
+from tests.dolls.swaying import write_moving_capture, write_moving_run
+from tests.dolls.tiny import tiny_preset
 
 
 @pytest.fixture(scope="module")
