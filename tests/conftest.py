@@ -10,6 +10,10 @@ from tests import shape_contracts
 
 shape_contracts.install()  # before anything of the packages is imported
 
+from tests import remembered  # noqa: E402 - its imports are of the packages
+
+remembered.install()
+
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 
