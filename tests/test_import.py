@@ -53,7 +53,7 @@ def violations(folder: str, forbidden: set[str]) -> list[str]:
 def test_importing_is_light(module):
     heavy = ("torch", "trimesh", "PIL", "anny", "pygltflib")
     code = f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True)
     assert done.stdout.strip() == "[]"
 
 

@@ -68,6 +68,6 @@ def test_workers_start_empty_and_read_the_same(tmp_path, method):
     out = context.Queue()
     worker = context.Process(target=_mean_in_worker, args=(capture, views, out))
     worker.start()
-    held, there = out.get(timeout=60)
-    worker.join(timeout=60)
+    held, there = out.get(timeout=900)
+    worker.join(timeout=900)
     assert (held, there) == (0, here)

@@ -30,7 +30,7 @@ def validate(path: Path) -> dict:
     """The validator's report."""
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
-    run = subprocess.run(["node", str(SCRIPT), str(path)], capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(["node", str(SCRIPT), str(path)], capture_output=True, text=True, timeout=900, check=False)
     if run.returncode == 3:
         pytest.skip("the npm package gltf-validator is not in NODE_PATH")
     assert run.returncode == 0, run.stderr

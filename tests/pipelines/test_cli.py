@@ -163,7 +163,7 @@ def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
         [sys.executable, "-m", "pipelines.cli", "metrics", str(cube), str(huge), "--samples", "100"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=900,
         check=True,
     )
     text = " ".join(done.stderr.split())

@@ -226,7 +226,7 @@ def test_torchrun_trains_with_two_processes(fitted, capture):
         *SMALL,
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
     answer = json.loads(done.stdout)  # the first process alone speaks
     assert answer["finished"]

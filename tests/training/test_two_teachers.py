@@ -50,7 +50,7 @@ def test_two_processes_train_the_teacher_of_one(tmp_path):
         str(tmp_path / "two"),
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
     one = load_file(tmp_path / "one" / "learned_0.safetensors")
     first, second = (load_file(tmp_path / "two" / f"learned_{rank}.safetensors") for rank in (0, 1))
