@@ -44,7 +44,10 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         return function
     if inspect.isgeneratorfunction(function):
         shaped.pop("return", None)
-    places = {name: place for place, name in enumerate(_positional(function))}
+    code = inspect.unwrap(function).__code__  # `inspect.signature` at every call costs ten times as much
+    places = {name: place for place, name in enumerate(code.co_varnames[: code.co_argcount])}
+    if open_ended := shaped.keys() & set(code.co_varnames[code.co_argcount + code.co_kwonlyargcount :]):
+        raise TypeError(f"{function.__qualname__}: shapes of *{', '.join(open_ended)} cannot be checked")
     hints: dict[str, Any] = {}
 
     @functools.wraps(function)
@@ -81,12 +84,6 @@ def _checked_dataclass(cls: type) -> None:
         _hold(cls.__qualname__, {name: (hint, getattr(self, name)) for name, hint in hints.items()})
 
     cls.__init__ = init
-
-
-def _positional(function: Callable[..., Any]) -> tuple[str, ...]:
-    """The names of parameters that may be given by place; `inspect.signature` at every call costs ten times as much."""
-    code = inspect.unwrap(function).__code__
-    return code.co_varnames[: code.co_argcount]
 
 
 def _annotations(function: Callable[..., Any]) -> dict[str, str]:
