@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,10 @@ import pytest
 from tests import shape_contracts
 
 shape_contracts.install()  # before anything of the packages is imported
+
+from tests import remembered  # noqa: E402 - its imports are of the packages
+
+remembered.install()
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
@@ -21,3 +28,37 @@ def captures() -> Path:
     if not path.is_dir():
         pytest.skip("no ground-truth captures beside the checkout")
     return path
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Make a folder of a name once for all workers of a test run; nobody may change it.
+
+    The other workers wait for the one that makes it. A folder whose making failed is made again, and fails again.
+    """
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def once(name: str, make: Callable[[Path], object]) -> Path:
+        with open(base / f"{name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (base / f"{name}.made").exists():
+                make(base / name)
+                (base / f"{name}.made").touch()
+        return base / name
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def person_run(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """The embedded person's whole build by the command line."""
+
+    def build(run: Path) -> None:
+        from pipelines.cli import main
+
+        assert (
+            main(["build", "--capture", str(ROOT / "data" / "fixtures" / "person"), "--out", str(run), "--json"]) == 0
+        )
+
+    return made_once("person", build)

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,7 @@ import trimesh
 from PIL import Image
 
 from avatar.export.splats import read_splat_ply
-from pipelines.commands.build import Build
-from pipelines.stages.build import build
 from smplxpp import Template
-from smplxpp.core.errors import GeometryWarning
 
 ROOT = Path(__file__).resolve().parents[1]
 # What each must write into its folder.
@@ -33,17 +29,6 @@ FILES = {
 
 OF_A_RUN = ("06_train_a_student",)
 """Take a run as their first argument."""
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with the embedded person's template."""
-    run = tmp_path_factory.mktemp("built") / "run"
-    command = Build(out=run, capture=ROOT / "data" / "fixtures" / "person")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)  # the small scan is repaired here and there
-        build(run, command.inputs(), command.config(), last="60_assemble")
-    return run
 
 
 def run_example(name: str, out: Path, *arguments: str) -> str:
@@ -75,7 +60,7 @@ def test_every_example_is_listed_and_short() -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    run = [str(request.getfixturevalue("built"))] if name in OF_A_RUN else []
+    run = [str(request.getfixturevalue("person_run"))] if name in OF_A_RUN else []
     text = run_example(name, tmp_path / "out", *run)
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
     check = {

@@ -13,7 +13,7 @@ from benchmarks import machine
 from benchmarks.ablation import AblationBenchmark
 from pipelines.cli import main
 from smplxpp.core.errors import InputError
-from tests.baselines.moving_doll import HEIGHT, WIDTH, write_moving_capture, write_moving_run
+from tests.dolls.swaying import HEIGHT, WIDTH, write_moving_capture, write_moving_run
 
 QUICK = (
     *("--preset", "demo", "--iterations-share", "0.01", "--gaussians", "400", "--every", "3", "--device", "cpu"),

@@ -11,7 +11,7 @@ from pipelines.ablation.rows import PAPER_ROWS, ROWS, ablation_rows, ablation_st
 from pipelines.runs.layout import MODEL_STAGES
 from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
-from tests.baselines.moving_doll import tiny_preset
+from tests.dolls.tiny import tiny_preset
 
 FRAMES = 4
 """To train on."""

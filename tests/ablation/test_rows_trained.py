@@ -23,7 +23,8 @@ from pipelines.runs.stage import read_manifest
 from pipelines.stages.models import Trainer, TrainOptions
 from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.train import TrainConfig, train
-from tests.baselines.moving_doll import tiny_preset, write_moving_capture, write_moving_run
+from tests.dolls.swaying import write_moving_capture, write_moving_run
+from tests.dolls.tiny import tiny_preset
 
 MEASURED = EvaluationConfig(
     protocol=ProtocolConfig(every=2, sets=("novel_view", "novel_pose")),

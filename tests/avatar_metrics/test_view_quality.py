@@ -11,7 +11,7 @@ import torch
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.metrics.view_quality import ViewQuality, eight_bit, mean_quality, view_quality
-from tests.training.doll import doll
+from tests.dolls.standing import doll
 
 BLACK = torch.zeros(3)
 

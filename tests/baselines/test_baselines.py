@@ -22,7 +22,7 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.random_state import fixed_seed
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
-from tests.baselines.moving_doll import TORSO, open_moving, params, template
+from tests.dolls.swaying import TORSO, open_moving, params, template
 
 SAMPLING = SamplingConfig(count=500)
 KINDS = {

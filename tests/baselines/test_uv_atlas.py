@@ -8,7 +8,7 @@ import pytest
 from avatar.baselines.uv_atlas import REACH, _unrolled, cylinder_atlas
 from avatar.gaussians.binding import corner_weights
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from tests.baselines.moving_doll import template
+from tests.dolls.swaying import template
 
 SIZE = 64
 

@@ -12,7 +12,7 @@ from benchmarks import gpu
 from benchmarks.gpu import GpuBenchmark, run_part
 from benchmarks.on_gpu.parts import PARTS, Job, enlarge
 from smplxpp.capture import open_capture
-from tests.training.dancing_doll import write_dance, write_dance_run
+from tests.dolls.dancing import write_dance, write_dance_run
 
 NETWORK = ("MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE", "RANK", "LOCAL_RANK")
 

@@ -13,17 +13,7 @@ import torch
 from avatar.data.sequence import Item, SequenceConfig, camera_centers_of
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import (
-    HEIGHT,
-    HELD_OUT,
-    NOVEL_POSES,
-    TRAIN,
-    WIDTH,
-    dance,
-    sequence,
-    template,
-    write_dance,
-)
+from tests.dolls.dancing import HEIGHT, HELD_OUT, NOVEL_POSES, TRAIN, WIDTH, dance, sequence, template, write_dance
 
 TRAIN_FRAMES = (0, 1, 2, 3)
 

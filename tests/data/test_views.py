@@ -12,7 +12,7 @@ from PIL import Image
 from avatar.data.views import View, read_views
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import GeometryWarning, InputError
-from tests.training.doll import HELD_OUT, TRAIN, doll, write_capture
+from tests.dolls.standing import HELD_OUT, TRAIN, doll, write_capture
 
 
 @pytest.fixture

@@ -27,8 +27,7 @@ from avatar.rig.rig import Rig
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
-from tests.evaluation.standing_doll import OUT, Grown, opened, still
-from tests.training.doll import doll
+from tests.dolls.standing import OUT, Grown, doll, opened, still
 
 CONFIG = EvaluationConfig(
     protocol=ProtocolConfig(every=4), metric="none", samples=2000, speed_size=(24, 32), speed_pictures=2, shown=1

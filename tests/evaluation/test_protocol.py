@@ -9,8 +9,7 @@ from PIL import Image
 from avatar.evaluation.protocol import SETS, ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import GeometryWarning, InputError
-from tests.evaluation.standing_doll import NOVEL, opened, write_frames
-from tests.training.doll import HELD_OUT, TRAIN
+from tests.dolls.standing import HELD_OUT, NOVEL, TRAIN, opened, write_frames
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
 from avatar.models.teacher_avatar import map_frame
 from avatar.rig.rig import Rig
-from tests.training.dancing_doll import gaussians, template
+from tests.dolls.dancing import gaussians, template
 
 SIZE = 48
 

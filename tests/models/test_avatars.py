@@ -14,7 +14,8 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import HALF_EXTENT, TeacherAvatar, map_frame
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
+from tests.dolls.dancing import dance, gaussians, template, varied
+from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 
 EYES = torch.tensor([[0.0, 0.8, 2.0], [1.5, 0.2, -1.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8, jaw=True)

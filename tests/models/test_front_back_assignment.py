@@ -15,7 +15,7 @@ from avatar.models.teacher_avatar import map_frame
 from avatar.render.map_frame import MapFrame
 from avatar.render.mesh_maps import vertex_normals
 from avatar.rig.rig import Rig
-from tests.training.dancing_doll import template
+from tests.dolls.dancing import template
 
 SIZE = 256
 RADIUS = 0.6

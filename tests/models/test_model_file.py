@@ -17,7 +17,8 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, template, varied
+from tests.dolls.dancing import dance, gaussians, template, varied
+from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 
 EYES = torch.tensor([[0.0, 0.8, 2.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8)

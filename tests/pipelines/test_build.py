@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import re
 import shutil
 from dataclasses import dataclass, replace
@@ -30,24 +29,6 @@ from smplxpp.template.template import Template
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 PARAMS = FIXTURE / "params" / "params.npz"
 BUDGETS = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500, "outer": 400}
-
-
-@pytest.fixture(scope="session")
-def shared_folder(tmp_path_factory) -> Path:
-    """One folder for all workers of a parallel test run."""
-    base = tmp_path_factory.getbasetemp()
-    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-
-
-@pytest.fixture(scope="session")
-def person_run(shared_folder) -> Path:
-    """The fixture's whole build by the command line, made once; nobody changes it."""
-    run = shared_folder / "person"
-    with open(shared_folder / "person.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (run / "report.html").is_file():
-            assert main(["build", "--capture", str(FIXTURE), "--out", str(run), "--json"]) == 0
-    return run
 
 
 @dataclass(frozen=True)

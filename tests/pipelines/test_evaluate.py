@@ -36,8 +36,7 @@ from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
-from tests.evaluation.standing_doll import FRAMES, dressed, write_frames
-from tests.training.doll import HELD_OUT, doll
+from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
 from tools.overview import held_out_view
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -21,7 +21,7 @@ from pipelines.commands.progress import training_progress
 from pipelines.figures.comparison import read_strip
 from pipelines.runs.stage import SCHEMA, read_manifest
 from smplxpp.core.params import BodyParams
-from tests.training.doll import HELD_OUT, TRAIN, doll, write_capture, write_run
+from tests.dolls.standing import HELD_OUT, TRAIN, doll, write_capture, write_run
 
 SMALL = ("--gaussians", "1500", "--iterations", "12", "--device", "cpu", "--json")
 

@@ -21,7 +21,7 @@ from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from smplxpp.core.errors import InputError
-from tests.training.doll import HELD_OUT, TRAIN, write_capture, write_run
+from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 

@@ -20,8 +20,8 @@ from pipelines.figures.comparison import read_strip
 from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
 from smplxpp.core.errors import InputError
+from tests.dolls.dancing import HELD_OUT, template, write_dance, write_dance_run
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
-from tests.training.dancing_doll import HELD_OUT, template, write_dance, write_dance_run
 
 ROOT = Path(__file__).resolve().parents[2]
 MODELS = {

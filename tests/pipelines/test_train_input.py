@@ -17,18 +17,8 @@ from pipelines.runs.stage import read_manifest
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
+from tests.dolls.dancing import FRAMES, HEIGHT, HELD_OUT, TRAIN, WIDTH, dance, template, write_dance, write_dance_run
 from tests.pipelines.training_runs import refused, train
-from tests.training.dancing_doll import (
-    FRAMES,
-    HEIGHT,
-    HELD_OUT,
-    TRAIN,
-    WIDTH,
-    dance,
-    template,
-    write_dance,
-    write_dance_run,
-)
 
 
 @pytest.fixture(scope="module")

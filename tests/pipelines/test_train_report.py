@@ -13,8 +13,8 @@ from pipelines.report.sections.training import standing_trainings, training_key_
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.train_names import kind_name
 from smplxpp.core.spread import spread
+from tests.dolls.dancing import write_dance, write_dance_run
 from tests.pipelines.training_runs import STAGES, train
-from tests.training.dancing_doll import write_dance, write_dance_run
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from avatar.models.networks.presets import NetworkPreset
 from avatar.training.presets import TRAINING_PRESETS
 from avatar.training.tracking.track import Level, TrackConfig
 from pipelines.cli import main
-from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER
+from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 
 STAGES = ("80_teacher", "85_bake", "90_compensate")
 SMALL = (

@@ -12,7 +12,7 @@ from avatar.render.api import rasterize
 from avatar.render.avatar_view import render_view
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Rig
-from tests.training.dancing_doll import HEIGHT, WIDTH, cameras, dance, gaussians, template, varied
+from tests.dolls.dancing import HEIGHT, WIDTH, cameras, dance, gaussians, template, varied
 
 GREY = torch.tensor([0.2, 0.4, 0.6])
 

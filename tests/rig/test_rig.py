@@ -12,8 +12,8 @@ from threadpoolctl import ThreadpoolController
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from tests.dolls.dancing import FRAMES, dance, template
 from tests.export.templates import open_body_template, random_motion, random_template
-from tests.training.dancing_doll import FRAMES, dance, template
 
 RANDOM = random_template(joint_count=55, pose_correctives=True)
 MOTION = random_motion(3, expressions=3)

@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 
 from avatar.training.engine.loop import STATE_FILE, LoopConfig, run_training
 from avatar.training.engine.optimization_task import OptimiserConfig
-from tests.training.engine.toy import Toy
+from tests.dolls.toy import Toy
 
 STEPS = 330
 

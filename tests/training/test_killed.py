@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 
 from avatar.training.engine.loop import METRICS_FILE, STATE_FILE
 from avatar.training.engine.metrics_log import read_metrics
-from tests.training.engine.toy import same_state
+from tests.dolls.toy import same_state
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = Path(__file__).with_name("killed_training.py")

@@ -24,9 +24,10 @@ from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.track import Level
 from avatar.training.train import PRETRAIN, TRACK, Session, bake, fit_teacher
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, dance, gaussians, sequence, template, write_dance
+from tests.dolls.dancing import dance, gaussians, sequence, template, write_dance
+from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
+from tests.dolls.toy import copied, same_state
 from tests.training.engine.test_photometric_tasks import BAKE, TEACHER
-from tests.training.engine.toy import copied, same_state
 from tests.training.tracking.test_track import CONFIG as TRACKING
 
 CONFIG = PretrainConfig(iterations=40, batch=2, lr=1e-2)

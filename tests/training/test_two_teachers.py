@@ -15,7 +15,8 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.processes import Distributed, join_processes
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
-from tests.training.dancing_doll import TINY_TEACHER, gaussians, sequence, write_dance
+from tests.dolls.dancing import gaussians, sequence, write_dance
+from tests.dolls.tiny import TINY_TEACHER
 from tests.training.engine.test_photometric_tasks import STEPS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from avatar.models.networks.control_points import CLOTH_DENSITY, choose_control_points, template_control_points
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import template
+from tests.dolls.dancing import template
 
 
 def sheet(count: int = 200, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

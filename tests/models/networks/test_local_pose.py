@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar.models.networks.local_pose import MIN_SKIN_WEIGHT, seen_joints
-from tests.training.dancing_doll import template
+from tests.dolls.dancing import template
 
 
 def test_no_steps_are_the_joints_that_carry_a_vertex():

@@ -19,7 +19,7 @@ from avatar.training.engine.metrics_log import append_metrics, read_metrics, tru
 from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError, MissingExtraError
-from tests.training.engine.toy import Toy
+from tests.dolls.toy import Toy
 
 
 class Walk:

@@ -11,7 +11,7 @@ import torch
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.errors import InputError
-from tests.training.engine.toy import Toy, copied, same_state
+from tests.dolls.toy import Toy, copied, same_state
 
 CONFIG = OptimiserConfig(iterations=40)
 

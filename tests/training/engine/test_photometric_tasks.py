@@ -23,9 +23,10 @@ from avatar.training.student.distillation import DistillationTargets
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from smplxpp.core.errors import InputError
+from tests.dolls.dancing import gaussians, sequence, varied, write_dance
+from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
+from tests.dolls.toy import copied, same_state
 from tests.losses.test_reconstruction import MeanDifference
-from tests.training.dancing_doll import TINY_FIELD, TINY_TEACHER, gaussians, sequence, varied, write_dance
-from tests.training.engine.toy import copied, same_state
 
 WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 STEPS = {"iterations": 6, "views": 2, "weights": WEIGHTS, "evaluations": 2, "evaluated": 1}

@@ -17,7 +17,7 @@ from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import OptimiserConfig
 from avatar.training.engine.processes import Distributed, join_processes
 from smplxpp.core.errors import InputError
-from tests.training.engine.toy import Toy, same_state
+from tests.dolls.toy import Toy, same_state
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = Path(__file__).with_name("two_processes.py")

@@ -24,7 +24,7 @@ from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.optimization_task import OptimiserConfig
 from avatar.training.engine.processes import Distributed, join_processes
 from smplxpp.core.errors import InputError
-from tests.training.engine.toy import Toy
+from tests.dolls.toy import Toy
 
 CONFIG = OptimiserConfig(iterations=20)
 

@@ -20,7 +20,7 @@ from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitScene, FitTask, fit_reference
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from tests.training.doll import HELD_OUT, TRAIN, doll
+from tests.dolls.standing import HELD_OUT, TRAIN, doll
 
 CONFIG = FitConfig(sampling=SamplingConfig(count=2500), iterations=60, evaluations=3, margin=4)
 

@@ -8,7 +8,8 @@ import torch
 from avatar.data.views import View
 from avatar.training.reference_fit.initial_colors import colors_from_views
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from tests.training.doll import TRAIN, doll, paint
+from tests.dolls.doll import paint
+from tests.dolls.standing import STRIPES, TRAIN, doll
 
 
 def views(*names: str) -> list[View]:
@@ -25,7 +26,7 @@ def test_points_take_the_colour_they_are_painted_in():
     mesh, points, normals = surface()
     colors, seen = colors_from_views(points, normals, torch.zeros(len(points), 3), mesh=mesh, views=views(*TRAIN))
     assert 0.7 < seen.mean() < 1.0  # soles and top face no camera
-    error = np.abs(colors.numpy()[seen] - paint(points[seen])).max(1)
+    error = np.abs(colors.numpy()[seen] - paint(points[seen], STRIPES)).max(1)
     assert np.percentile(error, 95) < 0.06 and error.max() < 0.2
     assert colors.dtype == torch.float32
 

@@ -7,7 +7,7 @@ import torch
 
 from avatar.data.sequence import camera_centers_of
 from avatar.training.student.distillation import DistillationTargets
-from tests.training.dancing_doll import sequence, write_dance
+from tests.dolls.dancing import sequence, write_dance
 from tests.training.engine.test_photometric_tasks import taught
 
 

@@ -16,8 +16,9 @@ from avatar.models.networks.teacher import local_offsets
 from avatar.models.student import Student, StudentConfig
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.training.student.init_blend_shapes import _components, init_blend_shapes
-from tests.training.dancing_doll import TINY_FIELD, dance, gaussians, sequence, varied, write_dance
-from tests.training.engine.toy import copied, same_state
+from tests.dolls.dancing import dance, gaussians, sequence, varied, write_dance
+from tests.dolls.tiny import TINY_FIELD
+from tests.dolls.toy import copied, same_state
 
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=16, jaw=True)
 EYE = torch.tensor([[0.0, 0.8, 2.0]])

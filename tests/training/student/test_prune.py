@@ -12,7 +12,8 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.training.student.prune import coefficient_std, pruned_to
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import TINY_FIELD, gaussians, sequence, write_dance
+from tests.dolls.dancing import gaussians, sequence, write_dance
+from tests.dolls.tiny import TINY_FIELD
 
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=8, body_shapes=20, width=8, jaw=True)
 

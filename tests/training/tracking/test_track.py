@@ -20,8 +20,9 @@ from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.track import Level, TrackConfig, TrackTask
 from avatar.training.train import Session, fit_teacher, follow_surface
 from smplxpp.core.errors import InputError
-from tests.training.dancing_doll import TINY_TEACHER, gaussians, sequence, template, true_vertices, write_dance
-from tests.training.engine.toy import copied, same_state
+from tests.dolls.dancing import gaussians, sequence, template, true_vertices, write_dance
+from tests.dolls.tiny import TINY_TEACHER
+from tests.dolls.toy import copied, same_state
 
 CONFIG = TrackConfig(
     levels=(Level(1, 8, 1e-2), Level(0, 8, 6e-3)),
