@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.errors import InputError
 
 
@@ -33,14 +32,17 @@ class PhotographConfig(PhotometricConfig):
 class PhotographTask(PhotometricTask):
     """`L_rec` of a baseline's renderings against photographs."""
 
-    def __init__(self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, **options: Any) -> None:
+    config: PhotographConfig
+
+    def __init__(
+        self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, context: TaskContext = ALONE
+    ) -> None:
         groups = model.groups(config.lr, config.lr_final_factor)
-        super().__init__(sequence, model, config, groups, **options)
+        super().__init__(sequence, model, config, groups, context)
         for group in groups:
             # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
             for value in group.parameters.values():
                 value.requires_grad_(True)
-        self.config = config
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Of one frame."""

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -94,6 +95,26 @@ class Rig:
             rest=self._tensor(rest),
             world_from_rest=self._tensor(blended.reshape(-1, 3, 4)),
             root_from_world=self._tensor(np.linalg.inv(transforms[0])),
+        )
+
+    def motion_to(self, vertices: Float[np.ndarray, "V 3"]) -> Motion:
+        """Make the motion whose posed mesh is `vertices`, metres, to the bit: its T-pose, which skinning leaves alone.
+
+        Raises:
+            InputError: vertices of another number than the template's.
+        """
+        if vertices.shape != self.vertices.shape:
+            raise InputError(
+                "posed vertices", expected=f"shape {tuple(self.vertices.shape)}", received=str(vertices.shape)
+            )
+        return Motion(
+            None,
+            pose=torch.zeros(THETA, device=self.device),
+            expression=torch.zeros(self.expression_size, device=self.device),
+            jaw=torch.zeros(3, device=self.device),
+            rest=self._tensor(vertices),
+            world_from_rest=torch.eye(3, 4, device=self.device).expand(len(vertices), 3, 4),
+            root_from_world=torch.eye(4, device=self.device),
         )
 
     def pose(self, motion: Motion, displacements: Tensor | None = None) -> Tensor:

@@ -239,7 +239,7 @@ class BaselinePiece(Piece):
         sequence = shop.sequence(self.ground)
         with fixed_seed(self.config.seed):
             model = self._untrained(shop, get)
-        progress = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
+        progress = session.run(lambda: PhotographTask(sequence, model, self.config, session.context), self.config)
         return model.eval(), progress
 
     def write(self, product: Baseline, path: Path, *, compact: bool = False) -> None:

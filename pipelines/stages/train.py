@@ -259,7 +259,7 @@ def _compensate(training: Training) -> StageRecord:
         needs,
         work,
         lambda folder, model, sequence, session: write_student(
-            folder, model, sequence, preset.compensate, max_bytes=max_bytes, options=session.options
+            folder, model, sequence, preset.compensate, max_bytes=max_bytes, context=session.context
         ),
     )
 

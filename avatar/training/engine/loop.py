@@ -113,7 +113,7 @@ def run_training(
             diverged (`DivergedError`), and the last checkpoint is kept.
         MissingExtraError: a log for TensorBoard without tensorboard.
     """
-    together = task.distributed
+    processes = task.distributed
     state, metrics = folder / STATE_FILE, folder / METRICS_FILE
     sinks: list[Callable[[Mapping[str, Any]], None]] = [partial(append_metrics, metrics)]
     logged: Mapping[str, Any] = {}
@@ -147,25 +147,25 @@ def run_training(
     with explain_resource_errors(folder), ExitStack() as stack:
         done, spent_before = _begin(task, state, metrics, key)
         first, spent, unsaved = done, 0.0, 0.0
-        together.run_on_rank0(open_events)
+        processes.run_on_rank0(open_events)
         if not done:
-            together.run_on_rank0(evaluate)
+            processes.run_on_rank0(evaluate)
         while done < config.iterations and spent < config.max_seconds:
             begin = time.perf_counter()
             values = task.step(done)
-            took = together.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
+            took = processes.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
             done, spent, unsaved = done + 1, spent + took, unsaved + took
             last = done == config.iterations
             if done % config.log_every == 0 or last:
                 logged = values
-                together.run_on_rank0(log_step)
+                processes.run_on_rank0(log_step)
             if done % config.evaluate_every == 0 or last:
-                together.run_on_rank0(evaluate)
+                processes.run_on_rank0(evaluate)
             if unsaved >= config.checkpoint_seconds and not last:
-                together.run_on_rank0(save)
+                processes.run_on_rank0(save)
                 unsaved = 0.0
         if done < config.iterations or (config.keep_end and done > first):
-            together.run_on_rank0(save)
+            processes.run_on_rank0(save)
         return progress()
 
 

@@ -16,7 +16,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.training.engine.loop import LoopConfig, run_training
-from avatar.training.engine.photometric_task import pixel_size
+from avatar.training.engine.photometric_task import TaskContext, pixel_size
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.distillation import DistillationTargets
@@ -110,7 +110,7 @@ def test_the_bakes_semantic_term_is_zero_for_equal_geometry(frames):
     student = Student(STUDENT, frames.rig, teacher.gaussians.snapshot(), frames.train_frames)
     task = BakeTask(frames, student, replace(BAKE, null_share=0.0, pose_noise=0.0, attributes=0.5), teacher=teacher)
     _, terms = task.loss(task.micro_batches(0)[0])
-    assert terms["semantic"] < 1e-3  # lessons are kept in half precision
+    assert terms["semantic"] < 1e-3  # targets are kept in half precision
     assert terms["nonrigid"] < 1e-5 and terms["l1"] < 2e-3
 
 
@@ -220,7 +220,7 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
     config = replace(TEACHER, weights=weights, perceptual_every=2, view_jitter=0.0)
-    task = TeacherTask(frames, teacher, config, perceptual=MeanDifference())
+    task = TeacherTask(frames, teacher, config, TaskContext(perceptual=MeanDifference()))
     for k, weight in ((0, 0.5), (1, 0.0)):
         total, terms = task.loss(task.micro_batches(k)[0])
         assert ("perceptual" in terms) == bool(weight)
@@ -229,7 +229,7 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
 
 def test_held_out_views_and_poses_are_measured_and_shown(frames):
     shown = {}
-    task = CompensateTask(frames, make("compensate", frames).student, COMPENSATE, preview=shown.update)
+    task = CompensateTask(frames, make("compensate", frames).student, COMPENSATE, TaskContext(preview=shown.update))
     figures = task.evaluate(0)
     assert set(figures) == {"mean", "novel_view", "novel_pose"} and figures["mean"] == figures["novel_view"]
     assert set(shown) == {"Held0 2", "Held0 5"}
