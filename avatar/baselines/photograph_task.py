@@ -9,6 +9,7 @@ from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.errors import InputError
 
@@ -39,6 +40,8 @@ class PhotographTask(PhotometricTask):
     ) -> None:
         groups = model.groups(config.lr, config.lr_final_factor)
         super().__init__(sequence, model, config, groups, context)
+        if config.null_share:
+            show_null_code(model)
         for group in groups:
             # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
             for value in group.parameters.values():

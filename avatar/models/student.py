@@ -119,6 +119,7 @@ class Student(nn.Module):
         if self.field is not None:
             other.field.load_state_dict(self.field.state_dict())
             other.codes.load_state_dict(self.codes.state_dict())
+            other.codes.null_code_shown = self.codes.null_code_shown
         return other
 
 

@@ -11,6 +11,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -172,6 +173,8 @@ def bake(
         if not progress.finished:
             return made.eval(), progress
         session = session.after(progress)
+        if config.null_share or config.imagined:
+            show_null_code(made)  # on the processes that only waited for the pretraining, too
     progress = session.run(lambda: BakeTask(sequence, made, config, session.context, teacher=teacher), config)
     return made.eval(), progress
 

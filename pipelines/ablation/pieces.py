@@ -21,6 +21,7 @@ from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -255,7 +256,10 @@ class BaselinePiece(Piece):
 
     def _untrained(self, shop: Workshop, get: Get) -> Baseline:
         sequence = shop.sequence(self.ground)
-        return make_baseline(self.model, sequence.rig, get(self.gaussians), sequence.train_frames)
+        model = make_baseline(self.model, sequence.rig, get(self.gaussians), sequence.train_frames)
+        if self.config.null_share:
+            show_null_code(model)
+        return model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Motion
@@ -85,6 +86,8 @@ class BakeTask(PhotometricTask):
             ]
         super().__init__(sequence, student, config, groups, context)
         self.student, self.targets = student, None
+        if config.null_share:
+            show_null_code(student)
         if teacher is not None:
             self.targets = DistillationTargets(
                 teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)

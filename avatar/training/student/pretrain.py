@@ -12,6 +12,7 @@ from torch import Tensor
 from avatar.data.byte_cache import ByteCache
 from avatar.data.sequence import AvatarSequence
 from avatar.models.front_back_assignment import assign_front_back
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -60,6 +61,8 @@ class PretrainFieldTask(PretrainTask):
         super().__init__(groups, config, len(frames) + imagined, seed)
         self.sequence, self.student, self.teacher = sequence, student, teacher
         self.null_share = null_share
+        if null_share or imagined:
+            show_null_code(student)
         self._lookup = _MapLookup(teacher, student.field.points)
         self._known = ByteCache(KNOWN_BYTES)
         self.iteration = 0

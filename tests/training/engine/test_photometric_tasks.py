@@ -317,3 +317,24 @@ def test_half_precision_is_the_networks_alone(frames):
     assert torch.equal(half.positions, exact.positions) and torch.equal(half_centre, centre)
     assert (half.cosines is None) == (exact.cosines is None)
     assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)
+
+
+def test_a_normal_loss_without_normal_maps_is_told_once(frames, caplog):
+    steps(make("compensate", frames), 3)
+    told = [record.getMessage() for record in caplog.records if "normal" in record.getMessage()]
+    assert len(told) == 1 and "no normal map" in told[0] and "0.02" in told[0]
+    caplog.clear()
+    steps(make("compensate", frames, weights=replace(WEIGHTS, normal=0.0)), 1)
+    assert not caplog.records
+
+
+def test_a_normal_loss_with_normal_maps_tells_nothing(frames, caplog, monkeypatch):
+    view = type(frames).view
+
+    def with_normals(self, camera, frame):
+        seen = view(self, camera, frame)
+        return replace(seen, normals=torch.ones((*seen.alpha.shape, 3), dtype=torch.float16))
+
+    monkeypatch.setattr(type(frames), "view", with_normals)
+    assert steps(make("compensate", frames), 1)[0]["normal"] > 0
+    assert not caplog.records
