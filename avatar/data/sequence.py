@@ -18,6 +18,7 @@ from avatar.rig.rig import Motion, Rig
 from smplxpp.capture import Capture
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread_inside
 from smplxpp.core.validation import require_at_least
 from smplxpp.template.template import Template
@@ -209,7 +210,12 @@ class AvatarSequence:
             chosen.append(names[_shuffled((seed, 1, frame, cycle), len(names))[place]])
         return tuple(chosen)
 
-    def _read_motion(self, frame: int) -> Motion:
+    def params(self, frame: int) -> BodyParams:
+        """Return the body parameters of a frame.
+
+        Raises:
+            InputError: none of it.
+        """
         params = self.capture.params(frame)
         if params is None:
             raise InputError(
@@ -218,7 +224,10 @@ class AvatarSequence:
                 received="none",
                 remedy="leave the frame out, or name a file with --params",
             )
-        return self.rig.motion(params, frame=frame if frame in self.train_frames else None)
+        return params
+
+    def _read_motion(self, frame: int) -> Motion:
+        return self.rig.motion(self.params(frame), frame=frame if frame in self.train_frames else None)
 
     def _read_view(self, camera: str, frame: int) -> View:
         whole = read_view(self.capture, camera, frame, normals=self.config.normals)

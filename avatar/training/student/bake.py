@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
@@ -13,6 +14,7 @@ from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.render.avatar_view import Rendering
 from avatar.rig.rig import Motion
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
@@ -77,7 +79,7 @@ class BakeTask(PhotometricTask):
         teacher: TeacherAvatar | None = None,
     ) -> None:
         groups = []
-        if student.field is not None:
+        if student.field is not None and student.codes is not None:
             groups = [
                 ParameterGroup("field", dict(student.field.named_parameters()), config.lr, config.lr_final_factor),
                 ParameterGroup(
@@ -100,7 +102,7 @@ class BakeTask(PhotometricTask):
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame and its terms."""
-        motion = self._seen(self.sequence.motion(item.frame))
+        motion = self._seen(self.sequence.motion(item.frame), item.frame)
         views = self.views(item)
         posed = self.student(motion, camera_centers_of(views))
         if self.targets is None:
@@ -112,7 +114,7 @@ class BakeTask(PhotometricTask):
         total, terms, renderings = self.compared(posed, views, targets, extra=self.labels if semantic else None)
         if semantic:
             pairs = zip(renderings, shown, strict=True)
-            differences = [(drawn.extra - one.labels).abs().mean() for drawn, one in pairs]
+            differences = [(_labels(drawn) - one.labels).abs().mean() for drawn, one in pairs]
             terms["semantic"] = float(torch.stack(differences).mean().detach())
             total = total + self.config.semantic * torch.stack(differences).mean()
         if self.config.nonrigid and posed.displacements is not None:
@@ -121,12 +123,18 @@ class BakeTask(PhotometricTask):
             total = total + self.config.nonrigid * nonrigid
         return total, {"loss": float(total.detach()), **terms}
 
-    def _seen(self, motion: Motion) -> Motion:
+    def _seen(self, motion: Motion, frame: int) -> Motion:
         """Return the pose as the field is shown it."""
-        noise = self.generator(motion.frame)
+        noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
             motion = motion.without_code()
         if self.config.pose_noise:
             moved = torch.tensor(noise.normal(size=len(motion.pose)) * self.config.pose_noise)
             motion = replace(motion, pose=motion.pose + moved.to(motion.pose))
         return motion
+
+
+def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:
+    """Return the semantic map that was drawn with an image."""
+    assert rendering.extra is not None
+    return rendering.extra

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
@@ -28,11 +29,11 @@ class DistillationTarget:
     """What the student is to imitate in one view.
 
     Attributes:
-        target: the teacher's image, opacity and, if asked for, normals. labels: (H, W, 3) its semantic map.
+        target: the teacher's image, opacity and, if asked for, normals. labels: its semantic map.
     """
 
     target: Target
-    labels: Tensor
+    labels: Float[Tensor, "H W 3"]
 
 
 class DistillationTargets:
@@ -40,7 +41,7 @@ class DistillationTargets:
 
     Args:
         teacher: its weights are not changed. sequence: of the frames.
-        background: (3,) behind the person. eps2d: see `rasterize`.
+        eps2d: see `rasterize`.
         tau: of the semantic labels. normals: whether targets have them.
         max_bytes: of what is kept.
     """
@@ -60,8 +61,8 @@ class DistillationTargets:
         self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
         self._kept = ByteCache(max_bytes)
 
-    def displacements(self, frame: int) -> Tensor:
-        """(2, R, R, 3) metres, the teacher's position maps dU of a frame; the surface itself where it was followed."""
+    def displacements(self, frame: int) -> Float[Tensor, "2 R R 3"]:
+        """Return the teacher's position maps dU of a frame, metres; the surface itself where it was followed."""
 
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
@@ -95,8 +96,9 @@ class DistillationTargets:
         seen = render_view(
             posed, index, view, self.sequence.background, eps2d=self.eps2d, normals=self.normals, extra=self.labels
         )
+        assert seen.extra is not None
         tensors = [seen.image, seen.alpha, seen.extra]
-        if self.normals:
+        if seen.normals is not None:
             tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
         return tuple(tensor.half() for tensor in tensors)
 
