@@ -131,7 +131,7 @@ class AvatarSequence:
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
 
     def motion(self, frame: int) -> Motion:
-        """The pose of a frame; it has the frame's number if training sees the frame, else the null code.
+        """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.
 
         Raises:
             InputError: no parameters of it.
@@ -144,12 +144,12 @@ class AvatarSequence:
         return self._motions[frame]
 
     def view(self, camera: str, frame: int) -> View:
-        """A training view, cut to the silhouette."""
+        """Return a training view, cut to the silhouette."""
         expected = self._expected.pop((camera, frame), None)
         return (self._read_view(camera, frame) if expected is None else expected.result()).to(self.device)
 
     def whole_view(self, camera: str, frame: int) -> View:
-        """All pixels of a view, of any camera and frame of the capture; not cached."""
+        """Return all pixels of a view, of any camera and frame of the capture; not cached."""
         return read_view(self.capture, camera, frame).to(self.device)
 
     def measured_views(self, frames: int) -> Iterator[MeasuredView]:
@@ -201,7 +201,7 @@ class AvatarSequence:
         return out
 
     def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
-        """Training cameras for a visit of a frame: visit after visit every camera comes equally often."""
+        """Return training cameras for a visit of a frame: visit after visit every camera comes equally often."""
         names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
         views = min(views, len(names))
         chosen = []

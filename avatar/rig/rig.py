@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -27,22 +27,22 @@ class Motion:
 
     Attributes:
         frame: number of the training frame whose code the student takes; None for the null code.
-        pose: (63,) theta, radians. expression: (E,). jaw: (3,) axis-angle, radians.
-        rest: (V, 3) T-pose with this frame's expression and pose correctives, metres.
-        world_from_rest: (V, 3, 4) blended transforms of the vertices.
-        root_from_world: (4, 4) takes the root's motion away.
+        pose: theta, radians. expression: coefficients. jaw: axis-angle, radians.
+        rest: T-pose with this frame's expression and pose correctives, metres.
+        world_from_rest: blended transforms of the vertices.
+        root_from_world: takes the root's motion away.
     """
 
     frame: int | None
-    pose: Tensor
-    expression: Tensor
-    jaw: Tensor
-    rest: Tensor
-    world_from_rest: Tensor
-    root_from_world: Tensor
+    pose: Float32[Tensor, " 63"]
+    expression: Float32[Tensor, " E"]
+    jaw: Float32[Tensor, " 3"]
+    rest: Float32[Tensor, "V 3"]
+    world_from_rest: Float32[Tensor, "V 3 4"]
+    root_from_world: Float32[Tensor, "4 4"]
 
     def without_code(self) -> Motion:
-        """The same pose, driven by the null code."""
+        """Return the same pose, driven by the null code."""
         return replace(self, frame=None)
 
 
@@ -65,10 +65,11 @@ class Rig:
 
     @property
     def expression_size(self) -> int:
+        """Number of the template's expression coefficients."""
         return self.template.expression_basis.shape[2]
 
     def motion(self, params: BodyParams, *, frame: int | None = None) -> Motion:
-        """What one pose does to the template.
+        """Return what one pose does to the template.
 
         Args:
             params: one frame. frame: its number, where the student has a code for it.
@@ -117,14 +118,11 @@ class Rig:
             root_from_world=torch.eye(4, device=self.device),
         )
 
-    def pose(self, motion: Motion, displacements: Tensor | None = None) -> Tensor:
-        """Vertices in the world, `x = (sum_j w_j G_j) (v + dv)`.
+    def pose(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"]:
+        """Return the vertices in the world, metres, `x = (sum_j w_j G_j) (v + dv)`.
 
         Args:
-            displacements: (V, 3) dv, metres along the axes of the T-pose; gradients reach them.
-
-        Returns:
-            (V, 3) metres.
+            displacements: dv, metres along the axes of the T-pose; gradients reach them.
         """
         rest = motion.rest if displacements is None else motion.rest + displacements
         return _Skinning.apply(rest, motion.world_from_rest)

@@ -16,12 +16,12 @@ from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.optimization_task import OptimizationTask
 from avatar.training.engine.photometric_task import PhotometricConfig, Preview, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.random_state import fixed_seed
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.init_blend_shapes import init_blend_shapes
@@ -89,11 +89,11 @@ class Session:
         return processes.run_on_rank0(lambda: self.run(make, config, keep_end=True))
 
     def within(self, name: str) -> Session:
-        """The same in a folder of its own, without previews."""
+        """Return the same in a folder of its own, without previews."""
         return replace(self, folder=self.folder / name, preview=lambda images: None)
 
     def after(self, progress: Progress) -> Session:
-        """What is left of the time after a training that came first."""
+        """Return the session with what is left of the time after a training that came first."""
         return replace(self, max_seconds=max(self.max_seconds - progress.session_seconds, 0.0))
 
 
@@ -131,7 +131,7 @@ def fit_teacher(
 def follow_surface(
     sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
 ) -> tuple[Track, Progress]:
-    """Displacements of every training frame, one frame after the other.
+    """Find the displacements of every training frame, one frame after the other.
 
     Steps have one frame each: of several processes the first follows it, and the others hear what it found.
     """

@@ -26,8 +26,8 @@ from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Rig
+from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.random_state import fixed_seed
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitScene, fit_reference
 from avatar.training.student.bake import BakeConfig

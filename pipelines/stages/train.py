@@ -23,7 +23,7 @@ from avatar.rig.posed import AvatarModel
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_resource_errors
+from avatar.training.engine.resources import explain_resource_errors
 from avatar.training.presets import LOCAL, TrainingPreset
 from avatar.training.train import Session, bake, compensate, fit_teacher
 from pipelines.runs.digests import code_digest, sha256_file

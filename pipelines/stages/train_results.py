@@ -18,9 +18,9 @@ from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
-from avatar.training.engine.memory import peak_memory
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.photometric_task import TaskContext
+from avatar.training.engine.resources import peak_memory
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.prune import pruned_to
 from avatar.training.train import PRETRAIN, TRACK

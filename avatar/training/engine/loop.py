@@ -13,10 +13,9 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.metrics_log import append_metrics, truncate_metrics
+from avatar.training.engine.metrics_log import TensorboardLog, append_metrics, truncate_metrics
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_resource_errors
-from avatar.training.engine.tensorboard_log import TensorboardLog
+from avatar.training.engine.resources import explain_resource_errors
 
 STATE_FILE = "state.safetensors"
 METRICS_FILE = "metrics.jsonl"
@@ -33,13 +32,13 @@ class Task(Protocol):
     distributed: Distributed
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """Step number `iteration`, counted from 0; its metrics."""
+        """Take step number `iteration`, counted from 0; return its metrics."""
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Figures of the state after `iteration` steps, as JSON values."""
+        """Return figures of the state after `iteration` steps, as JSON values."""
 
     def state(self) -> Mapping[str, Tensor]:
-        """All that the next step depends on."""
+        """Return all that the next step depends on."""
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take what `state` gave."""
@@ -89,6 +88,7 @@ class Progress:
 
     @property
     def finished(self) -> bool:
+        """Whether all steps are done."""
         return self.iteration >= self.iterations
 
 

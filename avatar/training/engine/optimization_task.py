@@ -13,6 +13,7 @@ from torch import Tensor
 
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
 Batch = TypeVar("Batch")
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
@@ -47,19 +48,13 @@ class OptimiserConfig:
     amp: bool = False
 
     def __post_init__(self) -> None:
-        if self.schedule not in ("cosine", "exponential", "constant"):
-            raise InputError(
-                "optimiser: schedule", expected="cosine, exponential or constant", received=repr(self.schedule)
-            )
-        for name, value, fits, expected in (
-            ("iterations", self.iterations, self.iterations >= 1, "a number, at least 1"),
-            ("warmup", self.warmup, 0 <= self.warmup < math.inf, "a number of steps, at least 0"),
-            ("betas", self.betas, all(0.0 <= beta < 1.0 for beta in self.betas), "two numbers in [0, 1)"),
-            ("eps", self.eps, 0.0 < self.eps < math.inf, "a positive number"),
-            ("max_grad_norm", self.max_grad_norm, self.max_grad_norm > 0.0, "a positive number"),
-        ):
-            if not fits:
-                raise InputError(f"optimiser: {name}", expected=expected, received=repr(value))
+        require_choice("optimiser: schedule", self.schedule, ("cosine", "exponential", "constant"))
+        require_at_least("optimiser: iterations", self.iterations, 1)
+        require_at_least("optimiser: warmup", self.warmup, 0)
+        require_positive("optimiser: eps", self.eps)
+        require_positive("optimiser: max_grad_norm", self.max_grad_norm, finite=False)
+        if not all(0.0 <= beta < 1.0 for beta in self.betas):
+            raise InputError("optimiser: betas", expected="two numbers in [0, 1)", received=repr(self.betas))
 
     def lr_factor(self, iteration: int, lr_final_factor: float) -> float:
         """Return the share of a rate that is left at a step counted from 0."""
@@ -87,8 +82,7 @@ class ParameterGroup:
 
     def __post_init__(self) -> None:
         assert all(value.is_leaf and value.requires_grad for value in self.parameters.values()), self.name
-        if not 0.0 < self.lr < math.inf:
-            raise InputError(f"learning rate {self.name}", expected="a positive number", received=repr(self.lr))
+        require_positive(f"learning rate {self.name}", self.lr)
         if not 0.0 < self.lr_final_factor <= 1.0:
             raise InputError(
                 f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.lr_final_factor)
@@ -224,7 +218,7 @@ def _diverged(iteration: int, item: str) -> DivergedError:
 
 
 def _means(outcomes: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of every number over the outcomes that have it, in the order of first appearance."""
+    """Return the mean of every number over the outcomes that have it, in the order of first appearance."""
     columns: dict[str, list[float]] = {}
     for figures in outcomes:
         for name, value in figures.items():

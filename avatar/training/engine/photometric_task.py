@@ -18,10 +18,10 @@ from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
-from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
+from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.render.avatar_view import Rendering, render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar
-from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.validation import require_at_least
@@ -257,35 +257,3 @@ class PhotometricTask(OptimizationTask[Item]):
 def photograph(view: View, background: Tensor) -> Target:
     """Return the view's own pixels as what a rendering should look like."""
     return Target(view.composited(background), view.opacity(), view.normals)
-
-
-def attribute_groups(
-    gaussians: LearnedGaussians, multiple: float, pixel: float, rates: LearningRates
-) -> list[ParameterGroup]:
-    """Return groups of the Gaussians' attributes at `multiple` times `rates`; none for 0, which freezes them.
-
-    Args:
-        pixel: metres, the unit of the offsets' rates.
-    """
-    if not multiple:
-        gaussians.requires_grad_(False)
-        return []
-    unit = {"normal_offset": pixel, "offset": pixel}
-    gaussians.requires_grad_(True)
-    return [
-        ParameterGroup(
-            f"gaussians.{name}",
-            {name: getattr(gaussians, name)},
-            multiple * getattr(rates, name) * unit.get(name, 1.0),
-            rates.lr_final_factor,
-        )
-        for name in LEARNED
-        if getattr(gaussians, name).numel()
-    ]
-
-
-def pixel_size(sequence: FrameSequence) -> float:
-    """Return the metres that a pixel covers at the person: median over the training cameras of `distance / f`."""
-    center = sequence.person_center()
-    cameras = [sequence.camera(name) for name in sequence.train_cameras]
-    return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.models.student import Student
+from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import (
     ALONE,
     PhotometricConfig,
     PhotometricTask,
     TaskContext,
-    pixel_size,
 )
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_between

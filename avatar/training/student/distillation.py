@@ -73,7 +73,7 @@ class DistillationTargets:
 
     @cached_property
     def _maps(self) -> MeshMapsTensor:
-        """The T-pose's, as large as the teacher's."""
+        """Maps of the T-pose, as large as the teacher's."""
         rig, teacher = self.sequence.rig, self.teacher
         return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
 

@@ -15,8 +15,9 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
+from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import LoopConfig, run_training
-from avatar.training.engine.photometric_task import TaskContext, pixel_size
+from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.distillation import DistillationTargets
