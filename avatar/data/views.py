@@ -62,7 +62,7 @@ class View:
 
     def photograph(self, background: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
         """Return the composited image, to look at."""
-        return (self.composited(torch.tensor(background)) * 255.0).round().to(torch.uint8).numpy()
+        return (self.composited(torch.tensor(background, dtype=torch.float32)) * 255.0).round().to(torch.uint8).numpy()
 
     def cropped(self, margin: int) -> View:
         """Only the silhouette's bounding box and `margin` pixels around it; the principal point moves with it.
