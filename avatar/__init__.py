@@ -8,6 +8,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from smplxpp.native import let_workers_sleep
+
+let_workers_sleep()
 _EXPORTS: dict[str, str] = {
     "AvatarSequence": "avatar.data.sequence",
     "BoundGaussians": "avatar.gaussians",

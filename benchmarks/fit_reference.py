@@ -18,9 +18,13 @@ from typing import Any
 import torch
 import tyro
 
+from avatar.data.one_frame import FRAME
+from avatar.data.sequence import camera_centers_of
 from avatar.data.views import read_views
 from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.sampling import SamplingConfig
+from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.reference_fit.config import PRESETS, FitConfig
@@ -102,22 +106,23 @@ def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
         times.setdefault(name, []).append(1e3 * (time.perf_counter() - begin))
         return out
 
-    parameters = list(task.parameters.values())
+    rest = task.sequence.motion(FRAME).rest
+    parameters = list(task.learned.values())
     for k in range(WARM_UP + TIMED):
-        view = task.train[task.view_index(k)]
-        bound = replace(task.start, **task.parameters)
+        views = task.views(task.micro_batches(k)[0])
+        bound = task.student.gaussians()
         world = timed("binding, forward", lambda b=bound: world_from_frames(b, task.frames))
-        colors = timed("colours, forward", lambda b=bound, w=world, v=view: task.colors(b, w, v))
+        colors = timed(
+            "colours, forward",
+            lambda b=bound, w=world, v=views: view_colors(b, task.frames, w.means.detach(), camera_centers_of(v)),
+        )
         outputs = [*(getattr(world, name) for name in WORLD), colors]
         # Cut the graph, so that each part's backward pass can be timed by itself.
         leaves = [value.detach().requires_grad_() for value in outputs]
         placed = replace(world, **dict(zip(WORLD, leaves, strict=False)))
-        drawn = timed("rasteriser, forward", lambda p=placed, c=leaves[-1], v=view: task.draw(p, c, v))
-        loss = timed("loss, forward", lambda v=view, d=drawn: task.compare(v, *d)[0])
-        grads = timed(
-            "loss, backward", lambda x=loss, d=drawn: torch.autograd.grad(x, [*d, *parameters], allow_unused=True)
-        )
-        pulled = timed("rasteriser, backward", lambda d=drawn, v=leaves, g=grads[:2]: torch.autograd.grad(d, v, g))
+        posed = PosedAvatar(rest, placed, leaves[-1], bound)
+        loss = timed("rasteriser and loss, forward", lambda p=posed, v=views: task.penalised(p, v)[0])
+        pulled = timed("rasteriser and loss, backward", lambda x=loss, v=leaves: torch.autograd.grad(x, v))
         timed("binding and colours, backward", lambda o=outputs, g=pulled: torch.autograd.grad(o, parameters, g))
         for value in parameters:
             value.grad = torch.zeros_like(value)  # the optimiser's work does not depend on the values

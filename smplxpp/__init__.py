@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from smplxpp.native import let_workers_sleep
+
+let_workers_sleep()
 _EXPORTS: dict[str, str] = {
     "BodyModel": "smplxpp.body",
     "BodyParams": "smplxpp.core",

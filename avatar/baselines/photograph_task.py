@@ -9,9 +9,8 @@ from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
-from avatar.losses.perceptual import PerceptualDistance
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask, Preview
-from avatar.training.engine.processes import Distributed
+from avatar.models.networks.deformation_field import show_null_code
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.validation import require_between
 
 
@@ -36,19 +35,12 @@ class PhotographTask(PhotometricTask):
     config: PhotographConfig
 
     def __init__(
-        self,
-        sequence: AvatarSequence,
-        model: Baseline,
-        config: PhotographConfig,
-        *,
-        perceptual: PerceptualDistance | None = None,
-        distributed: Distributed | None = None,
-        preview: Preview = lambda images: None,
+        self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, context: TaskContext = ALONE
     ) -> None:
         groups = model.groups(config.lr, config.lr_final_factor)
-        super().__init__(
-            sequence, model, config, groups, perceptual=perceptual, distributed=distributed, preview=preview
-        )
+        super().__init__(sequence, model, config, groups, context)
+        if config.null_share:
+            show_null_code(model)
         for group in groups:
             # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
             for value in group.parameters.values():

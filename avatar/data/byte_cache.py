@@ -25,7 +25,7 @@ class ByteCache:
         return key in self._kept
 
     def get(self, key: Hashable, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """What is kept under the key, or what `make` gives, without gradients."""
+        """Return what is kept under the key, or what `make` gives, without gradients."""
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]

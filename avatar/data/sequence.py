@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.views import View, read_view
 from avatar.rig.rig import Motion, Rig
 from smplxpp.capture import Capture
+from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread_inside
+from smplxpp.core.validation import require_at_least
 from smplxpp.template.template import Template
 
 
@@ -35,8 +41,7 @@ class SequenceConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("margin", 0), ("motions", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"sequence: {name}", expected=f"at least {least}", received=str(getattr(self, name)))
+            require_at_least(f"sequence: {name}", getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,56 @@ class Item:
 
     def __str__(self) -> str:
         return f"frame {self.frame}, cameras {' '.join(self.cameras)}"
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredView:
+    """A whole view that a training is measured on.
+
+    Attributes:
+        kind: "novel_view" or "novel_pose". name: of the view among those that are measured.
+        frame: of its image.
+    """
+
+    kind: str
+    name: str
+    view: View
+    frame: int
+
+
+class FrameSequence(Protocol):
+    """What photometric trainings learn from: numbered frames, their poses, and views of them.
+
+    Attributes:
+        rig: of the template. background: (3,) sRGB in [0, 1] behind the person.
+        train_cameras, train_frames: what is learned from.
+    """
+
+    rig: Rig
+    background: Tensor
+    train_cameras: tuple[str, ...]
+    train_frames: tuple[int, ...]
+
+    def motion(self, frame: int) -> Motion:
+        """Return the pose of a frame."""
+
+    def view(self, camera: str, frame: int) -> View:
+        """Return a training view, cut to the silhouette."""
+
+    def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
+        """Return the `count` items of a step with up to `views` cameras each, decided by seed and step alone."""
+
+    def expect(self, items: Sequence[Item]) -> None:
+        """Prepare for the views of items, which will be asked for soon."""
+
+    def measured_views(self, frames: int) -> Iterable[MeasuredView]:
+        """Return the views that training is measured on, of at most `frames` frames of either kind."""
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera with all its pixels."""
+
+    def person_center(self) -> Float[np.ndarray, " 3"]:
+        """Return the middle of the person in the first training frame, metres."""
 
 
 class AvatarSequence:
@@ -76,7 +131,7 @@ class AvatarSequence:
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
 
     def motion(self, frame: int) -> Motion:
-        """The pose of a frame; it has the frame's number if training sees the frame, else the null code.
+        """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.
 
         Raises:
             InputError: no parameters of it.
@@ -89,13 +144,37 @@ class AvatarSequence:
         return self._motions[frame]
 
     def view(self, camera: str, frame: int) -> View:
-        """A training view, cut to the silhouette."""
+        """Return a training view, cut to the silhouette."""
         expected = self._expected.pop((camera, frame), None)
         return (self._read_view(camera, frame) if expected is None else expected.result()).to(self.device)
 
     def whole_view(self, camera: str, frame: int) -> View:
-        """All pixels of a view, of any camera and frame of the capture; not cached."""
+        """Return all pixels of a view, of any camera and frame of the capture; not cached."""
         return read_view(self.capture, camera, frame).to(self.device)
+
+    def measured_views(self, frames: int) -> Iterator[MeasuredView]:
+        """Read views of held-out cameras (of two training cameras where none is held out), person in view.
+
+        They come at training frames ("novel_view") and at held-out frames ("novel_pose"), where there are any.
+        """
+        splits = self.capture.splits
+        cameras = splits.novel_view_cameras or splits.train_cameras[:2]
+        for kind, own in (("novel_view", self.train_frames), ("novel_pose", splits.novel_pose_frames)):
+            for frame in spread_inside(own, frames):
+                for camera in cameras:
+                    if self.capture.file(camera, frame) is None:
+                        continue
+                    view = self.whole_view(camera, frame)
+                    if view.alpha.any():  # a view of nobody measures nothing
+                        yield MeasuredView(kind, f"{camera} {frame}", view, frame)
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera of the capture with all its pixels."""
+        return self.capture.cameras[name]
+
+    def person_center(self) -> Float[np.ndarray, " 3"]:
+        """Return the mean of the posed vertices in the first training frame, metres."""
+        return self.rig.pose(self.motion(self.train_frames[0])).mean(0).cpu().numpy()
 
     def expect(self, items: Sequence[Item]) -> None:
         """Read the views of items in the background: they will be asked for soon."""
@@ -106,7 +185,7 @@ class AvatarSequence:
                     self._expected[camera, item.frame] = read
 
     def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
-        """The items of a step, decided by seed and step alone.
+        """Return the items of a step, decided by seed and step alone.
 
         Every frame comes once an epoch in a shuffled order; from epoch to epoch a frame goes through its cameras, in
         a shuffled order too, so that every view is seen equally often.
@@ -122,7 +201,7 @@ class AvatarSequence:
         return out
 
     def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
-        """Training cameras for a visit of a frame: visit after visit every camera comes equally often."""
+        """Return training cameras for a visit of a frame: visit after visit every camera comes equally often."""
         names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
         views = min(views, len(names))
         chosen = []
@@ -131,7 +210,12 @@ class AvatarSequence:
             chosen.append(names[_shuffled((seed, 1, frame, cycle), len(names))[place]])
         return tuple(chosen)
 
-    def _read_motion(self, frame: int) -> Motion:
+    def params(self, frame: int) -> BodyParams:
+        """Return the body parameters of a frame.
+
+        Raises:
+            InputError: none of it.
+        """
         params = self.capture.params(frame)
         if params is None:
             raise InputError(
@@ -140,31 +224,26 @@ class AvatarSequence:
                 received="none",
                 remedy="leave the frame out, or name a file with --params",
             )
-        return self.rig.motion(params, frame=frame if frame in self.train_frames else None)
+        return params
+
+    def _read_motion(self, frame: int) -> Motion:
+        return self.rig.motion(self.params(frame), frame=frame if frame in self.train_frames else None)
 
     def _read_view(self, camera: str, frame: int) -> View:
         whole = read_view(self.capture, camera, frame, normals=self.config.normals)
         return whole.cropped(self.config.margin)
 
 
-def camera_centers_of(views: Sequence[View]) -> Tensor:
-    """(C, 3) centres of projection in the world."""
+def camera_centers_of(views: Sequence[View]) -> Float[Tensor, "C 3"]:
+    """Return the centres of projection in the world, metres."""
     return torch.stack([view.position for view in views])
-
-
-def spread_inside(frames: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the frames, each from the middle of its share."""
-    if not len(frames):
-        return []
-    count = min(count, len(frames))
-    return [frames[int((k + 0.5) * len(frames) / count)] for k in range(count)]
 
 
 def _training_part(capture: Capture) -> tuple[tuple[str, ...], tuple[int, ...]]:
     cameras = capture.splits.train_cameras
     presence = capture.presence()
     rows = [row for row, name in enumerate(capture.cameras) if name in set(cameras)]
-    seen = {frame for frame, there in zip(capture.frames, presence[rows].any(axis=0), strict=True) if there}
+    seen = {frame for frame, there in zip(capture.frames, np.asarray(presence[rows].any(axis=0)), strict=True) if there}
     frames = tuple(frame for frame in capture.splits.train_frames if frame in seen)
     if not cameras or not frames:
         raise InputError(

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float16, Float32, UInt8
 from torch import Tensor
 
 from smplxpp.capture import Capture
@@ -22,45 +23,46 @@ class View:
 
     Attributes:
         camera: of these pixels.
-        foreground: (H, W, 3) uint8 sRGB times opacity. alpha: (H, W) uint8 opacity of the person.
-        normals: (H, W, 3) float16 world normals, 0 on the background; None where the capture has none.
+        foreground: sRGB times opacity. alpha: opacity of the person.
+        normals: world normals in half precision, 0 on the background; None where the capture has none.
     """
 
     camera: Camera
-    foreground: Tensor
-    alpha: Tensor
-    normals: Tensor | None = None
+    foreground: UInt8[Tensor, "H W 3"]
+    alpha: UInt8[Tensor, "H W"]
+    normals: Float16[Tensor, "H W 3"] | None = None
 
     @property
     def name(self) -> str:
+        """Name of the camera."""
         return self.camera.name
 
     @cached_property
-    def viewmat(self) -> Tensor:
-        """(4, 4) float32 camera from world."""
+    def viewmat(self) -> Float32[Tensor, "4 4"]:
+        """Camera from world."""
         return torch.tensor(self.camera.cam_from_world, dtype=torch.float32, device=self.alpha.device)
 
     @cached_property
-    def K(self) -> Tensor:
-        """(3, 3) float32 intrinsics in pixels."""
+    def K(self) -> Float32[Tensor, "3 3"]:
+        """Intrinsics in pixels."""
         return torch.tensor(self.camera.K, dtype=torch.float32, device=self.alpha.device)
 
     @cached_property
-    def position(self) -> Tensor:
-        """(3,) float32 centre of projection in the world."""
+    def position(self) -> Float32[Tensor, " 3"]:
+        """Centre of projection in the world, metres."""
         return torch.tensor(self.camera.position, dtype=torch.float32, device=self.alpha.device)
 
-    def opacity(self) -> Tensor:
-        """(H, W) float32 in [0, 1]."""
+    def opacity(self) -> Float32[Tensor, "H W"]:
+        """Return the opacity in [0, 1]."""
         return self.alpha / 255.0
 
-    def composited(self, background: Tensor) -> Tensor:
-        """(H, W, 3) float32 sRGB in [0, 1]: `F + (1 - a) B` for a (3,) background B."""
+    def composited(self, background: Float[Tensor, " 3"]) -> Float32[Tensor, "H W 3"]:
+        """Return sRGB in [0, 1] on a background B: `F + (1 - a) B`."""
         return self.foreground / 255.0 + (1.0 - self.opacity())[..., None] * background
 
-    def photograph(self, background: Sequence[float]) -> np.ndarray:
-        """(H, W, 3) uint8, composited, to look at."""
-        return (self.composited(torch.tensor(background)) * 255.0).round().to(torch.uint8).numpy()
+    def photograph(self, background: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the composited image, to look at."""
+        return (self.composited(torch.tensor(background, dtype=torch.float32)) * 255.0).round().to(torch.uint8).numpy()
 
     def cropped(self, margin: int) -> View:
         """Only the silhouette's bounding box and `margin` pixels around it; the principal point moves with it.
@@ -87,13 +89,13 @@ class View:
         return View(camera, small[..., :3].contiguous(), small[..., 3].contiguous(), normals)
 
     def to(self, device: torch.device | str) -> View:
-        """The same view on another device."""
+        """Return the same view on another device."""
         normals = None if self.normals is None else self.normals.to(device)
         return View(self.camera, self.foreground.to(device), self.alpha.to(device), normals)
 
 
 def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = False) -> View:
-    """The whole image of a camera, composited as the capture says, with its normal map if asked for and there.
+    """Read the whole image of a camera, composited as the capture says, with its normal map if asked for and there.
 
     Raises:
         InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
@@ -109,7 +111,7 @@ def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = Fals
 
 
 def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[View]:
-    """The whole images of a frame, composited as the capture says; cameras without an image or a person are left out.
+    """Read whole images of a frame, composited as the capture says; cameras without image or person are left out.
 
     Raises:
         InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.

@@ -20,14 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionWeights:
-    """Weights of `L_rec = L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha`. The defaults are the paper's.
+    """Weights of `L_rec = w L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha`. The defaults are the paper's.
 
     Attributes:
-        dssim: a, of `1 - SSIM`. perceptual: b, of LPIPS or ST-LPIPS. normal: c, of the L1 between normals.
-        alpha: d, of the L1 between opacity and mask, which the paper does not have: on a black background dark hair
-            could be a hole.
+        l1: of the mean absolute difference of colours. dssim: of `1 - SSIM`. perceptual: of LPIPS or ST-LPIPS.
+        normal: of the L1 between normals.
+        alpha: of the L1 between opacity and mask, which the paper does not have: on a black background dark hair could
+            be a hole.
     """
 
+    l1: float = 1.0
     dssim: float = 0.2
     perceptual: float = 0.01
     normal: float = 0.02
@@ -65,7 +67,7 @@ def reconstruction_loss(
     Terms without what they need (no normals, no perceptual distance, an image below its size) are left out.
     """
     l1 = (rendering.image - target.image).abs().mean()
-    total, terms = l1, {"l1": l1}
+    total, terms = weights.l1 * l1, {"l1": l1}
     if weights.dssim:
         terms["dssim"] = 1.0 - ssim(rendering.image, target.image)
         total = total + weights.dssim * terms["dssim"]

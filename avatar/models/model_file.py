@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.models.config_dict import config_from_dict, config_to_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.networks.deformation_field import FieldConfig, show_null_code
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -48,6 +48,7 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
         about |= {
             "kind": "student",
             "frames": list(model.frames),
+            "null_code_shown": model.codes is not None and model.codes.null_code_shown,
             "control_points": config.control_points,
             "field": None if config.field is None else config_to_dict(config.field),
             "blend_shapes": None if config.blend_shapes is None else config_to_dict(config.blend_shapes),
@@ -105,7 +106,10 @@ def _student(about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, 
         }
         shapes = BlendShapes(config_from_dict(BlendShapeConfig, about["blend_shapes"]), len(gaussians), **extra)
     config = StudentConfig(field, None if shapes is None else shapes.config, about["control_points"])
-    return Student(config, rig, gaussians, tuple(about["frames"]), blend_shapes=shapes)
+    student = Student(config, rig, gaussians, tuple(about["frames"]), blend_shapes=shapes)
+    if about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
+        show_null_code(student)
+    return student
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

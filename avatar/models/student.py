@@ -120,6 +120,8 @@ class Student(nn.Module):
         for mine, its in ((self.field, other.field), (self.codes, other.codes)):
             if mine is not None and its is not None:
                 its.load_state_dict(mine.state_dict())
+        if self.codes is not None and other.codes is not None:
+            other.codes.null_code_shown = self.codes.null_code_shown
         return other
 
 

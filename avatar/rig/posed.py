@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, WorldGaussians
@@ -19,18 +20,18 @@ class PosedAvatar:
     """An avatar in one pose, as C cameras see it.
 
     Attributes:
-        vertices: (V, 3) posed mesh, world, metres.
+        vertices: of the posed mesh, world, metres.
         gaussians: N of them in the world.
-        colors: (C, N, 3) sRGB, towards each camera.
+        colors: sRGB, towards each camera.
         bound: the same Gaussians in their triangles' frames, with this pose's residuals.
-        displacements: (V, 3) metres by which the mesh left the T-pose before skinning; None: skinning alone.
+        displacements: metres by which the mesh left the T-pose before skinning; None: skinning alone.
     """
 
-    vertices: Tensor
+    vertices: Float[Tensor, "V 3"]
     gaussians: WorldGaussians
-    colors: Tensor
+    colors: Float[Tensor, "C N 3"]
     bound: BoundGaussians
-    displacements: Tensor | None = None
+    displacements: Float[Tensor, "V 3"] | None = None
 
 
 class AvatarModel(Protocol):
@@ -39,11 +40,11 @@ class AvatarModel(Protocol):
     rig: Rig
     training: bool
 
-    def __call__(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        """The avatar in a pose.
+    def __call__(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Return the avatar in a pose.
 
         Args:
-            camera_centers: (C, 3) centres of projection in the world, metres.
+            camera_centers: centres of projection in the world, metres.
         """
 
     def train(self, mode: bool = True) -> Any:
@@ -58,7 +59,7 @@ class AvatarModel(Protocol):
 
 @contextmanager
 def at_rest(model: AvatarModel | nn.Module) -> Iterator[None]:
-    """No gradients, and the module in its evaluation mode; afterwards it trains as before."""
+    """Run the block without gradients and with the module in its evaluation mode; afterwards it trains as before."""
     was_training = model.training
     model.eval()
     try:

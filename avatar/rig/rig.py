@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float32
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -26,22 +27,22 @@ class Motion:
 
     Attributes:
         frame: number of the training frame whose code the student takes; None for the null code.
-        pose: (63,) theta, radians. expression: (E,). jaw: (3,) axis-angle, radians.
-        rest: (V, 3) T-pose with this frame's expression and pose correctives, metres.
-        world_from_rest: (V, 3, 4) blended transforms of the vertices.
-        root_from_world: (4, 4) takes the root's motion away.
+        pose: theta, radians. expression: coefficients. jaw: axis-angle, radians.
+        rest: T-pose with this frame's expression and pose correctives, metres.
+        world_from_rest: blended transforms of the vertices.
+        root_from_world: takes the root's motion away.
     """
 
     frame: int | None
-    pose: Tensor
-    expression: Tensor
-    jaw: Tensor
-    rest: Tensor
-    world_from_rest: Tensor
-    root_from_world: Tensor
+    pose: Float32[Tensor, " 63"]
+    expression: Float32[Tensor, " E"]
+    jaw: Float32[Tensor, " 3"]
+    rest: Float32[Tensor, "V 3"]
+    world_from_rest: Float32[Tensor, "V 3 4"]
+    root_from_world: Float32[Tensor, "4 4"]
 
     def without_code(self) -> Motion:
-        """The same pose, driven by the null code."""
+        """Return the same pose, driven by the null code."""
         return replace(self, frame=None)
 
 
@@ -64,10 +65,11 @@ class Rig:
 
     @property
     def expression_size(self) -> int:
+        """Number of the template's expression coefficients."""
         return self.template.body.num_expressions
 
     def motion(self, params: BodyParams, *, frame: int | None = None) -> Motion:
-        """What one pose does to the template.
+        """Return what one pose does to the template.
 
         Args:
             params: one frame. frame: its number, where the student has a code for it.
@@ -96,14 +98,31 @@ class Rig:
             root_from_world=self._tensor(np.linalg.inv(transforms[0])),
         )
 
-    def pose(self, motion: Motion, displacements: Tensor | None = None) -> Tensor:
-        """Vertices in the world, `x = (sum_j w_j G_j) (v + dv)`.
+    def motion_to(self, vertices: Float[np.ndarray, "V 3"]) -> Motion:
+        """Make the motion whose posed mesh is `vertices`, metres, to the bit: its T-pose, which skinning leaves alone.
+
+        Raises:
+            InputError: vertices of another number than the template's.
+        """
+        if vertices.shape != self.vertices.shape:
+            raise InputError(
+                "posed vertices", expected=f"shape {tuple(self.vertices.shape)}", received=str(vertices.shape)
+            )
+        return Motion(
+            None,
+            pose=torch.zeros(THETA, device=self.device),
+            expression=torch.zeros(self.expression_size, device=self.device),
+            jaw=torch.zeros(3, device=self.device),
+            rest=self._tensor(vertices),
+            world_from_rest=torch.eye(3, 4, device=self.device).expand(len(vertices), 3, 4),
+            root_from_world=torch.eye(4, device=self.device),
+        )
+
+    def pose(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"]:
+        """Return the vertices in the world, metres, `x = (sum_j w_j G_j) (v + dv)`.
 
         Args:
-            displacements: (V, 3) dv, metres along the axes of the T-pose; gradients reach them.
-
-        Returns:
-            (V, 3) metres.
+            displacements: dv, metres along the axes of the T-pose; gradients reach them.
         """
         rest = motion.rest if displacements is None else motion.rest + displacements
         return _Skinning.apply(rest, motion.world_from_rest)

@@ -42,11 +42,11 @@ class TrainingPreset:
     control_points: int = 0
 
     def student(self) -> StudentConfig:
-        """Of the bake; the compensation adds the blend shapes."""
+        """Return the student of the bake; the compensation adds the blend shapes."""
         return StudentConfig(self.networks.field, None, self.control_points)
 
     def with_seed(self, seed: int) -> TrainingPreset:
-        """The same with another seed everywhere."""
+        """Return the same with another seed everywhere."""
         track = self.teacher.track
         return replace(
             self,
@@ -57,7 +57,7 @@ class TrainingPreset:
         )
 
     def shortened(self, share: float) -> TrainingPreset:
-        """The same with `share` of the iterations of every training."""
+        """Return the same with `share` of the iterations of every training."""
 
         def fewer(iterations: int) -> int:
             return max(1, round(share * iterations))
@@ -77,7 +77,7 @@ Pretrained = TypeVar("Pretrained", FitTeacherConfig, BakeConfig)
 
 
 def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
-    """A configuration with other iterations, and as large a share of its pretraining."""
+    """Return a configuration with other iterations, and as large a share of its pretraining."""
     pretrain = config.pretrain and config.pretrain.shortened(iterations / config.iterations)
     return replace(config, iterations=iterations, pretrain=pretrain)
 
@@ -101,7 +101,7 @@ class _Size:
 
 
 def _lean(name: str, size: _Size) -> TrainingPreset:
-    """Presets for two cores: the surface is followed first, networks learn what was found before they see photographs.
+    """Make a preset for two cores: the surface is followed first, networks learn it before they see photographs.
 
     A teacher of minutes draws worse than the photographs are: the bake compares with those, and takes from the teacher
     the followed surface and its answers about imagined poses. Several views a step, attributes that learn in every
@@ -201,7 +201,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
 
 
 def training_preset(name: str) -> TrainingPreset:
-    """The preset "paper", "gpu", "cpu" or "demo".
+    """Return the preset "paper", "gpu", "cpu" or "demo".
 
     Raises:
         InputError: another name.

@@ -11,16 +11,17 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.optimization_task import OptimizationTask
-from avatar.training.engine.photometric_task import PhotometricConfig, Preview
+from avatar.training.engine.photometric_task import PhotometricConfig, Preview, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.random_state import fixed_seed
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.init_blend_shapes import init_blend_shapes
@@ -59,13 +60,13 @@ class Session:
     preview: Preview = lambda images: None
 
     @property
-    def options(self) -> dict[str, Any]:
-        """Of a `PhotometricTask`."""
-        return {"perceptual": self.perceptual, "distributed": self.distributed, "preview": self.preview}
+    def context(self) -> TaskContext:
+        """What a `PhotometricTask` takes of it."""
+        return TaskContext(self.perceptual, self.distributed, self.preview)
 
     def run(
         self,
-        make: Callable[[], OptimizationTask],
+        make: Callable[[], OptimizationTask[Any]],
         config: PhotometricConfig | PretrainConfig,
         *,
         keep_end: bool = False,
@@ -80,17 +81,19 @@ class Session:
         )
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 
-    def run_alone(self, make: Callable[[], OptimizationTask], config: PhotometricConfig | PretrainConfig) -> Progress:
+    def run_alone(
+        self, make: Callable[[], OptimizationTask[Any]], config: PhotometricConfig | PretrainConfig
+    ) -> Progress:
         """Train what `make` gives on the first process; the others wait. A checkpoint of the end is kept."""
-        together = self.distributed or Distributed()
-        return together.run_on_rank0(lambda: self.run(make, config, keep_end=True))
+        processes = self.distributed or Distributed()
+        return processes.run_on_rank0(lambda: self.run(make, config, keep_end=True))
 
     def within(self, name: str) -> Session:
-        """The same in a folder of its own, without previews."""
+        """Return the same in a folder of its own, without previews."""
         return replace(self, folder=self.folder / name, preview=lambda images: None)
 
     def after(self, progress: Progress) -> Session:
-        """What is left of the time after a training that came first."""
+        """Return the session with what is left of the time after a training that came first."""
         return replace(self, max_seconds=max(self.max_seconds - progress.session_seconds, 0.0))
 
 
@@ -121,22 +124,22 @@ def fit_teacher(
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
-    progress = session.run(lambda: TeacherTask(sequence, teacher, config, **session.options), config)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, session.context), config)
     return teacher.eval(), progress
 
 
 def follow_surface(
     sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
 ) -> tuple[Track, Progress]:
-    """Displacements of every training frame, one frame after the other.
+    """Find the displacements of every training frame, one frame after the other.
 
     Steps have one frame each: of several processes the first follows it, and the others hear what it found.
     """
     avatar = TrackedAvatar(sequence.rig, gaussians, min(config.control_points, len(sequence.rig.vertices)))
-    task = TrackTask(sequence, avatar, config, **{**session.options, "distributed": None})
+    task = TrackTask(sequence, avatar, config, replace(session.context, distributed=None))
     progress = session.run_alone(lambda: task, task.config)
-    together = session.distributed or Distributed()
-    task.solved.copy_(together.run_on_rank0(lambda: task.solved.cpu()))
+    processes = session.distributed or Distributed()
+    task.solved.copy_(processes.run_on_rank0(lambda: task.solved.cpu()))
     return task.track(), progress
 
 
@@ -170,7 +173,9 @@ def bake(
         if not progress.finished:
             return made.eval(), progress
         session = session.after(progress)
-    progress = session.run(lambda: BakeTask(sequence, made, config, teacher=teacher, **session.options), config)
+        if config.null_share or config.imagined:
+            show_null_code(made)  # on the processes that only waited for the pretraining, too
+    progress = session.run(lambda: BakeTask(sequence, made, config, session.context, teacher=teacher), config)
     return made.eval(), progress
 
 
@@ -192,5 +197,5 @@ def compensate(
         made = student.with_blend_shapes(shapes)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
-    progress = session.run(lambda: CompensateTask(sequence, made, config, **session.options), config)
+    progress = session.run(lambda: CompensateTask(sequence, made, config, session.context), config)
     return made.eval(), progress

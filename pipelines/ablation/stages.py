@@ -14,7 +14,8 @@ from avatar.baselines.avatar_base import Baseline
 from avatar.baselines.build import BaselineConfig, make_baseline
 from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.models.model_file import save_avatar
-from avatar.training.engine.random_state import fixed_seed
+from avatar.models.networks.deformation_field import show_null_code
+from avatar.training.engine.device import fixed_seed
 from avatar.training.student.prune import coefficient_std, pruned_to
 from avatar.training.train import Session
 from pipelines.runs.stage import StageOutput
@@ -94,7 +95,7 @@ class BaselineStage(ModelStage):
         sequence = trainer.sequence(self.ground)
         with fixed_seed(self.config.seed):
             model = self._untrained(trainer)
-        done = session.run(lambda: PhotographTask(sequence, model, self.config, **session.options), self.config)
+        done = session.run(lambda: PhotographTask(sequence, model, self.config, session.context), self.config)
 
         def write() -> Mapping[str, Any]:
             write_baseline(folder / self.file, model)
@@ -112,7 +113,10 @@ class BaselineStage(ModelStage):
 
     def _untrained(self, trainer: Trainer) -> Baseline:
         sequence = trainer.sequence(self.ground)
-        return make_baseline(self.model, sequence.rig, trainer.model(self.gaussians), sequence.train_frames)
+        model = make_baseline(self.model, sequence.rig, trainer.model(self.gaussians), sequence.train_frames)
+        if self.config.null_share:
+            show_null_code(model)
+        return model
 
 
 def write_baseline(path: Path, model: Baseline, *, compact: bool = False) -> None:

@@ -65,7 +65,7 @@ class CompensateStage(ModelStage):
             model,
             done,
             lambda: write_student(
-                folder, model, sequence, self.config, max_bytes=self.max_bytes, options=session.options
+                folder, model, sequence, self.config, max_bytes=self.max_bytes, context=session.context
             ),
         )
 

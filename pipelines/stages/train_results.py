@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
-from avatar.training.engine.memory import peak_memory
 from avatar.training.engine.metrics_log import read_metrics
+from avatar.training.engine.photometric_task import TaskContext
+from avatar.training.engine.resources import peak_memory
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.prune import pruned_to
 from avatar.training.train import PRETRAIN, TRACK, Session
@@ -53,21 +55,21 @@ def write_student(
     config: CompensateConfig,
     *,
     max_bytes: float | None,
-    options: Mapping[str, Any],
+    context: TaskContext,
 ) -> dict[str, Any]:
     """Write a student with blend shapes, whole and compact; bytes, and figures of the compact one read back.
 
     Args:
         max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
-        options: of a `PhotometricTask`.
+        context: of the training.
     """
     name, compact = (Path(file).name for file in (STUDENT, COMPACT_STUDENT))
     small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
     bytes_of = {name: save_avatar(folder / name, student), compact: save_avatar(folder / compact, small, compact=True)}
     # As a player has it: half precision, and without what was pruned.
     stored = load_avatar(folder / compact, sequence.rig)
-    quiet = {**options, "preview": lambda images: None}
-    figures = CompensateTask(sequence, stored, config, **quiet).evaluate(config.iterations)
+    quiet = replace(context, preview=lambda images: None)
+    figures = CompensateTask(sequence, stored, config, quiet).evaluate(config.iterations)
     measured = {kind: figures[kind] for kind in KINDS if kind in figures}
     return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
 

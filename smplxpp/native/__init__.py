@@ -19,6 +19,17 @@ _FEATURES = {
 }
 
 
+def let_workers_sleep() -> None:
+    """Ask OpenMP, which torch and the native library share, to put workers to sleep where they have nothing to do.
+
+    By default they spin for milliseconds after every parallel loop, on cores that another training could use: two on
+    one machine then take many times as long as one. Packages call this before they load torch, as the runtime looks
+    once; what the environment says of it (`OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`) stands. No number depends on it.
+    """
+    if "GOMP_SPINCOUNT" not in os.environ:
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
 def usable_levels() -> tuple[str, ...]:
     """Those of `LEVELS` that this CPU can run, the best first."""
     return tuple(level for level in LEVELS if _FEATURES[level] <= _cpu_features())

@@ -159,8 +159,8 @@ def make_template(
     """Make a template of parts: the body's first, then its clothes, by name.
 
     Every body vertex has the same share in every joint, there are two shapes that move nothing and no expression, and
-    clothes lie on the body's first vertices; `bases_changed` are arguments of `small_body` that differ, `changes` fields of
-    `Template`.
+    clothes lie on the body's first vertices; `bases_changed` are arguments of `small_body` that differ,
+    `changes` fields of `Template`.
     """
     garments = garments or {}
     parts, joints = [*body, *garments.values()], load_body()

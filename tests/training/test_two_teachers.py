@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import LoopConfig, run_training
+from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.engine.processes import Distributed, join_processes
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
 from tests.dolls.dancing import gaussians, sequence, write_dance
@@ -28,7 +29,7 @@ def teach(capture: Path, folder: Path, together: Distributed) -> None:
     frames = sequence(capture)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
     config = FitTeacherConfig(pretrain=None, lr=1e-3, attributes=0.5, **{**STEPS, "poses_per_step": 4, "iterations": 4})
-    task = TeacherTask(frames, teacher, config, distributed=together)
+    task = TeacherTask(frames, teacher, config, TaskContext(distributed=together))
     run_training(task, LoopConfig(iterations=4, evaluate_every=4), folder, key="k")
     learned = {name: value.detach().contiguous() for name, value in task.learned.items()}
     save_file(learned, folder / f"learned_{together.rank}.safetensors")

@@ -206,8 +206,8 @@ class DeformationField(nn.Module):
 class FrameCodes(nn.Module):
     """Learnable codes z_t, one for every frame of a sequence, zero at first.
 
-    The zero vector is the *null code*: what a pose without a frame is driven by. It means something only if training
-    shows it to the field, in the place of some of the codes.
+    A pose without a frame is driven by the *null code*: the zero vector if training showed that to the field, in the
+    place of some of the codes (`show_null_code`); else z_0, the code of the first frame, which it has seen.
 
     Args:
         frames: numbers of the frames, each once.
@@ -224,6 +224,7 @@ class FrameCodes(nn.Module):
         self.frames = tuple(int(frame) for frame in frames)
         self.row = {frame: row for row, frame in enumerate(self.frames)}
         self.codes = nn.Parameter(torch.zeros(len(self.frames), code_size))
+        self.null_code_shown = False
 
     def forward(self, frames: Sequence[int | None]) -> Float[Tensor, "B Z"]:
         """Return the code of each frame, the null code for None.
@@ -240,5 +241,13 @@ class FrameCodes(nn.Module):
                 remedy="drive new frames with the null code, or fit codes to them",
             )
         rows = torch.tensor([0 if frame is None else self.row[frame] for frame in frames], device=self.codes.device)
-        known = torch.tensor([frame is not None for frame in frames], device=self.codes.device)
+        coded = [frame is not None or not self.null_code_shown for frame in frames]
+        known = torch.tensor(coded, device=self.codes.device)
         return self.codes[rows] * known[:, None]
+
+
+def show_null_code(model: nn.Module) -> None:
+    """Tell all frame codes within a model that training shows the zero vector to it as the null code."""
+    for module in model.modules():
+        if isinstance(module, FrameCodes):
+            module.null_code_shown = True

@@ -44,7 +44,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
-    """The checkpoint in a file, bit for bit; None where there is none, or nothing that can be read, which is logged.
+    """Return the checkpoint in a file, bit for bit; None where there is none or it cannot be read, which is logged.
 
     Raises:
         InputError: one of another training or of another version of the format. Hours may lie in it: only the user

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
-from smplxpp.core.errors import InputError
+import numpy as np
+
+from avatar.data.sequence import FrameSequence
+from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
+from avatar.training.engine.optimization_task import ParameterGroup
+from smplxpp.core.validation import require_positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +36,36 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value = getattr(self, f.name)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"learning rate {f.name}", expected="a positive number", received=repr(value))
+            require_positive(f"learning rate {f.name}", getattr(self, f.name))
+
+
+def attribute_groups(
+    gaussians: LearnedGaussians, multiple: float, pixel: float, rates: LearningRates
+) -> list[ParameterGroup]:
+    """Return groups of the Gaussians' attributes at `multiple` times `rates`; none for 0, which freezes them.
+
+    Args:
+        pixel: metres, the unit of the offsets' rates.
+    """
+    if not multiple:
+        gaussians.requires_grad_(False)
+        return []
+    unit = {"normal_offset": pixel, "offset": pixel}
+    gaussians.requires_grad_(True)
+    return [
+        ParameterGroup(
+            f"gaussians.{name}",
+            {name: getattr(gaussians, name)},
+            multiple * getattr(rates, name) * unit.get(name, 1.0),
+            rates.lr_final_factor,
+        )
+        for name in LEARNED
+        if getattr(gaussians, name).numel()
+    ]
+
+
+def pixel_size(sequence: FrameSequence) -> float:
+    """Return the metres that a pixel covers at the person: median over the training cameras of `distance / f`."""
+    center = sequence.person_center()
+    cameras = [sequence.camera(name) for name in sequence.train_cameras]
+    return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))

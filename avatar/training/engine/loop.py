@@ -13,10 +13,9 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.metrics_log import append_metrics, truncate_metrics
+from avatar.training.engine.metrics_log import TensorboardLog, append_metrics, truncate_metrics
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resource_errors import explain_resource_errors
-from avatar.training.engine.tensorboard_log import TensorboardLog
+from avatar.training.engine.resources import explain_resource_errors
 
 STATE_FILE = "state.safetensors"
 METRICS_FILE = "metrics.jsonl"
@@ -33,13 +32,13 @@ class Task(Protocol):
     distributed: Distributed
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """Step number `iteration`, counted from 0; its metrics."""
+        """Take step number `iteration`, counted from 0; return its metrics."""
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Figures of the state after `iteration` steps, as JSON values."""
+        """Return figures of the state after `iteration` steps, as JSON values."""
 
     def state(self) -> Mapping[str, Tensor]:
-        """All that the next step depends on."""
+        """Return all that the next step depends on."""
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take what `state` gave."""
@@ -89,6 +88,7 @@ class Progress:
 
     @property
     def finished(self) -> bool:
+        """Whether all steps are done."""
         return self.iteration >= self.iterations
 
 
@@ -113,7 +113,7 @@ def run_training(
             diverged (`DivergedError`), and the last checkpoint is kept.
         MissingExtraError: a log for TensorBoard without tensorboard.
     """
-    together = task.distributed
+    processes = task.distributed
     state, metrics = folder / STATE_FILE, folder / METRICS_FILE
     sinks: list[Callable[[Mapping[str, Any]], None]] = [partial(append_metrics, metrics)]
     logged: Mapping[str, Any] = {}
@@ -147,25 +147,25 @@ def run_training(
     with explain_resource_errors(folder), ExitStack() as stack:
         done, spent_before = _begin(task, state, metrics, key)
         first, spent, unsaved = done, 0.0, 0.0
-        together.run_on_rank0(open_events)
+        processes.run_on_rank0(open_events)
         if not done:
-            together.run_on_rank0(evaluate)
+            processes.run_on_rank0(evaluate)
         while done < config.iterations and spent < config.max_seconds:
             begin = time.perf_counter()
             values = task.step(done)
-            took = together.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
+            took = processes.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
             done, spent, unsaved = done + 1, spent + took, unsaved + took
             last = done == config.iterations
             if done % config.log_every == 0 or last:
                 logged = values
-                together.run_on_rank0(log_step)
+                processes.run_on_rank0(log_step)
             if done % config.evaluate_every == 0 or last:
-                together.run_on_rank0(evaluate)
+                processes.run_on_rank0(evaluate)
             if unsaved >= config.checkpoint_seconds and not last:
-                together.run_on_rank0(save)
+                processes.run_on_rank0(save)
                 unsaved = 0.0
         if done < config.iterations or (config.keep_end and done > first):
-            together.run_on_rank0(save)
+            processes.run_on_rank0(save)
         return progress()
 
 

@@ -1,13 +1,14 @@
-"""metrics.jsonl: one JSON object a line, appended as training goes on."""
+"""What a training logs: metrics.jsonl, one JSON object a line, and the same numbers as TensorBoard's events."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.errors import MissingExtraError
 from smplxpp.core.json_values import jsonable
 
 
@@ -18,7 +19,7 @@ def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
-    """All entries; a last line that a kill cut short is left out."""
+    """Return all entries; a last line that a kill cut short is left out."""
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -36,3 +37,42 @@ def truncate_metrics(path: str | Path, iteration: int) -> None:
     """Drop the entries after `iteration`: those steps are done again from the checkpoint."""
     kept = [entry for entry in read_metrics(path) if entry["iteration"] <= iteration]
     atomic_write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))
+
+
+class TensorboardLog:
+    """Writes entries of a metrics log as scalars `kind/name`, and those of mappings as `kind/name/inner`.
+
+    Args:
+        folder: for TensorBoard's files.
+        redone: first iteration whose entries come (again); TensorBoard hides what it has from there on.
+
+    Raises:
+        MissingExtraError: tensorboard is not installed.
+    """
+
+    def __init__(self, folder: Path, *, redone: int) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise MissingExtraError("tensorboard", extra="tensorboard", purpose="the log for TensorBoard") from None
+        self._writer = SummaryWriter(str(folder), purge_step=redone)
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Add an entry with `kind`, `iteration` and numbers; all else in it is left out."""
+        for tag, value in _numbers(entry["kind"], entry):
+            if tag != f"{entry['kind']}/iteration":
+                self._writer.add_scalar(tag, value, entry["iteration"])
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Take no more entries."""
+        self._writer.close()
+
+
+def _numbers(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """Give the numbers in nested mappings with their paths."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(f"{path}/{name}", value)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{path}/{name}", value

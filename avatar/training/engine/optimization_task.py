@@ -6,14 +6,16 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
+Batch = TypeVar("Batch")
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -46,22 +48,16 @@ class OptimiserConfig:
     amp: bool = False
 
     def __post_init__(self) -> None:
-        if self.schedule not in ("cosine", "exponential", "constant"):
-            raise InputError(
-                "optimiser: schedule", expected="cosine, exponential or constant", received=repr(self.schedule)
-            )
-        for name, value, fits, expected in (
-            ("iterations", self.iterations, self.iterations >= 1, "a number, at least 1"),
-            ("warmup", self.warmup, 0 <= self.warmup < math.inf, "a number of steps, at least 0"),
-            ("betas", self.betas, all(0.0 <= beta < 1.0 for beta in self.betas), "two numbers in [0, 1)"),
-            ("eps", self.eps, 0.0 < self.eps < math.inf, "a positive number"),
-            ("max_grad_norm", self.max_grad_norm, self.max_grad_norm > 0.0, "a positive number"),
-        ):
-            if not fits:
-                raise InputError(f"optimiser: {name}", expected=expected, received=repr(value))
+        require_choice("optimiser: schedule", self.schedule, ("cosine", "exponential", "constant"))
+        require_at_least("optimiser: iterations", self.iterations, 1)
+        require_at_least("optimiser: warmup", self.warmup, 0)
+        require_positive("optimiser: eps", self.eps)
+        require_positive("optimiser: max_grad_norm", self.max_grad_norm, finite=False)
+        if not all(0.0 <= beta < 1.0 for beta in self.betas):
+            raise InputError("optimiser: betas", expected="two numbers in [0, 1)", received=repr(self.betas))
 
     def lr_factor(self, iteration: int, lr_final_factor: float) -> float:
-        """Of a rate, at a step counted from 0."""
+        """Return the share of a rate that is left at a step counted from 0."""
         at = iteration / self.iterations
         rising = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
         if self.schedule == "cosine":
@@ -86,15 +82,14 @@ class ParameterGroup:
 
     def __post_init__(self) -> None:
         assert all(value.is_leaf and value.requires_grad for value in self.parameters.values()), self.name
-        if not 0.0 < self.lr < math.inf:
-            raise InputError(f"learning rate {self.name}", expected="a positive number", received=repr(self.lr))
+        require_positive(f"learning rate {self.name}", self.lr)
         if not 0.0 < self.lr_final_factor <= 1.0:
             raise InputError(
                 f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.lr_final_factor)
             )
 
 
-class OptimizationTask(ABC):
+class OptimizationTask(ABC, Generic[Batch]):
     """A task of `run_training` that Adam solves: the mean loss of a step's micro-batches goes down.
 
     A subclass says what the micro-batches of a step are (`micro_batches`) and what each costs (`loss`). Micro-batches
@@ -124,32 +119,32 @@ class OptimizationTask(ABC):
         )
 
     @abstractmethod
-    def micro_batches(self, iteration: int) -> Sequence[Any]:
-        """The micro-batches of a step: one or more, decided by its number alone, the same on every process."""
+    def micro_batches(self, iteration: int) -> Sequence[Batch]:
+        """Return the micro-batches of a step: one or more, decided by its number alone, the same on every process."""
 
     @abstractmethod
-    def loss(self, item: Any) -> tuple[Tensor, Mapping[str, float]]:
-        """The loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
+    def loss(self, item: Batch) -> tuple[Tensor, Mapping[str, float]]:
+        """Return the loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
 
     def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
-        """Of a group's rate at a step: the configuration's schedule."""
+        """Return the share of a group's rate that is left at a step: the configuration's schedule."""
         return self.optimiser_config.lr_factor(iteration, group.lr_final_factor)
 
-    def name_of(self, item: Any) -> str:
-        """A micro-batch in the user's words: "frame 12, cameras Cam001 Cam002"."""
+    def name_of(self, item: Batch) -> str:
+        """Return a micro-batch in the user's words: "frame 12, cameras Cam001 Cam002"."""
         return str(item)
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Figures of the state after `iteration` steps; none by default."""
+        """Return figures of the state after `iteration` steps; none by default."""
         return {}
 
     def autocast(self) -> torch.autocast:
-        """To put around networks, and nothing else: rasteriser and losses need float32. Cast what comes out."""
+        """Return what to put around networks alone: rasteriser and losses need float32. Cast what comes out."""
         enabled = self.optimiser_config.amp and self.device.type == "cuda"
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """One step of Adam on the mean over the micro-batches.
+        """Take one step of Adam on the mean over the micro-batches.
 
         Returns:
             Means of the losses' numbers, each over the items that gave it, and the items' names.
@@ -163,18 +158,20 @@ class OptimizationTask(ABC):
             group["lr"] = told.lr * self.lr_factor(iteration, told)
         self.optimiser.zero_grad(set_to_none=True)
         outcomes = self.distributed.share_out(items, lambda own: self._backward(own, len(items)))
+        finite = []
         for item, figures in zip(items, outcomes, strict=True):
             if figures is None:
                 raise _diverged(iteration, self.name_of(item))
+            finite.append(figures)
         parameters = list(self.learned.values())
         self.distributed.sum_gradients(parameters)
         if self.optimiser_config.max_grad_norm < math.inf:
             torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.max_grad_norm)
         self.optimiser.step()
-        return {**_means(outcomes), "items": [self.name_of(item) for item in items]}
+        return {**_means(finite), "items": [self.name_of(item) for item in items]}
 
     def state(self) -> Mapping[str, Tensor]:
-        """Parameters by `group.name`, and Adam's moments of each that has been moved."""
+        """Return parameters by `group.name`, and Adam's moments of each that has been moved."""
         tensors = dict(self.learned)
         for key, value in self.learned.items():
             for moment, content in self.optimiser.state.get(value, {}).items():
@@ -191,7 +188,7 @@ class OptimizationTask(ABC):
                     moment: _laid_out(content, value) for moment, content in moments.items() if content is not None
                 }
 
-    def _backward(self, item: Any, count: int) -> Mapping[str, float] | None:
+    def _backward(self, item: Batch, count: int) -> Mapping[str, float] | None:
         """Add a micro-batch's share to the gradients; None if it is not finite."""
         loss, figures = self.loss(item)
         (loss / count).backward()
@@ -221,7 +218,7 @@ def _diverged(iteration: int, item: str) -> DivergedError:
 
 
 def _means(outcomes: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of every number over the outcomes that have it, in the order of first appearance."""
+    """Return the mean of every number over the outcomes that have it, in the order of first appearance."""
     columns: dict[str, list[float]] = {}
     for figures in outcomes:
         for name, value in figures.items():

@@ -1,32 +1,58 @@
-"""What the trainings of teacher and student share: views of frames, the loss on them, held-out figures."""
+"""What all trainings on photographs share: views of frames, the loss on them, figures of held-out views."""
 
 from __future__ import annotations
 
-import math
+import logging
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.data.sequence import FrameSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
-from avatar.metrics.view_quality import eight_bit, mean_quality, view_quality
-from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
+from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
+from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.render.avatar_view import Rendering, render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar
-from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
-from smplxpp.core.errors import InputError
-from smplxpp.core.spread import spread_inside
+from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskContext:
+    """What a task has beside data, model and configuration; the perceptual distance alone changes its steps.
+
+    Attributes:
+        perceptual: for the perceptual term; None leaves it out.
+        distributed: the processes that train together; None: this one alone.
+        preview: called at every evaluation with rendered (H, W, 3) uint8 images by name.
+    """
+
+    perceptual: PerceptualDistance | None = None
+    distributed: Distributed | None = None
+    preview: Preview = lambda images: None
+
+
+ALONE = TaskContext()
+"""One process, no perceptual term, nothing shown."""
+
+
+class TrainableAvatar(AvatarModel, Protocol):
+    """An avatar whose Gaussians' attributes can be learned."""
+
+    gaussians: LearnedGaussians
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +61,10 @@ class PhotometricConfig:
 
     Attributes:
         iterations: steps. poses_per_step: the batch. views: cameras that look at each pose.
-        lr: Adam's step of the networks at the start. lr_final_factor: share of every one left at the end (cosine).
-        attributes: of the Gaussians' own attributes: multiple of the reference fit's rates; 0 leaves them as they are.
+        lr: Adam's step of the networks at the start. lr_final_factor: share of it left at the end.
+        schedule: how every step falls, see `OptimiserConfig`.
+        attributes: multiple of `rates` for the Gaussians' own attributes; 0 leaves them as they are.
+        rates: of those attributes.
         weights: of the losses.
         perceptual_every: steps between those with the perceptual term, which then counts as many times.
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
@@ -52,14 +80,16 @@ class PhotometricConfig:
     views: int = 1
     lr: float = 5e-4
     lr_final_factor: float = 0.05
+    schedule: Literal["cosine", "exponential", "constant"] = "cosine"
     attributes: float = 0.0
+    rates: LearningRates = field(default_factory=LearningRates)
     weights: ReconstructionWeights = field(default_factory=ReconstructionWeights)
     perceptual_every: int = 1
     coarse: float = 0.0
     eps2d: float = 0.1
     betas: tuple[float, float] = (0.9, 0.999)
     amp: bool = False
-    max_grad_norm: float = math.inf
+    max_grad_norm: float = float("inf")
     evaluations: int = 6
     evaluated: int = 2
     seed: int = 0
@@ -77,52 +107,53 @@ class PhotometricConfig:
             ("evaluated", 1),
             ("seed", 0),
         ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= least):
-                raise InputError(f"training: {name}", expected=f"a number, at least {least:g}", received=repr(value))
+            require_at_least(f"training: {name}", getattr(self, name), least)
 
     def optimiser(self) -> OptimiserConfig:
-        """Of these steps."""
+        """Return the optimiser of these steps."""
         return OptimiserConfig(
-            iterations=self.iterations, betas=self.betas, eps=1e-15, amp=self.amp, max_grad_norm=self.max_grad_norm
+            iterations=self.iterations,
+            schedule=self.schedule,
+            betas=self.betas,
+            eps=1e-15,
+            amp=self.amp,
+            max_grad_norm=self.max_grad_norm,
         )
 
     @property
     def evaluate_every(self) -> int:
+        """Steps between evaluations."""
         return max(1, self.iterations // self.evaluations)
 
 
-class PhotometricTask(OptimizationTask):
-    """A stage whose micro-batches are frames with some of their cameras.
+class PhotometricTask(OptimizationTask[Item]):
+    """A training whose micro-batches are frames with some of their cameras.
 
     Args:
         sequence: what is trained on.
         model: what is trained.
         groups: its learned parameters; the attributes of `gaussians` join them where the configuration moves them.
         gaussians: the model's.
-        perceptual: for the perceptual term; None leaves it out.
-        preview: called at every evaluation with rendered (H, W, 3) uint8 images by name.
+        context: perceptual distance, processes, previews.
     """
 
     def __init__(
         self,
-        sequence: AvatarSequence,
-        model: AvatarModel,
+        sequence: FrameSequence,
+        model: TrainableAvatar,
         config: PhotometricConfig,
         groups: Sequence[ParameterGroup],
-        *,
-        perceptual: PerceptualDistance | None = None,
-        distributed: Distributed | None = None,
-        preview: Preview = lambda images: None,
+        context: TaskContext = ALONE,
     ) -> None:
-        self.sequence, self.model, self.config, self.preview = sequence, model, config, preview
-        self.perceptual = perceptual if config.weights.perceptual else None
+        self.sequence, self.model, self.config, self.preview = sequence, model, config, context.preview
+        self.perceptual = context.perceptual if config.weights.perceptual else None
         self.iteration = 0
-        attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence))
-        super().__init__((*groups, *attributes), config.optimiser(), distributed)
+        self._told_of_normals = False
+        attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
+        super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
-        """The step's frames and cameras; those of the next are read meanwhile."""
+        """Return the step's frames and cameras; those of the next are read meanwhile."""
         self.iteration = iteration
         now, soon = (
             self.sequence.items(k, count=self.config.poses_per_step, views=self.config.views, seed=self.config.seed)
@@ -133,33 +164,42 @@ class PhotometricTask(OptimizationTask):
 
     @abstractmethod
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Mean over the item's views, and its terms."""
+        """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
-        """The item's photographs, at half their size in the coarse part of the training."""
+        """Return the item's photographs, at half their size in the coarse part of the training."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
         coarse = self.iteration < self.config.coarse * self.config.iterations
         return [view.halved() for view in views] if coarse else views
 
     def compared(
-        self, posed: PosedAvatar, views: Sequence[View], targets: Sequence[Target] | None = None, **options: Any
-    ) -> tuple[Tensor, dict[str, float], list[Rendering]]:
-        """Mean reconstruction loss of a pose over views, its terms, and the renderings.
+        self,
+        posed: PosedAvatar,
+        views: Sequence[View],
+        targets: Sequence[Target] | None = None,
+        *,
+        extra: Float[Tensor, "N D"] | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, float], list[Rendering]]:
+        """Return the mean reconstruction loss of a pose over views, its terms, and the renderings.
 
         Args:
-            targets: in the place of the photographs. options: of `render_view`.
+            targets: in the place of the photographs. extra: more values of the Gaussians to draw.
         """
         weights = self.config.weights
         turn = self.iteration % self.config.perceptual_every == 0
         if self.config.perceptual_every > 1:
             scaled = weights.perceptual * self.config.perceptual_every
-            weights = ReconstructionWeights(**{**asdict(weights), "perceptual": scaled})
-        total, terms, renderings = posed.vertices.new_zeros(()), [], []
+            weights = replace(weights, perceptual=scaled)
+        total = posed.vertices.new_zeros(())
+        terms: list[dict[str, float]] = []
+        renderings: list[Rendering] = []
         for index, view in enumerate(views):
             target = targets[index] if targets else photograph(view, self.sequence.background)
             normals = bool(weights.normal) and target.normals is not None
+            if weights.normal and not normals:
+                self._tell_of_normals(view)
             rendering = render_view(
-                posed, index, view, self.sequence.background, eps2d=self.config.eps2d, normals=normals, **options
+                posed, index, view, self.sequence.background, eps2d=self.config.eps2d, normals=normals, extra=extra
             )
             loss, figures = reconstruction_loss(
                 rendering, target, weights, perceptual=self.perceptual if turn else None
@@ -172,69 +212,48 @@ class PhotometricTask(OptimizationTask):
         return total, means, renderings
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Figures of held-out cameras at training frames, and at held-out frames, where there are any."""
-        splits = self.sequence.capture.splits
-        cameras = splits.novel_view_cameras or splits.train_cameras[:2]
-        out: dict[str, Any] = {"mean": {}}
-        images: dict[str, np.ndarray] = {}
-        for kind, frames in (("novel_view", self.sequence.train_frames), ("novel_pose", splits.novel_pose_frames)):
-            quality = {}
-            for frame in spread_inside(frames, self.config.evaluated):
-                for camera in cameras:
-                    if self.sequence.capture.file(camera, frame) is None:
-                        continue
-                    view, name = self.sequence.whole_view(camera, frame), f"{camera} {frame}"
-                    if view.alpha.any():  # a view of nobody measures nothing
-                        quality[name], images[name] = self.measure(view, frame)
-            if quality:
-                out[kind] = mean_quality(quality)
-        out["mean"] = out.get("novel_view", {})
+        """Return mean figures of the measured views by kind, those of "novel_view" as "mean" too."""
+        quality, images = self.measure_views()
         self.preview(images)
-        return out
+        means = {kind: mean_quality(views) for kind, views in quality.items()}
+        return {"mean": means.get("novel_view", {}), **means}
 
-    def measure(self, view: View, frame: int) -> tuple[Any, np.ndarray]:
-        """Figures and the rendered uint8 image of a whole view."""
+    def measure_views(self) -> tuple[dict[str, dict[str, ViewQuality]], dict[str, np.ndarray]]:
+        """Return figures of the measured views by kind and name, and their rendered (H, W, 3) uint8 images by name."""
+        quality: dict[str, dict[str, ViewQuality]] = {}
+        images: dict[str, np.ndarray] = {}
+        for measured in self.sequence.measured_views(self.config.evaluated):
+            of_view, images[measured.name] = self.measure(measured.view, measured.frame)
+            quality.setdefault(measured.kind, {})[measured.name] = of_view
+        return quality, images
+
+    def measure(self, view: View, frame: int) -> tuple[ViewQuality, UInt8[np.ndarray, "H W 3"]]:
+        """Return figures and the rendered image of a whole view."""
         with torch.no_grad():
             posed = self.model(self.sequence.motion(frame), camera_centers_of([view]))
             seen = render_view(posed, 0, view, self.sequence.background, eps2d=self.config.eps2d)
-            quality = view_quality(view, seen.image, seen.alpha, self.sequence.background, head=None)
+            quality = view_quality(view, seen.image, seen.alpha, self.sequence.background, head=self.head_box_of(view))
         return quality, eight_bit(seen.image).numpy()
 
+    def head_box_of(self, view: View) -> Box | None:
+        """Return the box of the head in a measured view, to measure it apart; None leaves it out."""
+        return None
+
+    def _tell_of_normals(self, view: View) -> None:
+        """Say once that a term of the loss which was asked for is missing."""
+        if not self._told_of_normals:
+            self._told_of_normals = True
+            log.warning(
+                "the loss has no normal term (weight %g) where a view has no normal map; the first such view is %s's",
+                self.config.weights.normal,
+                view.name,
+            )
+
     def generator(self, *key: int) -> np.random.Generator:
-        """Noise that the seed, the step and a key decide."""
+        """Return noise that the seed, the step and a key decide."""
         return np.random.default_rng((self.config.seed, 2, self.iteration, *key))
 
 
 def photograph(view: View, background: Tensor) -> Target:
-    """The view's own pixels."""
+    """Return the view's own pixels as what a rendering should look like."""
     return Target(view.composited(background), view.opacity(), view.normals)
-
-
-def attribute_groups(gaussians: LearnedGaussians, multiple: float, pixel: float) -> list[ParameterGroup]:
-    """Groups of the Gaussians' attributes at `multiple` times the reference fit's rates; none for 0, which freezes.
-
-    Args:
-        pixel: metres, the unit of the offsets' rates.
-    """
-    if not multiple:
-        gaussians.requires_grad_(False)
-        return []
-    rates, unit = LearningRates(), {"normal_offset": pixel, "offset": pixel}
-    gaussians.requires_grad_(True)
-    return [
-        ParameterGroup(
-            f"gaussians.{name}",
-            {name: getattr(gaussians, name)},
-            multiple * getattr(rates, name) * unit.get(name, 1.0),
-            rates.lr_final_factor,
-        )
-        for name in LEARNED
-        if getattr(gaussians, name).numel()
-    ]
-
-
-def pixel_size(sequence: AvatarSequence) -> float:
-    """Metres that a pixel covers at the person: median over the training cameras of `distance / f`."""
-    center = sequence.rig.pose(sequence.motion(sequence.train_frames[0])).mean(0).cpu().numpy()
-    cameras = [sequence.capture.cameras[name] for name in sequence.train_cameras]
-    return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from smplxpp.core.errors import InputError
 
+S = TypeVar("S")
 T = TypeVar("T")
 PATIENCE = timedelta(hours=4)
 """How long processes wait for each other: evaluations of the first one are within it."""
@@ -41,8 +42,8 @@ class Distributed:
         """Whether this is the process that evaluates and writes."""
         return self.rank == 0
 
-    def share_out(self, items: Sequence[Any], work: Callable[[Any], T | None]) -> list[T | None]:
-        """`work(item)` of every item, on every process; item k is done by process `k mod world_size`.
+    def share_out(self, items: Sequence[S], work: Callable[[S], T | None]) -> list[T | None]:
+        """Return `work(item)` of every item, on every process; item k is done by process `k mod world_size`.
 
         A process leaves its other items out after one for which `work` gives None; theirs are None as well.
 
@@ -86,7 +87,7 @@ class Distributed:
                 parameter.grad.copy_(summed.view(parameter.shape))
 
     def run_on_rank0(self, work: Callable[[], T]) -> T:
-        """What `work` gives on the first process, on all; the others wait. Its error is raised on all."""
+        """Return what `work` gives on the first process, on all; the others wait. Its error is raised on all."""
         if self.world_size == 1:
             return work()
         box: list[Any] = [None, None]
@@ -107,7 +108,7 @@ class Distributed:
 
 @contextmanager
 def join_processes(device: str = "cpu") -> Iterator[Distributed]:
-    """The processes that `torchrun` started, joined for the block; this one alone where it did not.
+    """Give the processes that `torchrun` started, joined for the block; this one alone where it did not.
 
     Args:
         device: "cpu" (messages by gloo) or "cuda" (NCCL; each process takes the GPU of its LOCAL_RANK).
@@ -139,7 +140,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
 
 
 def _number(name: str) -> int:
-    """A variable of torchrun's environment."""
+    """Return a number of torchrun's environment."""
     text = os.environ.get(name, "")
     if not text.isdigit():
         raise InputError(
@@ -152,7 +153,7 @@ def _number(name: str) -> int:
 
 
 def _words(error: Exception) -> tuple[str, dict[str, str]]:
-    """An error as the arguments of an `InputError`."""
+    """Return an error as the arguments of an `InputError`."""
     if isinstance(error, InputError):
         return error.subject, {"expected": error.expected, "received": error.received, "remedy": error.remedy}
     return "the first process", {"expected": "to go on", "received": f"{type(error).__name__}: {error}"}

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 from avatar.gaussians.sampling import SamplingConfig
+from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.training.engine.learning_rates import LearningRates
-from smplxpp.core.errors import InputError
+from avatar.training.engine.photometric_task import PhotometricConfig
+from smplxpp.core.validation import require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +55,23 @@ class FitConfig:
             ("evaluations", 1, math.inf),
             ("seed", 0, math.inf),
         ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and least <= value <= most):
-                limit = f" and at most {most:g}" if math.isfinite(most) else ""
-                raise InputError(f"fit: {name}", expected=f"a number, at least {least:g}{limit}", received=repr(value))
+            require_between(f"fit: {name}", getattr(self, name), least, most)
+
+    def photometric(self) -> PhotometricConfig:
+        """Return what the fit shares with the other trainings on photographs: everything but start and penalties."""
+        return PhotometricConfig(
+            iterations=self.iterations,
+            schedule="exponential",
+            attributes=1.0,
+            rates=self.rates,
+            weights=ReconstructionWeights(
+                l1=1.0 - self.dssim, dssim=self.dssim, perceptual=0.0, normal=0.0, alpha=self.alpha
+            ),
+            eps2d=self.eps2d,
+            betas=(0.9, 0.99),
+            evaluations=self.evaluations,
+            seed=self.seed,
+        )
 
 
 PRESETS: dict[str, FitConfig] = {

@@ -2,44 +2,32 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from avatar.data.one_frame import FRAME, OneFrame
+from avatar.data.sequence import Item, camera_centers_of
 from avatar.data.views import View
 from avatar.export.splats import Splats, posed_splats
-from avatar.gaussians.binding import BoundGaussians, WorldGaussians, world_from_frames
+from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.regularizers import offset_penalty, scale_penalty
-from avatar.gaussians.sampling import sample_on_mesh
-from avatar.gaussians.spherical_harmonics import view_colors
-from avatar.losses.psnr import psnr_from_mse
-from avatar.losses.ssim import ssim
-from avatar.metrics.view_quality import (
-    Box,
-    ViewQuality,
-    eight_bit,
-    head_box,
-    head_vertices,
-    mean_quality,
-    view_quality,
-)
-from avatar.models.learned_gaussians import LEARNED
-from avatar.render.api import rasterize
+from avatar.metrics.view_quality import Box, ViewQuality, head_box, head_vertices, mean_quality
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
-from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
+from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
 from avatar.training.reference_fit.config import FitConfig
-from avatar.training.reference_fit.initial_colors import colors_from_views
+from avatar.training.reference_fit.initial_colors import initial_gaussians
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +35,13 @@ class FitScene:
     """What a fit is made on.
 
     Attributes:
-        template: the clothed body. vertices: (V, 3) of it in the frame's pose, metres.
-        train, held_out: whole views; `held_out` are measured.
-        background: (3,) sRGB in [0, 1] behind the person.
+        template: the clothed body. vertices: of it in the frame's pose, metres.
+        train, held_out: whole views, each with a name of its own; `held_out` are measured.
+        background: sRGB in [0, 1] behind the person.
     """
 
     template: Template
-    vertices: np.ndarray
+    vertices: Float[np.ndarray, "V 3"]
     train: Sequence[View]
     held_out: Sequence[View] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -82,7 +70,7 @@ class FitResult:
     splats: Splats
     progress: Progress
     quality: dict[str, ViewQuality]
-    images: dict[str, np.ndarray]
+    images: dict[str, UInt8[np.ndarray, "_ _ 3"]]
     heads: dict[str, Box | None]
 
 
@@ -99,8 +87,9 @@ def fit_reference(
 ) -> FitResult:
     """Fit Gaussians to a frame by gradient descent on `(1 - s) L1 + s (1 - SSIM)` of composited images.
 
-    The mesh stands still; offsets, scales, rotations, opacities and colours are learned. Colours start from the
-    photographs. The same seed gives the same bits at one number of threads, interrupted or not.
+    A student without field is trained as the others are, on one frame. The mesh stands still; offsets, scales,
+    rotations, opacities and colours are learned. Colours start from the photographs. The same seed gives the same bits
+    at one number of threads, interrupted or not.
 
     Args:
         folder: for `metrics.jsonl` and the checkpoint; a checkpoint with this `key` in it is taken up, one of
@@ -113,155 +102,72 @@ def fit_reference(
     Raises:
         InputError: unusable input; `DivergedError` when the loss is not finite.
     """
-    task = FitTask(scene, config, device, preview)
+    task = FitTask(scene, config, device, TaskContext(preview=preview))
     loop = LoopConfig(
         iterations=config.iterations,
-        evaluate_every=max(1, config.iterations // config.evaluations),
+        evaluate_every=task.config.evaluate_every,
         max_seconds=max_seconds,
     )
     progress = run_training(task, loop, Path(folder), key=key, report=report)
-    quality, images = task.measure((*scene.held_out, *scene.train))
-    gaussians = task.gaussians().to(device="cpu")
+    names = [view.name for view in (*scene.held_out, *scene.train)]
+    measured = {name: task.measure(task.sequence.whole_view(name), FRAME) for name in names}
+    quality = {name: of_view for name, (of_view, _) in measured.items()}
+    images = {name: image for name, (_, image) in measured.items()}
+    gaussians = task.student.gaussians.snapshot()
     splats = posed_splats(gaussians, torch.tensor(scene.vertices), torch.tensor(scene.template.faces))
     return FitResult(gaussians, splats, progress, quality, images, task.heads)
 
 
-class FitTask(OptimizationTask):
-    """A reference fit, as `run_training` wants it; a step renders one view."""
+class FitTask(PhotometricTask):
+    """A reference fit: a student without field or blend shapes learns its Gaussians' attributes on one frame.
 
-    def __init__(
-        self,
-        scene: FitScene,
-        config: FitConfig,
-        device: str = "cpu",
-        preview: Callable[[Mapping[str, np.ndarray]], None] = lambda images: None,
-    ) -> None:
-        self.scene, self.config, self.preview = scene, config, preview
-        template, mesh = scene.template, scene.template.mesh.with_vertices(scene.vertices)
-        faces = torch.tensor(template.faces, device=device)
-        self.frames = triangle_frames(torch.tensor(scene.vertices, dtype=torch.float32, device=device), faces)
-        start = sample_on_mesh(template, config.sampling).to(device=device)
-        placed = world_from_frames(start, self.frames)
-        dc, seen = colors_from_views(
-            placed.means.double().cpu().numpy(),
-            placed.normals.double().cpu().numpy(),
-            start.dc,
-            mesh=mesh,
-            views=scene.train,
+    A step renders one view. To the loss of every photometric training come the penalties on scales and offsets.
+    """
+
+    sequence: OneFrame
+
+    def __init__(self, scene: FitScene, config: FitConfig, device: str = "cpu", context: TaskContext = ALONE) -> None:
+        frame = OneFrame(
+            scene.template,
+            scene.vertices,
+            scene.train,
+            scene.held_out,
+            background=scene.background,
+            margin=config.margin,
+            device=device,
         )
-        self.seen_share = float(seen.mean())
-        self.start = replace(start, dc=dc)
-        self.parameters = {name: getattr(self.start, name).clone().requires_grad_() for name in LEARNED}
-        pixel = pixel_size(scene)
-        unit = {"normal_offset": pixel, "offset": pixel}
-        groups = [
-            ParameterGroup(
-                "gaussians",
-                {name: value},
-                getattr(config.rates, name) * unit.get(name, 1.0),
-                config.rates.lr_final_factor,
-            )
-            for name, value in self.parameters.items()
-        ]
-        super().__init__(
-            groups,
-            OptimiserConfig(
-                iterations=config.iterations,
-                schedule="exponential",
-                betas=(0.9, 0.99),
-                eps=1e-15,
-            ),
-        )
-        self.train = [view.cropped(config.margin).to(device) for view in scene.train]
-        self.held_out = [view.to(device) for view in scene.held_out]
-        self.background = torch.tensor(scene.background, dtype=torch.float32, device=device)
-        corners = scene.vertices[head_vertices(template)]
+        start = initial_gaussians(frame.rig, scene.vertices, scene.train, config.sampling)
+        self.fit_config, self.held_out = config, bool(scene.held_out)
+        self.student = Student(StudentConfig(field=None), frame.rig, start, ())
+        super().__init__(frame, self.student, config.photometric(), [], context)
+        self.frames = triangle_frames(frame.motion(FRAME).rest, frame.rig.faces)
+        corners = scene.vertices[head_vertices(scene.template)]
         self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
 
-    def gaussians(self) -> BoundGaussians:
-        """The Gaussians as they stand, without gradients."""
-        return replace(self.start, **{name: value.detach().clone() for name, value in self.parameters.items()})
+    def name_of(self, item: Item) -> str:
+        """Return the name of the step's view."""
+        return f"view {' '.join(item.cameras)}"
 
-    def render(self, view: View) -> tuple[Tensor, Tensor]:
-        """(H, W, 3) image and (H, W) opacity of a view, with gradients to the parameters."""
-        bound = replace(self.start, **self.parameters)
-        world = world_from_frames(bound, self.frames)
-        return self.draw(world, self.colors(bound, world, view), view)
+    def loss(self, item: Item) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a view, rendered, and its terms."""
+        views = self.views(item)
+        return self.penalised(self.student(self.sequence.motion(item.frame), camera_centers_of(views)), views)
 
-    def colors(self, bound: BoundGaussians, world: WorldGaussians, view: View) -> Tensor:
-        """(1, N, 3) as the camera of a view sees them; directions count as constants."""
-        return view_colors(bound, self.frames, world.means.detach(), view.position[None])
+    def penalised(self, posed: PosedAvatar, views: Sequence[View]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of the posed Gaussians in views, penalties included, and its terms."""
+        total, terms, _ = self.compared(posed, views)
+        total = total + self.fit_config.scale_penalty * scale_penalty(posed.bound)
+        total = total + self.fit_config.offset_penalty * offset_penalty(posed.bound, self.frames)
+        return total, {"loss": float(total.detach()), **terms}
 
-    def draw(self, world: WorldGaussians, colors: Tensor, view: View) -> tuple[Tensor, Tensor]:
-        """Rasterise; parameters are checked for NaN once a step, not here."""
-        image, alpha, _ = rasterize(
-            world.means,
-            world.quats,
-            world.scales,
-            world.opacities,
-            colors,
-            view.viewmat[None],
-            view.K[None],
-            view.camera.width,
-            view.camera.height,
-            background=self.background,
-            eps2d=self.config.eps2d,
-            check=False,
-        )
-        return image[0], alpha[0, ..., 0]
-
-    def micro_batches(self, iteration: int) -> list[View]:
-        """One view."""
-        return [self.train[self.view_index(iteration)]]
-
-    def name_of(self, item: View) -> str:
-        return f"view {item.name}"
-
-    def loss(self, item: View) -> tuple[Tensor, dict[str, float]]:
-        """Of a view, rendered."""
-        return self.compare(item, *self.render(item))
-
-    def compare(self, view: View, image: Tensor, alpha: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """The loss of a rendered view, and its terms as numbers."""
-        config, real = self.config, view.composited(self.background)
-        bound = replace(self.start, **self.parameters)
-        l1 = (image - real).abs().mean()
-        similarity = ssim(image, real)
-        total = (1.0 - config.dssim) * l1 + config.dssim * (1.0 - similarity)
-        if config.alpha:
-            total = total + config.alpha * (alpha - view.opacity()).abs().mean()
-        total = total + config.scale_penalty * scale_penalty(bound)
-        total = total + config.offset_penalty * offset_penalty(bound, self.frames)
-        square = (image.detach().clamp(0.0, 1.0) - real).square().mean()
-        psnr = psnr_from_mse(square.item())
-        return total, {"loss": total.item(), "l1": l1.item(), "ssim": similarity.item(), "psnr_crop": psnr}
-
-    def view_index(self, iteration: int) -> int:
-        """Every view once an epoch, in an order that the seed and the epoch alone decide."""
-        epoch, place = divmod(iteration, len(self.train))
-        return int(np.random.default_rng([self.config.seed, epoch]).permutation(len(self.train))[place])
-
-    def measure(self, views: Sequence[View]) -> tuple[dict[str, ViewQuality], dict[str, np.ndarray]]:
-        """Figures and rendered uint8 images of whole views."""
-        quality, images = {}, {}
-        with torch.no_grad():
-            for view in views:
-                view = view.to(self.background.device)
-                image, alpha = self.render(view)
-                quality[view.name] = view_quality(view, image, alpha, self.background, head=self.heads[view.name])
-                images[view.name] = eight_bit(image).numpy()
-        return quality, images
+    def head_box_of(self, view: View) -> Box | None:
+        """Return the box of the head in a view."""
+        return self.heads[view.name]
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Figures of the held-out views; of the training views where none is held out."""
-        quality, images = self.measure(self.held_out or self.scene.train)
+        """Return figures of the held-out views; of the training views where none is held out."""
+        measured, images = self.measure_views()
+        (quality,) = measured.values()
         self.preview(images)
-        views = {name: asdict(q) for name, q in quality.items()}
-        return {"held_out": bool(self.held_out), "mean": mean_quality(quality), "views": views}
-
-
-def pixel_size(scene: FitScene) -> float:
-    """Metres that a pixel covers at the person: median over the training views of `distance / f`."""
-    center = scene.vertices.mean(0)
-    sizes = [np.linalg.norm(view.camera.position - center) / view.camera.K[0, 0] for view in scene.train]
-    return float(np.median(sizes))
+        views = {name: asdict(of_view) for name, of_view in quality.items()}
+        return {"held_out": self.held_out, "mean": mean_quality(quality), "views": views}

@@ -1,15 +1,21 @@
-"""Colours to start from: what the photographs show where each Gaussian lies."""
+"""Gaussians to start from, coloured as the photographs: what the photographs show where each Gaussian lies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 from torch import Tensor
 
 from avatar.data.views import View
+from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.rig.rig import Rig
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
@@ -20,21 +26,42 @@ MIN_COSINE = 0.2
 MIN_OPACITY = 0.99
 
 
+def initial_gaussians(
+    rig: Rig, vertices: Float[np.ndarray, "V 3"], views: Sequence[View], sampling: SamplingConfig
+) -> BoundGaussians:
+    """Sample Gaussians on a template and colour them from whole views of it at `vertices`, metres."""
+    start = sample_on_mesh(rig.template, sampling).to(device=rig.device)
+    placed = world_from_frames(start, triangle_frames(rig.motion_to(vertices).rest, rig.faces))
+    dc, _ = colors_from_views(
+        placed.means.double().cpu().numpy(),
+        placed.normals.double().cpu().numpy(),
+        start.dc,
+        mesh=rig.template.mesh.with_vertices(vertices),
+        views=views,
+    )
+    return replace(start, dc=dc)
+
+
 def colors_from_views(
-    points: np.ndarray, normals: np.ndarray, fallback: Tensor, *, mesh: TriangleMesh, views: Sequence[View]
-) -> tuple[Tensor, np.ndarray]:
-    """Mean colour of points over the views that see them, weighted by the pixels a square metre has there.
+    points: Float64[np.ndarray, "N 3"],
+    normals: Float64[np.ndarray, "N 3"],
+    fallback: Float[Tensor, "N 3"],
+    *,
+    mesh: TriangleMesh,
+    views: Sequence[View],
+) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
+    """Return the mean colour of points over the views that see them, weighted by the pixels a square metre has there.
 
     `c = sum_v w_v I_v(p) / sum_v w_v`, `w_v = cos^2 (f / distance)^2` where the z-buffer of the mesh shows the point,
     no silhouette edge is within a pixel, and the mask is opaque; 0 elsewhere.
 
     Args:
-        points, normals: (N, 3) in the world; unit normals.
-        fallback: (N, 3) colours of the points that no view sees.
+        points, normals: in the world, metres; unit normals.
+        fallback: colours of the points that no view sees.
         mesh: what hides points from cameras.
 
     Returns:
-        (N, 3) float32 colours, and (N,) bool: which points some view saw.
+        Colours, and which points some view saw.
     """
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
     for view in views:

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.render.avatar_view import Rendering
 from avatar.rig.rig import Motion
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.student.distillation import DistillationTargets
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_choice
+from smplxpp.core.validation import require_at_least, require_between, require_choice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +55,8 @@ class BakeConfig(PhotometricConfig):
         super().__post_init__()
         require_choice("bake: images", self.images, ("teacher", "photographs"))
         for name in ("imagined", "nonrigid", "semantic", "code_lr_factor", "pose_noise"):
-            if not getattr(self, name) >= 0.0:
-                raise InputError(f"bake: {name}", expected="at least 0", received=repr(getattr(self, name)))
-        if not 0.0 <= self.null_share <= 1.0:
-            raise InputError("bake: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+            require_at_least(f"bake: {name}", getattr(self, name), 0.0)
+        require_between("bake: null_share", self.null_share, 0.0, 1.0)
 
 
 class BakeTask(PhotometricTask):
@@ -68,27 +67,31 @@ class BakeTask(PhotometricTask):
         teacher: frozen; None: `L_rec` alone, on photographs.
     """
 
+    config: BakeConfig
+
     def __init__(
         self,
         sequence: AvatarSequence,
         student: Student,
         config: BakeConfig,
+        context: TaskContext = ALONE,
         *,
         teacher: TeacherAvatar | None = None,
-        **options: Any,
     ) -> None:
         groups = []
-        if student.field is not None:
+        if student.field is not None and student.codes is not None:
             groups = [
                 ParameterGroup("field", dict(student.field.named_parameters()), config.lr, config.lr_final_factor),
                 ParameterGroup(
                     "codes", {"codes": student.codes.codes}, config.lr * config.code_lr_factor, config.lr_final_factor
                 ),
             ]
-        super().__init__(sequence, student, config, groups, **options)
-        self.student, self.config, self.source = student, config, None
+        super().__init__(sequence, student, config, groups, context)
+        self.student, self.targets = student, None
+        if config.null_share:
+            show_null_code(student)
         if teacher is not None:
-            self.source = DistillationTargets(
+            self.targets = DistillationTargets(
                 teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)
             )
             teacher_config = teacher.config
@@ -98,34 +101,40 @@ class BakeTask(PhotometricTask):
             self.labels = semantic_labels(sequence.rig, student.gaussians(), tau=config.tau)
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Of one frame."""
-        motion = self._seen(self.sequence.motion(item.frame))
+        """Return the loss of one frame and its terms."""
+        motion = self._seen(self.sequence.motion(item.frame), item.frame)
         views = self.views(item)
         posed = self.student(motion, camera_centers_of(views))
-        if self.source is None:
+        if self.targets is None:
             total, terms, _ = self.compared(posed, views)
             return total, {"loss": float(total.detach()), **terms}
         semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
-        lessons = self.source.lessons(item.frame, views) if semantic or imitates else []
-        targets = [lesson.target for lesson in lessons] if imitates else None
+        shown = self.targets.of_views(item.frame, views) if semantic or imitates else []
+        targets = [one.target for one in shown] if imitates else None
         total, terms, renderings = self.compared(posed, views, targets, extra=self.labels if semantic else None)
         if semantic:
-            pairs = zip(renderings, lessons, strict=True)
-            differences = [(drawn.extra - lesson.labels).abs().mean() for drawn, lesson in pairs]
+            pairs = zip(renderings, shown, strict=True)
+            differences = [(_labels(drawn) - one.labels).abs().mean() for drawn, one in pairs]
             terms["semantic"] = float(torch.stack(differences).mean().detach())
             total = total + self.config.semantic * torch.stack(differences).mean()
         if self.config.nonrigid and posed.displacements is not None:
-            nonrigid = self.displacement_loss(posed.displacements, self.source.displacements(item.frame))
+            nonrigid = self.displacement_loss(posed.displacements, self.targets.displacements(item.frame))
             terms["nonrigid"] = float(nonrigid.detach())
             total = total + self.config.nonrigid * nonrigid
         return total, {"loss": float(total.detach()), **terms}
 
-    def _seen(self, motion: Motion) -> Motion:
-        """The pose as the field is shown it."""
-        noise = self.generator(motion.frame)
+    def _seen(self, motion: Motion, frame: int) -> Motion:
+        """Return the pose as the field is shown it."""
+        noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
             motion = motion.without_code()
         if self.config.pose_noise:
             moved = torch.tensor(noise.normal(size=len(motion.pose)) * self.config.pose_noise)
             motion = replace(motion, pose=motion.pose + moved.to(motion.pose))
         return motion
+
+
+def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:
+    """Return the semantic map that was drawn with an image."""
+    assert rendering.extra is not None
+    return rendering.extra

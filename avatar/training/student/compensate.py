@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.models.student import Student
+from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask, pixel_size
+from avatar.training.engine.photometric_task import (
+    ALONE,
+    PhotometricConfig,
+    PhotometricTask,
+    TaskContext,
+)
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +42,7 @@ class CompensateConfig(PhotometricConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 <= self.null_share <= 1.0:
-            raise InputError("compensation: null_share", expected="a share in [0, 1]", received=repr(self.null_share))
+        require_between("compensation: null_share", self.null_share, 0.0, 1.0)
 
 
 class CompensateTask(PhotometricTask):
@@ -47,7 +52,11 @@ class CompensateTask(PhotometricTask):
         student: with blend shapes.
     """
 
-    def __init__(self, sequence: AvatarSequence, student: Student, config: CompensateConfig, **options: Any) -> None:
+    config: CompensateConfig
+
+    def __init__(
+        self, sequence: AvatarSequence, student: Student, config: CompensateConfig, context: TaskContext = ALONE
+    ) -> None:
         shapes = student.blend_shapes
         if shapes is None:
             raise InputError("student of the compensation", expected="blend shapes", received="none")
@@ -63,11 +72,11 @@ class CompensateTask(PhotometricTask):
             ),
             ParameterGroup("colors", {"C": shapes.C}, config.color_lr, config.lr_final_factor),
         ]
-        super().__init__(sequence, student, config, groups, **options)
-        self.student, self.config = student, config
+        super().__init__(sequence, student, config, groups, context)
+        self.student = student
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Of one frame."""
+        """Return the loss of one frame and its terms."""
         views = self.views(item)
         motion = self.sequence.motion(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
@@ -17,6 +18,7 @@ from avatar.losses.reconstruction import Target
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.avatar_view import render_view
 from avatar.render.mesh_maps import MeshMapsTensor, front_back_maps
+from avatar.rig.posed import PosedAvatar
 
 SEEN = 0.5
 """Opacity from which a blended normal counts."""
@@ -27,20 +29,20 @@ class DistillationTarget:
     """What the student is to imitate in one view.
 
     Attributes:
-        target: the teacher's image, opacity and, if asked for, normals. labels: (H, W, 3) its semantic map.
+        target: the teacher's image, opacity and, if asked for, normals. labels: its semantic map.
     """
 
     target: Target
-    labels: Tensor
+    labels: Float[Tensor, "H W 3"]
 
 
 class DistillationTargets:
-    """The frozen teacher, asked for lessons; the latest used are kept, in half precision.
+    """The frozen teacher, asked for targets; the latest used are kept, in half precision.
 
     Args:
         teacher: its weights are not changed. sequence: of the frames.
-        background: (3,) behind the person. eps2d: see `rasterize`.
-        tau: of the semantic labels. normals: whether lessons have them.
+        eps2d: see `rasterize`.
+        tau: of the semantic labels. normals: whether targets have them.
         max_bytes: of what is kept.
     """
 
@@ -59,8 +61,8 @@ class DistillationTargets:
         self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
         self._kept = ByteCache(max_bytes)
 
-    def displacements(self, frame: int) -> Tensor:
-        """(2, R, R, 3) metres, the teacher's position maps dU of a frame; the surface itself where it was followed."""
+    def displacements(self, frame: int) -> Float[Tensor, "2 R R 3"]:
+        """Return the teacher's position maps dU of a frame, metres; the surface itself where it was followed."""
 
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
@@ -71,35 +73,36 @@ class DistillationTargets:
 
     @cached_property
     def _maps(self) -> MeshMapsTensor:
-        """The T-pose's, as large as the teacher's."""
+        """Maps of the T-pose, as large as the teacher's."""
         rig, teacher = self.sequence.rig, self.teacher
         return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
 
-    def lessons(self, frame: int, views: Sequence[View]) -> list[DistillationTarget]:
-        """What the teacher shows in views of a frame."""
+    def of_views(self, frame: int, views: Sequence[View]) -> list[DistillationTarget]:
+        """Return what the teacher shows in views of a frame."""
         keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
         # Taken before others are put in, which may push them out.
-        lessons = {k: self._kept.get(key, tuple) for k, key in enumerate(keys) if key in self._kept}
-        missing = [k for k in range(len(keys)) if k not in lessons]
+        found = {k: self._kept.get(key, tuple) for k, key in enumerate(keys) if key in self._kept}
+        missing = [k for k in range(len(keys)) if k not in found]
         if missing:
             with torch.no_grad():
                 camera_centers = camera_centers_of([views[k] for k in missing])
                 posed = self.teacher(self.sequence.motion(frame), camera_centers)
                 for index, k in enumerate(missing):
                     draw = partial(self._draw, posed, index, views[k])
-                    lessons[k] = self._kept.get(keys[k], draw)
-        return [_lesson(lessons[k]) for k in range(len(keys))]
+                    found[k] = self._kept.get(keys[k], draw)
+        return [_target(found[k]) for k in range(len(keys))]
 
-    def _draw(self, posed, index: int, view: View) -> tuple[Tensor, ...]:
+    def _draw(self, posed: PosedAvatar, index: int, view: View) -> tuple[Tensor, ...]:
         seen = render_view(
             posed, index, view, self.sequence.background, eps2d=self.eps2d, normals=self.normals, extra=self.labels
         )
+        assert seen.extra is not None
         tensors = [seen.image, seen.alpha, seen.extra]
-        if self.normals:
+        if seen.normals is not None:
             tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
         return tuple(tensor.half() for tensor in tensors)
 
 
-def _lesson(tensors: tuple[Tensor, ...]) -> DistillationTarget:
+def _target(tensors: tuple[Tensor, ...]) -> DistillationTarget:
     image, alpha, labels, *normals = (tensor.float() for tensor in tensors)
     return DistillationTarget(Target(image, alpha, normals[0] if normals else None), labels)

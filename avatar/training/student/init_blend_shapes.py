@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence
@@ -27,6 +28,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     so that B stays smooth between the few that there are.
     """
     shapes, rig = student.blend_shapes, sequence.rig
+    assert shapes is not None, "a student with blend shapes"
     bound = student.gaussians()
     local = triangle_frames(rig.vertices, rig.faces).rotations[bound.face_index]
     residuals, poses = [], []
@@ -34,8 +36,9 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
         for frame in spread_inside(sequence.train_frames, FRAMES):
             motion = sequence.motion(frame)
             left = track.displacements(frame)
-            if student.field is not None:
-                left = left - student.displacements(motion)
+            moved = student.displacements(motion)
+            if moved is not None:
+                left = left - moved
             at_gaussians = on_triangles(left[rig.faces[bound.face_index]], bound.barycentric)
             residuals.append(torch.einsum("nij,ni->nj", local, at_gaussians)[shapes.active])
             poses.append(motion.pose)
@@ -44,8 +47,8 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     _fit(shapes, pose, targets)
 
 
-def _components(shapes: BlendShapes, residuals: Tensor) -> Tensor:
-    """Set U from (T, M, 3) residuals; (T, parts, n_b) coefficients."""
+def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float[Tensor, "T parts n_b"]:
+    """Set U from residuals in metres; return the coefficients."""
     head, body, frames = shapes.config.head_shapes, shapes.config.body_shapes, len(residuals)
     count = min(body, frames)
     out = residuals.new_zeros(frames, shapes.config.parts, body)
@@ -66,7 +69,7 @@ def _components(shapes: BlendShapes, residuals: Tensor) -> Tensor:
     return out
 
 
-def _fit(shapes: BlendShapes, pose: Tensor, targets: Tensor) -> None:
+def _fit(shapes: BlendShapes, pose: Float[Tensor, "T 63"], targets: Float[Tensor, "T parts n_b"]) -> None:
     """Bring B(theta) to the coefficients."""
     network = shapes.body
     # Coefficients count as much as the motion that they stand for.

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
 from avatar.data.sequence import AvatarSequence
 from avatar.models.front_back_assignment import assign_front_back
+from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -52,28 +54,35 @@ class PretrainFieldTask(PretrainTask):
         null_share: float,
         imagined: int,
     ) -> None:
+        field, codes = student.field, student.codes
+        assert field is not None and codes is not None, "a student with a field"
         groups = [
-            ParameterGroup("field", dict(student.field.named_parameters()), config.lr, config.lr_final_factor),
-            ParameterGroup("codes", {"codes": student.codes.codes}, config.lr * code_lr_factor, config.lr_final_factor),
+            ParameterGroup("field", dict(field.named_parameters()), config.lr, config.lr_final_factor),
+            ParameterGroup("codes", {"codes": codes.codes}, config.lr * code_lr_factor, config.lr_final_factor),
         ]
         frames = sequence.train_frames
         super().__init__(groups, config, len(frames) + imagined, seed)
         self.sequence, self.student, self.teacher = sequence, student, teacher
+        self.field, self.codes = field, codes
         self.null_share = null_share
-        self._lookup = _MapLookup(teacher, student.field.points)
+        if null_share or imagined:
+            show_null_code(student)
+        self._lookup = _MapLookup(teacher, field.points)
         self._known = ByteCache(KNOWN_BYTES)
         self.iteration = 0
 
     def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
+        """Return the numbers of the poses of a step."""
         self.iteration = iteration
         return super().micro_batches(iteration)
 
     def name_of(self, item: tuple[int, ...]) -> str:
+        """Return the poses of a batch."""
         frames = self.sequence.train_frames
         return "poses " + " ".join(str(frames[k]) if k < len(frames) else f"imagined {k - len(frames)}" for k in item)
 
     def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
-        """Of a batch of poses."""
+        """Return the loss of a batch of poses."""
         frames = self.sequence.train_frames
         draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
         shown = [
@@ -81,17 +90,17 @@ class PretrainFieldTask(PretrainTask):
             for k, draw in zip(item, draws, strict=True)
         ]
         pose, known = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
-        found = self.student.field.at_points(pose, self.student.codes(shown))
+        found = self.field.at_points(pose, self.codes(shown))
         loss = (found - known).abs().sum(-1).mean() / self.teacher.config.position_scale
         return loss, {"loss": float(loss.detach())}
 
     def _of(self, number: int) -> tuple[Tensor, ...]:
-        """theta (63,), and the teacher's displacements (K, 3) metres at the field's points."""
+        """Return theta (63,) and the teacher's displacements (K, 3) metres at the field's points."""
 
         def make() -> tuple[Tensor, ...]:
             motion, track = self._motion(number), self.teacher.track
             if motion.frame is not None and track is not None:
-                return motion.pose, track.displacements(motion.frame)[self.student.field.points]
+                return motion.pose, track.displacements(motion.frame)[self.field.points]
             return motion.pose, self._lookup(self.teacher.displacement_maps([motion]))[0]
 
         return self._known.get(number, make)
@@ -101,7 +110,7 @@ class PretrainFieldTask(PretrainTask):
         if number < len(frames):
             return sequence.motion(frames[number])
         noise = np.random.default_rng((self.seed, 5, number))
-        a, b = (sequence.capture.params(frames[k]) for k in noise.integers(len(frames), size=2))
+        a, b = (sequence.params(frames[k]) for k in noise.integers(len(frames), size=2))
         share = noise.uniform(-BEYOND, 1.0 + BEYOND)
         return sequence.rig.motion(replace(a, body_pose=a.body_pose + share * (b.body_pose - a.body_pose)))
 
@@ -119,6 +128,6 @@ class _MapLookup:
         self.sampler = MapSampler(teacher.frame, size, vertices, sides.front)
         self.stays = (sides.behind > HIDDEN) & ~rig.cloth_mask[points]
 
-    def __call__(self, maps: Tensor) -> Tensor:
-        """(B, 2, R, R, 3) -> (B, K, 3)."""
+    def __call__(self, maps: Float[Tensor, "B 2 R R 3"]) -> Float[Tensor, "B K 3"]:
+        """Return the displacements of maps at the points, metres."""
         return self.sampler(maps).masked_fill(self.stays[:, None], 0.0)

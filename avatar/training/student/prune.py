@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence
@@ -16,13 +17,14 @@ HEADER_BYTES = 16_384
 """More than the names and shapes of a model file take."""
 
 
-def coefficient_std(student: Student, sequence: AvatarSequence) -> Tensor:
-    """(parts, n) standard deviations of the blend shapes' coefficients over the training frames.
+def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor, "parts n"]:
+    """Return the standard deviations of the blend shapes' coefficients over the training frames.
 
     Args:
         student: with blend shapes.
     """
     shapes = student.blend_shapes
+    assert shapes is not None, "a student with blend shapes"
     rows = []
     with torch.no_grad():
         for frame in sequence.train_frames:
@@ -33,7 +35,7 @@ def coefficient_std(student: Student, sequence: AvatarSequence) -> Tensor:
 
 
 def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> tuple[Student, float]:
-    """The student with as many Gaussians' blend shapes as a compact file of `max_bytes` has room for.
+    """Return the student with as many Gaussians' blend shapes as a compact file of `max_bytes` has room for.
 
     Those that move and colour most over the training frames keep theirs (`BlendShapes.pruned`).
 
@@ -44,6 +46,7 @@ def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> t
         InputError: the Gaussians and networks alone are larger.
     """
     shapes = student.blend_shapes
+    assert shapes is not None, "a student with blend shapes"
     count, stored = shapes.count, student.state_dict()
     one = 2 * 3 * shapes.config.shapes * STORED_BYTES + 4  # U, C and the Gaussian's index in `active`
     tensors = {
@@ -67,5 +70,5 @@ def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> t
 
 
 def _compact_size(value: Tensor) -> int:
-    """Bytes of a number in a compact model file."""
+    """Return the bytes of a number in a compact model file."""
     return STORED_BYTES if value.is_floating_point() else min(4, value.element_size())

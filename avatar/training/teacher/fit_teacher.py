@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from avatar.models.networks.teacher import Residuals
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.tracking.track import TrackConfig
 
@@ -40,19 +39,25 @@ class FitTeacherConfig(PhotometricConfig):
 
 
 class TeacherTask(PhotometricTask):
-    """`L_rec` of the teacher's renderings."""
+    """`L_rec` of the teacher's renderings goes down."""
+
+    config: FitTeacherConfig
 
     def __init__(
-        self, sequence: AvatarSequence, teacher: TeacherAvatar, config: FitTeacherConfig, **options: Any
+        self,
+        sequence: AvatarSequence,
+        teacher: TeacherAvatar,
+        config: FitTeacherConfig,
+        context: TaskContext = ALONE,
     ) -> None:
         networks = ParameterGroup(
             "networks", dict(teacher.networks.named_parameters()), config.lr, config.lr_final_factor
         )
-        super().__init__(sequence, teacher, config, [networks], **options)
-        self.teacher, self.config = teacher, config
+        super().__init__(sequence, teacher, config, [networks], context)
+        self.teacher = teacher
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Of one frame: the networks run once for all its cameras."""
+        """Return the loss of one frame, whose networks run once for all its cameras."""
         views = self.views(item)
         motion, camera_centers = self.sequence.motion(item.frame), camera_centers_of(views)
         maps = self._maps(item, camera_centers)
@@ -75,6 +80,6 @@ class TeacherTask(PhotometricTask):
 
 
 def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> float:
-    """Mean length of the Gaussians' displacement, mm."""
+    """Return the mean length of the Gaussians' displacement, mm."""
     with torch.no_grad():
         return 1e3 * float((posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean())

@@ -38,27 +38,29 @@ class PretrainTeacherTask(PretrainTask):
         self._known = ByteCache(KNOWN_BYTES)
 
     def name_of(self, item: tuple[int, ...]) -> str:
+        """Return the frames of a batch."""
         return "frames " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
     def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
-        """Of a batch of frames."""
+        """Return the loss of a batch of frames."""
         frames = [self.sequence.train_frames[k] for k in item]
         if self.track is None:
             maps = [self._all_residuals(frame) for frame in frames]
-            loss = sum(m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps) / len(maps)
+            sizes = [m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps]
+            loss = sum(sizes[1:], sizes[0]) / len(maps)
             return loss, {"loss": float(loss.detach())}
-        inputs, known = zip(*(self._of(frame) for frame in frames), strict=True)
+        inputs, known = zip(*(self._of(frame, self.track) for frame in frames), strict=True)
         with self.autocast():
             found = self.teacher.networks.positions(torch.cat(inputs), self.teacher.semantics)
         units = torch.stack(known) / self.teacher.config.position_scale
         loss = (self.teacher.sampler(found.float()) - units).abs().sum(-1).mean()
         return loss, {"loss": float(loss.detach())}
 
-    def _of(self, frame: int) -> tuple[Tensor, ...]:
-        """Input map, and the known displacements of the Gaussians, (N, 3) metres along the axes of the T-pose."""
+    def _of(self, frame: int, track: Track) -> tuple[Tensor, ...]:
+        """Return the input map and the Gaussians' known displacements, (N, 3) metres along the axes of the T-pose."""
 
         def make() -> tuple[Tensor, ...]:
-            corners = self.track.displacements(frame)[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
+            corners = track.displacements(frame)[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
             inputs = self.teacher.position_input(self.sequence.motion(frame))
             return inputs, on_triangles(corners, self.teacher.gaussians.barycentric)
 
@@ -66,7 +68,7 @@ class PretrainTeacherTask(PretrainTask):
 
     def _all_residuals(self, frame: int) -> Residuals:
         cameras = self.sequence.cameras(frame, 0, 1, self.seed)
-        camera_centers = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
-        camera_centers = torch.tensor(camera_centers, dtype=torch.float32, device=self.sequence.device)
+        positions = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
+        camera_centers = torch.tensor(positions, dtype=torch.float32, device=self.sequence.device)
         with self.autocast():
             return self.teacher.residual_maps(self.sequence.motion(frame), camera_centers)

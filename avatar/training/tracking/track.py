@@ -18,8 +18,9 @@ from avatar.data.views import View
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import PhotometricConfig, PhotometricTask
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)
@@ -77,16 +78,15 @@ class TrackConfig:
             ("body_motion_weight", 0),
             ("extrapolation", 0),
         ):
-            if not getattr(self, name) >= least:
-                raise InputError(f"tracking: {name}", expected=f"at least {least}", received=repr(getattr(self, name)))
+            require_at_least(f"tracking: {name}", getattr(self, name), least)
 
     @property
     def steps(self) -> int:
-        """Of one frame."""
+        """Steps of one frame."""
         return sum(level.steps for level in self.levels)
 
     def shortened(self, share: float) -> TrackConfig:
-        """With `share` of the steps of every level."""
+        """Return the same with `share` of the steps of every level."""
         levels = tuple(replace(level, steps=max(1, round(share * level.steps))) for level in self.levels)
         return replace(self, levels=levels)
 
@@ -94,7 +94,11 @@ class TrackConfig:
 class TrackTask(PhotometricTask):
     """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels."""
 
-    def __init__(self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, **options: Any) -> None:
+    sequence: AvatarSequence
+
+    def __init__(
+        self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, context: TaskContext = ALONE
+    ) -> None:
         frames = sequence.train_frames
         if config.reference is not None and config.reference not in frames:
             raise InputError(
@@ -112,13 +116,13 @@ class TrackTask(PhotometricTask):
             evaluations=1,
         )
         super().__init__(
-            sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], **options
+            sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], context
         )
         self.avatar, self.track_config = avatar, config
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
-        """One frame, until its steps are done."""
+        """Return one frame, until its steps are done."""
         self.iteration = iteration
         place, step = divmod(iteration, self.track_config.steps)
         now = self._item(place, step)
@@ -131,12 +135,12 @@ class TrackTask(PhotometricTask):
         return Item(frame, self.sequence.cameras(frame, step, self.track_config.views, self.track_config.seed))
 
     def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
-        """The rate itself: the level's, falling exponentially."""
+        """Return the rate itself: the level's, falling exponentially."""
         level, step = self._level(iteration)
         return level.lr * LEVEL_END ** (step / level.steps)
 
     def _level(self, iteration: int) -> tuple[Level, int]:
-        """The level of a step, and the step's number within it."""
+        """Return the level of a step, and the step's number within it."""
         step = iteration % self.track_config.steps
         for level in self.track_config.levels:
             if step < level.steps:
@@ -145,14 +149,14 @@ class TrackTask(PhotometricTask):
         raise AssertionError("steps are those of the levels")
 
     def views(self, item: Item) -> list[View]:
-        """At the level's size."""
+        """Return the photographs at the level's size."""
         views = super().views(item)
         for _ in range(self._level(self.iteration)[0].halvings):
             views = [view.halved() for view in views]
         return views
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """`L_rec`, the roughness of the displacements, and how far the body moves."""
+        """Return `L_rec` with the roughness of the displacements and how far the body moves, and its terms."""
         views = self.views(item)
         posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
@@ -163,7 +167,7 @@ class TrackTask(PhotometricTask):
         return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """A step of the frame's; the first one leaves the frame before."""
+        """Take a step of the frame's; the first one leaves the frame before."""
         place, step = divmod(iteration, self.track_config.steps)
         if step == 0:
             with torch.no_grad():
@@ -189,11 +193,11 @@ class TrackTask(PhotometricTask):
         return start
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Nothing: the control points are those of one frame."""
+        """Return nothing: the control points are those of one frame."""
         return {"mean": {}}
 
     def state(self) -> Mapping[str, Tensor]:
-        """The frames that are done too."""
+        """Return the frames that are done too."""
         return {**super().state(), "solved": self.solved}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
@@ -202,7 +206,7 @@ class TrackTask(PhotometricTask):
         self.solved.copy_(tensors["solved"])
 
     def track(self) -> Track:
-        """What was found, less what was found in the reference frame.
+        """Return what was found, less what was found in the reference frame.
 
         There the template is the surface: what images ask of it is an error of the Gaussians, in all frames alike.
         """

@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from avatar.models.networks.control_points import choose_control_points
-from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes, positional_encoding
+from avatar.models.networks.deformation_field import (
+    DeformationField,
+    FieldConfig,
+    FrameCodes,
+    positional_encoding,
+    show_null_code,
+)
 from smplxpp.core.errors import InputError
 
 CONFIG = FieldConfig(width=16, hidden_layers=2)
@@ -160,6 +166,8 @@ def test_codes_by_frame_and_the_null_code():
     assert codes((7, 3)).abs().max() == 0
     with torch.no_grad():
         codes.codes.copy_(torch.arange(12.0).view(3, 4) + 1)
+    assert torch.equal(codes((None,))[0], codes.codes[0])  # until training shows the null code
+    show_null_code(codes)
     rows = codes((12, None, 7))
     assert torch.equal(rows, torch.stack([codes.codes[2], torch.zeros(4), codes.codes[0]]))
     rows.sum().backward()

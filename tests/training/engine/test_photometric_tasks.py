@@ -15,8 +15,9 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
+from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import LoopConfig, run_training
-from avatar.training.engine.photometric_task import pixel_size
+from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.student.compensate import CompensateConfig, CompensateTask
 from avatar.training.student.distillation import DistillationTargets
@@ -111,7 +112,7 @@ def test_the_bakes_semantic_term_is_zero_for_equal_geometry(frames):
     student = Student(STUDENT, frames.rig, teacher.gaussians.snapshot(), frames.train_frames)
     task = BakeTask(frames, student, replace(BAKE, null_share=0.0, pose_noise=0.0, attributes=0.5), teacher=teacher)
     _, terms = task.loss(task.micro_batches(0)[0])
-    assert terms["semantic"] < 1e-3  # lessons are kept in half precision
+    assert terms["semantic"] < 1e-3  # targets are kept in half precision
     assert terms["nonrigid"] < 1e-5 and terms["l1"] < 2e-3
 
 
@@ -221,7 +222,7 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
     config = replace(TEACHER, weights=weights, perceptual_every=2, view_jitter=0.0)
-    task = TeacherTask(frames, teacher, config, perceptual=MeanDifference())
+    task = TeacherTask(frames, teacher, config, TaskContext(perceptual=MeanDifference()))
     for k, weight in ((0, 0.5), (1, 0.0)):
         total, terms = task.loss(task.micro_batches(k)[0])
         assert ("perceptual" in terms) == bool(weight)
@@ -230,7 +231,7 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
 
 def test_held_out_views_and_poses_are_measured_and_shown(frames):
     shown = {}
-    task = CompensateTask(frames, make("compensate", frames).student, COMPENSATE, preview=shown.update)
+    task = CompensateTask(frames, make("compensate", frames).student, COMPENSATE, TaskContext(preview=shown.update))
     figures = task.evaluate(0)
     assert set(figures) == {"mean", "novel_view", "novel_pose"} and figures["mean"] == figures["novel_view"]
     assert set(shown) == {"Held0 2", "Held0 5"}
@@ -318,3 +319,24 @@ def test_half_precision_is_the_networks_alone(frames):
     assert torch.equal(half.positions, exact.positions) and torch.equal(half_centre, centre)
     assert (half.cosines is None) == (exact.cosines is None)
     assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)
+
+
+def test_a_normal_loss_without_normal_maps_is_told_once(frames, caplog):
+    steps(make("compensate", frames), 3)
+    told = [record.getMessage() for record in caplog.records if "normal" in record.getMessage()]
+    assert len(told) == 1 and "no normal map" in told[0] and "0.02" in told[0]
+    caplog.clear()
+    steps(make("compensate", frames, weights=replace(WEIGHTS, normal=0.0)), 1)
+    assert not caplog.records
+
+
+def test_a_normal_loss_with_normal_maps_tells_nothing(frames, caplog, monkeypatch):
+    view = type(frames).view
+
+    def with_normals(self, camera, frame):
+        seen = view(self, camera, frame)
+        return replace(seen, normals=torch.ones((*seen.alpha.shape, 3), dtype=torch.float16))
+
+    monkeypatch.setattr(type(frames), "view", with_normals)
+    assert steps(make("compensate", frames), 1)[0]["normal"] > 0
+    assert not caplog.records

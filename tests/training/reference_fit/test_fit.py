@@ -103,8 +103,8 @@ def test_an_interrupted_fit_is_the_uninterrupted_one(tmp_path):
 
 def test_every_view_has_its_turn_once_an_epoch():
     task = FitTask(scene(), CONFIG)
-    epochs = [[task.view_index(k) for k in range(7 * e, 7 * e + 7)] for e in range(3)]
-    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    epochs = [[task.micro_batches(k)[0].cameras for k in range(7 * e, 7 * e + 7)] for e in range(3)]
+    assert all(sorted(epoch) == sorted((name,) for name in TRAIN) for epoch in epochs)
     assert epochs[0] != epochs[1] or epochs[1] != epochs[2]
 
 
@@ -130,6 +130,8 @@ def test_a_loss_that_is_not_finite_stops_with_the_views_name(tmp_path):
 def test_scenes_that_cannot_be_fitted_are_refused():
     with pytest.raises(InputError, match="at least one training view"):
         scene(train=[])
+    with pytest.raises(InputError, match="name of its own"):
+        FitTask(scene(held_out=[view(TRAIN[0])]), CONFIG)
     with pytest.raises(InputError, match="posed vertices"):
         scene(vertices=doll().template.vertices[:-1])
 

@@ -20,19 +20,19 @@ def source(frames, **options) -> DistillationTargets:
     return DistillationTargets(taught(frames), frames, **{"eps2d": 0.1, "tau": 8.0, "normals": True, **options})
 
 
-def test_lessons_show_what_the_teacher_renders(frames):
+def test_targets_show_what_the_teacher_renders(frames):
     from avatar.render.avatar_view import render_view
 
     own, views = source(frames), [frames.view(name, 1) for name in ("Ring0", "Ring2")]
-    lessons = own.lessons(1, views)
+    targets = own.of_views(1, views)
     with torch.no_grad():
         posed = own.teacher(frames.motion(1), camera_centers_of(views))
-    for index, (view, lesson) in enumerate(zip(views, lessons, strict=True)):
+    for index, (view, target) in enumerate(zip(views, targets, strict=True)):
         seen = render_view(posed, index, view, frames.background, normals=True, extra=own.labels)
-        torch.testing.assert_close(lesson.target.image, seen.image, rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(lesson.target.alpha, seen.alpha, rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(lesson.labels, seen.extra, rtol=2e-3, atol=2e-3)
-        known = lesson.target.normals.abs().sum(-1) > 0
+        torch.testing.assert_close(target.target.image, seen.image, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(target.target.alpha, seen.alpha, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(target.labels, seen.extra, rtol=2e-3, atol=2e-3)
+        known = target.target.normals.abs().sum(-1) > 0
         assert bool((seen.alpha[known] > 0.5).all()) and known.any()
     assert not any(p.requires_grad for p in own.teacher.parameters())
 
@@ -44,36 +44,36 @@ def test_maps_are_the_teachers(frames):
     torch.testing.assert_close(own.displacements(2), maps.position[0], rtol=1e-3, atol=1e-6)
 
 
-def test_a_lesson_is_drawn_once(frames, monkeypatch):
+def test_a_target_is_drawn_once(frames, monkeypatch):
     own, views = source(frames), [frames.view("Ring1", 0)]
-    first = own.lessons(0, views)[0]
+    first = own.of_views(0, views)[0]
     monkeypatch.setattr(DistillationTargets, "_draw", None)
-    again = own.lessons(0, views)[0]
+    again = own.of_views(0, views)[0]
     assert torch.equal(first.target.image, again.target.image) and torch.equal(first.labels, again.labels)
 
 
-def test_nothing_is_kept_without_memory_and_lessons_are_the_same(frames):
+def test_nothing_is_kept_without_memory_and_targets_are_the_same(frames):
     own, without = source(frames), source(frames, max_bytes=0)
     views = [frames.view("Ring0", 0)]
     key = (0, "Ring0", views[0].camera.width, views[0].camera.height)
-    torch.testing.assert_close(own.lessons(0, views)[0].labels, without.lessons(0, views)[0].labels)
+    torch.testing.assert_close(own.of_views(0, views)[0].labels, without.of_views(0, views)[0].labels)
     assert key in own._kept and key not in without._kept
 
 
-def test_without_normals_a_lesson_has_none(frames):
-    lesson = source(frames, normals=False).lessons(0, [frames.view("Ring0", 0)])[0]
-    assert lesson.target.normals is None and lesson.labels.shape[-1] == 3
+def test_without_normals_a_target_has_none(frames):
+    target = source(frames, normals=False).of_views(0, [frames.view("Ring0", 0)])[0]
+    assert target.target.normals is None and target.labels.shape[-1] == 3
 
 
-def test_a_lesson_that_another_pushes_out_is_still_given(frames):
+def test_a_target_that_another_pushes_out_is_still_given(frames):
     whole = source(frames)
     views = [frames.view(name, 0) for name in ("Ring0", "Ring1")]
-    first, second = whole.lessons(0, views)
+    first, second = whole.of_views(0, views)
     size = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring0", *sizes(views[0])), tuple))
     other = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring1", *sizes(views[1])), tuple))
     small = source(frames, max_bytes=size + other - 1)
-    small.lessons(0, views[:1])  # the one that the next call finds, and loses
-    for found, expected in zip(small.lessons(0, views), (first, second), strict=True):
+    small.of_views(0, views[:1])  # the one that the next call finds, and loses
+    for found, expected in zip(small.of_views(0, views), (first, second), strict=True):
         torch.testing.assert_close(found.target.image, expected.target.image)
 
 

@@ -1,8 +1,10 @@
-"""Memory or disk that runs out, told as what to do about it."""
+"""The machine's memory and disk: what a training holds of them, and what to do when they run out."""
 
 from __future__ import annotations
 
 import errno
+import resource
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +16,15 @@ from smplxpp.core.errors import InputError
 NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
 """In the words of CUDA's libraries and of the CPU allocators, which have no exception of their own."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+
+def peak_memory(device: str = "cpu") -> dict[str, int]:
+    """Return the most bytes that this process has held: of the machine's memory, and of the GPU's where it uses one."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    if not device.startswith("cuda"):
+        return {"host": host}
+    return {"host": host, "device": torch.cuda.max_memory_allocated(device)}
 
 
 @contextmanager
