@@ -32,7 +32,7 @@ def describe_machine() -> dict[str, object]:
     }
 
 
-def store_results(name: str, command: str, figures: object, *, folder: Path = RESULTS) -> Path:
+def store_results(name: str, command: str, figures: object, *, folder: Path | None = None) -> Path:
     """Write `<name>.json` into `benchmarks/results`, or another folder, with the command, the date and the machine."""
     content = {
         "command": command,
@@ -40,6 +40,6 @@ def store_results(name: str, command: str, figures: object, *, folder: Path = RE
         "machine": describe_machine(),
         "figures": jsonable(figures),
     }
-    path = folder / f"{name}.json"
+    path = (folder or RESULTS) / f"{name}.json"
     atomic_write_text(path, json.dumps(content, indent=1) + "\n")
     return path

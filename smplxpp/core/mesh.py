@@ -49,7 +49,7 @@ class TriangleMesh:
                 received=f"{int(bad.sum())} vertices with NaN or infinity, first at index {int(np.argmax(bad))}",
                 remedy="remove them with smplxpp.clean.sanitize(vertices, faces)",
             )
-        faces = np.array(faces, dtype=np.int64, order="C")
+        faces = faces.astype(np.int64, order="C")  # a copy; np.array would keep C's long long as it is
         if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise InputError(
                 "mesh faces",

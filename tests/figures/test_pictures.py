@@ -105,7 +105,8 @@ def test_the_bodys_left_is_on_the_right_of_a_front_view():
     left = np.array([[1.0, 0.5, 0.0]])
     assert front.screen_from_world(left)[0, 0] > front.width / 2
     assert back.screen_from_world(left)[0, 0] < back.width / 2
-    assert front.screen_from_world([[0, 1, 0]])[0, 1] < front.screen_from_world([[0, 0, 0]])[0, 1]
+    high, low = front.screen_from_world(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))[:, 1]
+    assert high < low
 
 
 def test_a_turntable_goes_once_around():

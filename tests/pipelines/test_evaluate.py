@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from pipelines.stages.train_inputs import TrainInputs
 
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import ProtocolConfig
@@ -32,6 +31,7 @@ from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES
 from pipelines.stages.evaluate_inputs import input_protocol
+from pipelines.stages.scene import TrainInputs
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams

@@ -15,7 +15,7 @@ from avatar.export.splats import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
 from avatar.training.engine.device import choose_device
 from pipelines.cli import main
-from pipelines.commands import extras, inspect
+from pipelines.commands import inspect, options
 from pipelines.commands.inspect import summarise_run
 from pipelines.commands.progress import training_progress
 from pipelines.figures.comparison import read_strip
@@ -207,7 +207,7 @@ def test_a_template_that_stands_elsewhere_than_the_images_is_refused(tmp_path, c
 
 
 def test_a_missing_extra_is_named(fitted, capture, capsys, monkeypatch):
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(options, "find_spec", lambda name: None)
     assert fit(fitted, capture) == 2
     assert "smplxpp[avatar]" in json.loads(capsys.readouterr().out)["error"]["message"]
 

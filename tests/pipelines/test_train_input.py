@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.commands import extras
+from pipelines.commands import options
 from pipelines.commands import train as command
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.scene import TrainInputs, open_scene
@@ -181,7 +181,7 @@ def test_options_that_make_no_sense(run, original, capsys, options, word):
 
 
 def test_a_missing_extra_is_named(run, original, capsys, monkeypatch):
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(options, "find_spec", lambda name: None)
     assert "smplxpp[avatar]" in refused(capsys, run, original)
 
 

@@ -19,7 +19,7 @@ def test_a_step_adds_parents_and_children_alone():
         on = doll.weights.dense()[:, joint] > 0.99
         if not on.any():
             continue
-        near = {joint, int(doll.parents[joint]), *np.flatnonzero(doll.parents == joint).tolist()}
+        near = {joint, int(doll.body.parents[joint]), *np.flatnonzero(doll.body.parents == joint).tolist()}
         expected = [other in near for other in range(1, 22)]
         np.testing.assert_array_equal(seen_joints(doll, 1)[on], np.broadcast_to(expected, (on.sum(), 21)))
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.training.dancing_doll import TINY_FIELD, gaussians, sequence, write_dance
 
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.model_file import load_avatar, save_avatar
@@ -14,6 +13,8 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.training.student.bake import BakeConfig, BakeTask
 from avatar.training.train import Session, bake
+from tests.dolls.dancing import gaussians, sequence, write_dance
+from tests.dolls.tiny import TINY_FIELD
 
 CONFIG = BakeConfig(
     iterations=3, lr=1e-2, code_lr_factor=10.0, weights=ReconstructionWeights(perceptual=0.0), evaluations=1
