@@ -105,20 +105,23 @@ def _stages(run: Path, inputs: BuildInputs, config: BuildConfig) -> dict[str, _S
         "20_segment": _Stage(lambda f: scan.segment(f, run, inputs), ("00_capture",), ("label_set",), label_files),
         "30_clean": _Stage(lambda f: scan.clean(f, run, config), ("00_capture", "20_segment"), ("budgets",)),
         "40_transfer": _Stage(
-            lambda f: template.transfer(f, run, inputs, config), geometry[1:], ("max_influences", "method"), ("body",)
+            lambda f: template.transfer(f, run, inputs, config),
+            geometry[1:],
+            ("max_influences", "method", "webs"),
+            ("body",),
         ),
         "50_unpose": _Stage(
-            lambda f: template.unpose_parts(f, run, inputs), (*geometry[1:], "40_transfer"), files=("body",)
+            lambda f: template.unpose_parts(f, run, inputs), ("10_register", "40_transfer"), files=("body",)
         ),
         "60_assemble": _Stage(
             lambda f: template.assemble(f, run, inputs, config),
-            (*geometry, "20_segment", "40_transfer", "50_unpose"),
+            ("00_capture", "10_register", "20_segment", "40_transfer", "50_unpose"),
             ("clearance_mm",),
             ("body",),
         ),
         "65_validate": _Stage(
             lambda f: validate.validate(f, run, inputs, config),
-            ("00_capture", "20_segment", "30_clean", "60_assemble"),
+            ("00_capture", "20_segment", "40_transfer", "60_assemble"),
             ("samples", "seed"),
             ("body", "motion"),
         ),

@@ -25,7 +25,7 @@ from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import FIT_STAGE, STAGES, BuildConfig, BuildInputs, load_build
 from pipelines.stages.evaluate_config import EVALUATE_STAGE
 from pipelines.stages.scan import MM, load_params_of_run, load_scan
-from pipelines.stages.template import load_parts, load_weights
+from pipelines.stages.template import load_cleaned_parts, load_parts, load_weights
 from smplxpp.body import load_body, load_params
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.json_values import jsonable
@@ -154,7 +154,7 @@ def _scan_section(run: Path, scan: TriangleMesh, colors: np.ndarray, cameras: li
 
 
 def _parts_section(run: Path, record: StageRecord, cameras: list, checks: tuple) -> Section:
-    parts = load_parts(run)
+    parts = load_cleaned_parts(run)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
     numbers = record.manifest["numbers"]
@@ -189,19 +189,30 @@ def _weights_section(run: Path, record: StageRecord, cameras: list, checks: tupl
     tint = np.where(matched[:, None], (90, 170, 120), (230, 160, 60)).astype(np.uint8)
     numbers = record.manifest["numbers"]
     rows = tuple(
-        (n, numbers[n]["matched_share"], numbers[n]["components"], ", ".join(numbers[n]["policies"])) for n in parts
+        (
+            n,
+            numbers[n]["matched_share"],
+            numbers[n]["components"],
+            ", ".join(numbers[n]["policies"]),
+            numbers[n]["web_faces"],
+            100.0 * numbers[n]["web_area_share"],
+        )
+        for n in parts
     )
     return Section(
         title="Skin weights",
         text=(
             "Weights of the body reach into the space around it; cloth takes them where it lies close and faces alike, "
-            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches.",
+            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches. Webs, where the "
+            "scan bridges two limbs, are cut.",
         ),
         pictures=(
             Picture("joints mixed by weight", _sheet(mesh, cameras, vertex_colors=colors)),
             Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
         ),
-        tables=(Table(("part", "matched share", "pieces", "policies"), rows, "transfer"),),
+        tables=(
+            Table(("part", "matched share", "pieces", "policies", "web faces cut", "of its area, %"), rows, "transfer"),
+        ),
         checks=checks,
     )
 
