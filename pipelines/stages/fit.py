@@ -18,6 +18,7 @@ from avatar.export.splats import write_splat_ply
 from avatar.gaussians.bound_file import save_bound
 from avatar.metrics.view_quality import CONVENTION, mean_quality
 from avatar.training.engine.loop import METRICS_FILE, Progress
+from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
 from pipelines.figures.comparison import write_strip
@@ -26,6 +27,7 @@ from pipelines.runs.digests import code_digest, sha256_file
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage, stage_key
 from pipelines.stages.build_config import FIT_STAGE, TEMPLATE
+from pipelines.stages.train_names import PSNR_FLOORS
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
@@ -240,10 +242,16 @@ def _fit(
     train = [view.name for view in scene.train]
     for name in (*held_out, *_spread(train, PREVIEWED_TRAINING_VIEWS)):
         write_strip(folder / "previews" / f"{name}.png", views[name].photograph(scene.background), result.images[name])
-    return _output(result, config, held_out, train, overlap)
+    start = next(line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation")
+    return _output(result, held_out, train, overlap=overlap, start=start["mean"]["psnr"])
 
 
-def _output(result: FitResult, config: FitConfig, held_out: list[str], train: list[str], overlap: float) -> StageOutput:
+def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap: float, start: float) -> StageOutput:
+    """Numbers and checks.
+
+    Args:
+        overlap: of the template and the masks. start: PSNR of the same views before the first step, dB.
+    """
     done = result.progress
     shown = held_out or train
     mean = {
@@ -267,12 +275,20 @@ def _output(result: FitResult, config: FitConfig, held_out: list[str], train: li
             f"{which} views: PSNR of the person",
             figures["psnr"],
             "dB",
-            22.0,
-            16.0,
+            *PSNR_FLOORS["novel_view"],
             higher_is_better=True,
             explanation=f"mean over {len(shown)} cameras, over the union of the silhouettes",
         ),
         Check(f"{which} views: SSIM", figures["ssim"], "", 0.9, 0.75, higher_is_better=True),
+        Check(
+            f"{which} views: gain of PSNR since the start",
+            figures["psnr"] - start,
+            "dB",
+            0.0,
+            -1.0,
+            higher_is_better=True,
+            explanation="the start: colours of the photographs laid on the template",
+        ),
         Check(
             "iterations done",
             done.iteration / done.iterations,

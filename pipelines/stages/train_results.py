@@ -26,7 +26,7 @@ from pipelines.figures.comparison import write_strip
 from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import COMPACT_STUDENT, STUDENT
-from pipelines.stages.train_names import KINDS, kind_name
+from pipelines.stages.train_names import KINDS, PSNR_FLOORS, kind_name
 from smplxpp.capture import Capture
 
 BEFORE = {TRACK: "track_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
@@ -146,7 +146,7 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
             explanation="mean over some training views; low: another pose, or other cameras",
         ),
     ]
-    for kind, gates in (("novel_view", (22.0, 16.0)), ("novel_pose", (20.0, 14.0))):
+    for kind, gates in PSNR_FLOORS.items():
         if kind not in numbers:
             continue
         name, figures = kind_name(kind, held_out=numbers["held_out_cameras"]), numbers[kind]

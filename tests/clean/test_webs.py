@@ -56,12 +56,12 @@ def body() -> tuple[TriangleMesh, TriangleMesh]:
 
 
 def sheet(path: np.ndarray, rows: int = 21) -> TriangleMesh:
-    """A sheet of height 20 cm over a horizontal path (C, 2) of x and z."""
+    """A sheet of height 20 cm over a horizontal path (C, 2) of x and z; its outside is on the path's right."""
     points = np.stack([path[:, 0], 0 * path[:, 0], path[:, 1]], axis=1)
     return grid(points + np.linspace(0.1, 0.3, rows)[:, None, None] * np.array([0.0, 1.0, 0.0]))
 
 
-def inside_the_gap(columns: int = 9) -> TriangleMesh:
+def inside_the_gap(columns: int = 8) -> TriangleMesh:
     """Cloth on the trunk, straight across the gap, on along the arm: a shirt as the scan has it.
 
     The cloth lies 2 mm off either; it crosses at the narrowest place, where trunk and arm face each other.
@@ -72,7 +72,7 @@ def inside_the_gap(columns: int = 9) -> TriangleMesh:
     across = np.stack([np.linspace(TRUNK + off, AXIS - ARM - off, columns), np.zeros(columns)], axis=1)[1:-1]
     arm = np.pi + np.linspace(0.0, 1.2, 30)
     back = np.stack([AXIS + (ARM + off) * np.cos(arm), (ARM + off) * np.sin(arm)], axis=1)
-    return sheet(np.concatenate([along, across, back]))
+    return sheet(np.concatenate([along, across, back])[::-1])
 
 
 def torn(cloth: TriangleMesh, width: float = 0.0) -> TriangleMesh:
@@ -116,21 +116,21 @@ def test_loose_cloth_between_two_limbs_stays(body):
     x = np.linspace(0.0, AXIS, 80)
     front = sheet(np.stack([x, np.full(80, TRUNK + 0.01)], axis=1))
     assert not find_webs(front, torn(front, width=AXIS), *body).any()
-    # Even weights that jump do not make it a web: trunk and arm do not face each other there, cloth lies before both.
+    # Not even where the weights jump: it is flat, while a web is the bottom of a fold.
     assert not find_webs(front, torn(front), *body).any()
 
 
 def test_a_cape_over_the_shoulder_stays(body):
     """It goes round trunk and arm from outside."""
-    angle = np.linspace(-1.5, 1.5, 120)
+    angle = np.linspace(1.5, -1.5, 120)
     cape = sheet(np.stack([0.05 + 0.3 * np.cos(angle), 0.2 * np.sin(angle)], axis=1))
     assert not find_webs(cape, torn(cape), *body).any()
 
 
-def test_cloth_that_goes_into_the_gap_and_out_again_stays(body):
-    """A true armpit: the cloth follows the trunk inwards, turns and follows the arm outwards, 5 mm from either."""
+def test_cloth_that_follows_one_limb_through_the_gap_stays(body):
+    """A tight shirt without sleeves, 5 mm off the trunk."""
     off = 0.005
-    trunk = np.linspace(-1.2, 1.2, 160)
+    trunk = np.linspace(1.2, -1.2, 160)
     along = (TRUNK + off) * np.stack([np.cos(trunk), np.sin(trunk)], axis=1)
     cloth = sheet(along)
     assert not find_webs(cloth, torn(cloth, width=1.0), *body).any()
