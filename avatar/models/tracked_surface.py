@@ -30,6 +30,10 @@ class ControlCage(nn.Module):
         rig: of the template. count: K.
     """
 
+    off_clothes: Tensor
+    from_body: Tensor
+    edges: Tensor
+
     def __init__(self, rig: Rig, count: int) -> None:
         super().__init__()
         control = template_control_points(rig.template, count)
@@ -62,7 +66,7 @@ class ControlCage(nn.Module):
         moved = controls[self.off_clothes].square().sum(-1)
         total = ((moved + STILL**2).sqrt() - STILL).sum() / count
         if reach > 0.0:
-            tight = torch.where(self.off_clothes, 0.0, (1.0 - self.from_body / reach).clamp(min=0.0))
+            tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
             total = total + (tight * ((controls.square().sum(-1) + STILL**2).sqrt() - STILL)).sum() / count
         return total
 

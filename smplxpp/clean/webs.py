@@ -138,4 +138,4 @@ def _faces_with(faces: Int[np.ndarray, "M 3"], edges: Int[np.ndarray, "E 2"], co
         return pairs.min(axis=-1) * count + pairs.max(axis=-1)
 
     own = keys(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2))
-    return np.isin(own, keys(edges)).any(axis=1)
+    return np.asarray(np.isin(own, keys(edges)).any(axis=1))
