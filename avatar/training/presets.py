@@ -97,6 +97,7 @@ class _Size:
     body_motion_weight: float
     tight_reach: float
     pretrain: int
+    field_lr: float
     fit: int
     rates: LearningRates
     teacher: int
@@ -137,7 +138,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake,
-            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=5e-3),
+            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=size.field_lr),
             images="photographs",
             semantic=0.0,
             attributes=1.0,
@@ -190,6 +191,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=0.0,
             tight_reach=0.0,
             pretrain=500,
+            field_lr=5e-3,
             fit=600,
             rates=LearningRates(),
             teacher=500,
@@ -209,6 +211,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=4.0,
             tight_reach=0.02,
             pretrain=100,
+            # At 5e-3 the field died in one of two trainings: no displacement at all after 100 steps.
+            field_lr=3e-3,
             fit=150,
             # Few steps, of one view each: colours learn fast or not at all.
             rates=LearningRates(dc=6e-3, offset=0.03),

@@ -37,7 +37,7 @@ from smplxpp.core.labels import CLOTH_LABELS
 SEEN_OF_A_PIXEL = 0.05
 """How finely photographs place a surface, pixels; points of a clear pattern are found to 0.05 to 0.1.
 
-Where skinning alone is right to a fraction of a pixel, a surface that photographs moved cannot be held to the same: at
+Where skinning alone is already right to a fraction of a pixel, a surface that photographs moved cannot be held to the same: at
 256x320 a pixel is 6 mm of the person, and skinning has a tight shirt at 1.7 mm. With many pixels nothing of it is left.
 """
 
@@ -228,7 +228,8 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
         for label in CLOTH_LABELS:
             if label.name in own and label.name in alone and own[label.name].p2s and alone[label.name].p2s:
                 share = own[label.name].p2s / alone[label.name].p2s
-                seen = SEEN_OF_A_PIXEL * pixel * MM / alone[label.name].p2s
+                within = alone[label.name].p2s < pixel * MM
+                seen = SEEN_OF_A_PIXEL * pixel * MM / alone[label.name].p2s if within else 0.0
                 checks.append(
                     Check(
                         f"P2S of {label.name} against skinning alone, {title}",
@@ -236,8 +237,8 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
                         "x",
                         1.0 + seen,
                         max(1.5, 1.0 + seen),
-                        explanation="below 1: the mesh that the field moves is nearer to the truth; above 1 the gate "
-                        f"leaves {SEEN_OF_A_PIXEL:g} pixels, as finely as photographs place a surface",
+                        explanation="below 1: the mesh that the field moves is nearer to the truth"
+                        + f"; within a pixel {SEEN_OF_A_PIXEL:g} of it are left, photographs are no finer" * within,
                     )
                 )
     return checks

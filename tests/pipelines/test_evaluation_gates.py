@@ -49,5 +49,7 @@ def test_a_surface_is_held_to_skinning_as_finely_as_pixels_show_it():
     assert checks(25.0, upper=1.4, pixel=0.006)[name].status == "warn"
     assert checks(25.0, upper=1.6, pixel=0.006)[name].status == "fail"
     assert checks(25.0, upper=1.2, pixel=0.001)[name].status == "warn"
+    # Skinning is off by more than a pixel here: photographs see that.
+    assert checks(25.0, upper=1.01, pixel=0.0009)[name].status == "warn"
     # Pixels so large that the tolerance is beyond the bound.
     assert checks(25.0, upper=1.7, pixel=0.02)[name].status == "pass"
