@@ -37,8 +37,9 @@ from smplxpp.core.labels import CLOTH_LABELS
 SEEN_OF_A_PIXEL = 0.05
 """How finely photographs place a surface, pixels; points of a clear pattern are found to 0.05 to 0.1.
 
-Where skinning alone is already right to a fraction of a pixel, a surface that photographs moved cannot be held to the same: at
-256x320 a pixel is 6 mm of the person, and skinning has a tight shirt at 1.7 mm. With many pixels nothing of it is left.
+Where skinning alone is already right to a fraction of a pixel, a surface that photographs moved cannot be held to the
+same: at 256x320 a pixel is 6 mm of the person, and skinning has a tight shirt at 1.7 mm. With many pixels nothing of it
+is left.
 """
 
 
