@@ -112,7 +112,7 @@ def check_fit_reference(text: str, out: Path) -> None:
 
 def check_train(text: str, out: Path) -> None:
     count, megabytes = numbers(r"(\d+) Gaussians, (\S+) MB", text)
-    assert count == 15_000 and (out / "student.safetensors").stat().st_size == pytest.approx(1e6 * megabytes, abs=1e5)
+    assert count == 22_000 and (out / "student.safetensors").stat().st_size == pytest.approx(1e6 * megabytes, abs=1e5)
     with Image.open(out / "new_pose.png") as image:
         photograph, drawn = np.split(np.asarray(image, dtype=float), 2, axis=1)
     person = photograph.max(-1) > 16

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import igl
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -16,6 +18,7 @@ from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
+from smplxpp.template.template import Template
 
 STILL = 1e-3
 """Metres: motion off the clothes much below this costs nearly nothing."""
@@ -29,6 +32,7 @@ class ControlCage(nn.Module):
     """
 
     off_clothes: Tensor
+    from_body: Tensor
     edges: Tensor
 
     def __init__(self, rig: Rig, count: int) -> None:
@@ -39,6 +43,7 @@ class ControlCage(nn.Module):
         weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
         self.rows = SparseRows(neighbours, weights, self.count)
         self.register_buffer("off_clothes", ~rig.cloth_mask[torch.as_tensor(control.vertices, device=rig.device)])
+        self.register_buffer("from_body", torch.tensor(_from_body(rig.template, control.vertices), device=rig.device))
         # Two control points are neighbours if some vertex has them as its two nearest.
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
@@ -51,10 +56,27 @@ class ControlCage(nn.Module):
         """Return the mean squared difference of neighbours, square metres."""
         return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
 
-    def motion_off_clothes(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
-        """Return by how many metres, on average, points of body, hair and shoes leave skinning; 0 without any."""
+    def motion_off_clothes(self, controls: Float[Tensor, "K 3"], *, reach: float = 0.0) -> Float[Tensor, ""]:
+        """Return by how many metres, on average, points of body, hair and shoes leave skinning; 0 without any.
+
+        Args:
+            reach: metres. Points of the clothes count too, on the skin as much as the body's, less with the distance
+                from it and not at all beyond; 0: none does.
+        """
+        count = max(int(self.off_clothes.sum()), 1)
         moved = controls[self.off_clothes].square().sum(-1)
-        return ((moved + STILL**2).sqrt() - STILL).sum() / max(len(moved), 1)
+        total = ((moved + STILL**2).sqrt() - STILL).sum() / count
+        if reach > 0.0:
+            tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
+            total = total + (tight * ((controls.square().sum(-1) + STILL**2).sqrt() - STILL)).sum() / count
+        return total
+
+
+def _from_body(template: Template, vertices: np.ndarray) -> np.ndarray:
+    """(K,) float32 distance of vertices from the naked body in the T-pose, metres."""
+    body = template.part_mesh("body")
+    points = template.vertices[vertices]
+    return np.sqrt(igl.point_mesh_squared_distance(points, body.vertices, body.faces)[0]).astype(np.float32)
 
 
 class TrackedAvatar(nn.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json as jsonlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -49,6 +49,8 @@ class Build:
     """Units of the scan file."""
     up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
     """Upward axis of the scan file."""
+    keep_webs: bool = False
+    """Keep the scan's surface where it bridges two limbs, as under the arms; it tears when the pose opens them."""
     method: Literal["ours", "paper"] = "ours"
     """Skin-weight transfer: ours, or robust transfer exactly as published."""
     budgets: Annotated[
@@ -176,5 +178,6 @@ class Build:
                 raise InputError(
                     f"option {name}", expected=f"a finite number, at least {least:g}{limit}", received=f"{value:g}"
                 )
-        names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets"}
-        return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets)
+        names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets", "webs"}
+        webs = replace(default.webs, rounds=0) if self.keep_webs else default.webs
+        return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets, webs=webs)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.runs.arrays import load_arrays
-from pipelines.runs.layout import PARAMS, PARTS, POSED_BODY, SCAN, SCAN_LABELS, WEIGHTS
+from pipelines.runs.layout import PARAMS, PARTS, PARTS_WITHOUT_WEBS, POSED_BODY, SCAN, SCAN_LABELS, WEIGHTS
 from smplxpp.body import BodyModel, load_params
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -37,9 +37,18 @@ def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarra
         return body.mesh(data["vertices"]), data["posed_from_rest"]
 
 
-def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
+def load_cleaned_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
     """The cleaned parts in the reference pose: mesh, and arrays `label`, `source_vertex`, `colors`."""
-    groups = load_arrays(run / PARTS)
+    return _parts(run / PARTS)
+
+
+def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
+    """The same as `load_cleaned_parts` without webs: what skin weights are for."""
+    return _parts(run / PARTS_WITHOUT_WEBS)
+
+
+def _parts(file: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
+    groups = load_arrays(file)
     return {name: (TriangleMesh(a["vertices"], a["faces"]), a) for name, a in groups.items()}
 
 

@@ -53,7 +53,6 @@ class _Part:
     files: tuple[str, ...] = ()
 
 
-_GEOMETRY = (REGISTER_STAGE, CLEAN_STAGE)
 PARTS: dict[str, _Part] = {
     CAPTURE_STAGE: _Part(
         capture, (), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
@@ -63,17 +62,19 @@ PARTS: dict[str, _Part] = {
         segment, (CAPTURE_STAGE,), settings=("label_set",), files=("labels", "label_maps", "cameras", "scan")
     ),
     CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
-    TRANSFER_STAGE: _Part(transfer, _GEOMETRY, settings=("max_influences", "method"), files=("body",)),
-    UNPOSE_STAGE: _Part(unpose, (*_GEOMETRY, TRANSFER_STAGE), files=("body",)),
+    TRANSFER_STAGE: _Part(
+        transfer, (REGISTER_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
+    ),
+    UNPOSE_STAGE: _Part(unpose, (REGISTER_STAGE, TRANSFER_STAGE), files=("body",)),
     ASSEMBLE_STAGE: _Part(
         assemble,
-        (CAPTURE_STAGE, *_GEOMETRY, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+        (CAPTURE_STAGE, REGISTER_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
         settings=("clearance_mm",),
         files=("body",),
     ),
     VALIDATE_STAGE: _Part(
         validate,
-        (CAPTURE_STAGE, SEGMENT_STAGE, CLEAN_STAGE, ASSEMBLE_STAGE),
+        (CAPTURE_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, ASSEMBLE_STAGE),
         settings=("samples", "seed"),
         files=("body", "motion"),
     ),

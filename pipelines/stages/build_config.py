@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import BUILD_FILE
+from smplxpp.clean import WebConfig
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.labels import LABELS
 
@@ -55,6 +56,7 @@ class BuildConfig:
         budgets: faces kept by part name.
         clearance_mm: how far outer layers are kept from inner ones.
         max_influences: joints a vertex.
+        webs: what of a part is cut because it bridges two limbs; no `rounds`: nothing is.
         method: "ours", or "paper" for robust transfer exactly as published.
         samples: surface samples of the validation.
         seed: of the samples.
@@ -65,6 +67,7 @@ class BuildConfig:
     budgets: dict[str, int] = field(default_factory=_default_budgets)
     clearance_mm: float = 1.0
     max_influences: int = 8
+    webs: WebConfig = field(default_factory=WebConfig)
     method: str = "ours"
     samples: int = 100_000
     seed: int = 0
@@ -104,7 +107,9 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
     """What `save_build` wrote; None where there is none of this version. Optional inputs that are gone are left out."""
     try:
         content = json.loads((run / BUILD_FILE).read_text())
-        values, config = content["inputs"], BuildConfig(**content["config"])
+        choices = content["config"]
+        config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
+        values = content["inputs"]
         paths = {name: None if values[name] is None else Path(values[name]) for name in _PATHS}
         for name in ("labels", "cameras", "motion"):
             if paths[name] is not None and not paths[name].exists():

@@ -10,28 +10,39 @@ import numpy as np
 from pipelines.figures.colors import blend_joint_colors
 from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import (
-    load_parts,
+    load_cleaned_parts,
     load_posed_body,
 )
 from pipelines.runs.checks import Check
+from pipelines.runs.layout import POSED_BODY
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
 from smplxpp.body import BodyModel, load_body
+from smplxpp.clean import WebConfig, cut_webs, find_webs
 from smplxpp.core.labels import LABELS
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.metrics import weight_report
+from smplxpp.skinning import UnposeConfig, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """skin weights of every part from the posed body."""
+    """Skin weights of every part from the posed body, and the parts without the webs that the weights show."""
     body = load_body(build.inputs.body)
-    posed, _ = load_posed_body(build.run, body)
-    groups, checks, numbers = {}, [], {}
-    for name, (mesh, arrays) in load_parts(build.run).items():
+    groups, parts, checks, numbers = {}, {}, [], {}
+    for name, (cleaned, arrays) in load_cleaned_parts(build.run).items():
         label = LABELS[int(arrays["label"])].name
         settings = transfer_config(label, body, build.config)
-        weights = transfer_weights(posed, body.weights, mesh, config=settings)
+        mesh, source, weights = _without_webs(cleaned, build.run, body, settings, build.config.webs)
+        parts[name] = {
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "label": arrays["label"],
+            "source_vertex": arrays["source_vertex"][source],
+            "colors": arrays["colors"][source],
+        }
         groups[name] = {
             "joint_indices": weights.joint_indices,
             "joint_weights": weights.joint_weights,
@@ -54,13 +65,41 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             "components": len(weights.policies),
             "policies": sorted(set(weights.policies)),
             "report": report.as_dict(),
+            "web_faces": cleaned.face_count - mesh.face_count,
+            "web_area_share": 1.0 - float(mesh.face_areas.sum() / cleaned.face_areas.sum()),
         }
         checks += [
             Check(f"{name}: rows off partition of unity", report.row_sum_error, "", 1e-12, 1e-9),
             Check(f"{name}: negative weights and silent zero rows", report.negative + report.zero_rows, "", 0, 0),
         ]
     save_arrays(folder / "weights.npz", groups)
+    save_arrays(folder / "parts.npz", parts)
     return StageOutput(checks, numbers)
+
+
+def _without_webs(
+    part: TriangleMesh, run: Path, body: BodyModel, settings: TransferConfig, config: WebConfig
+) -> tuple[TriangleMesh, np.ndarray, SkinWeights]:
+    """A part without its webs, the vertex of `part` that each of its vertices is, and its skin weights.
+
+    Weights are smoothed along the surface. Where that bridges two limbs they mix far beyond the web itself, so they are
+    found anew once it is cut; what remains of a web shows then.
+    """
+    posed, posed_from_rest = load_posed_body(run, body)
+    with np.load(run / POSED_BODY) as data:
+        at_rest = body.mesh(data["rest_vertices"])
+    source = np.arange(part.vertex_count)
+    weights = transfer_weights(posed, body.weights, part, config=settings)
+    for _ in range(config.rounds):
+        # What can hardly be unposed is for the next stage to say, of what is left then.
+        rest = unpose(part.vertices, weights, posed_from_rest, config=UnposeConfig(warn_below=0.0, fail_below=1e-9))
+        web = find_webs(part, part.with_vertices(rest.vertices), posed, at_rest, config=config)
+        if not web.any():
+            break
+        part, kept = cut_webs(part, web, config=config)
+        source = source[kept]
+        weights = transfer_weights(posed, body.weights, part, config=settings)
+    return part, source, weights
 
 
 def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> TransferConfig:

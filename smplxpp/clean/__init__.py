@@ -5,6 +5,7 @@ from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_part
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
 from smplxpp.clean.simplify import Simplified, simplify
 from smplxpp.clean.units import METRES_PER_UNIT, check_human_scale, convert_points
+from smplxpp.clean.webs import WebConfig, cut_webs, find_webs
 
 __all__ = [
     "METRES_PER_UNIT",
@@ -14,11 +15,14 @@ __all__ = [
     "PartsConfig",
     "Sanitized",
     "Simplified",
+    "WebConfig",
     "check_human_scale",
     "clean_parts",
     "convert_points",
+    "cut_webs",
     "drop_specks",
     "fill_pinholes",
+    "find_webs",
     "loop_lengths",
     "sanitize",
     "simplify",

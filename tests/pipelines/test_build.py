@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 from pipelines.cli import main
+from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
 from pipelines.runs.layout import BUILD_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
-from pipelines.stages.build_config import BuildConfig, BuildInputs
+from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_params
 from smplxpp.body.stress_poses import stress_poses
-from smplxpp.clean import simplify
+from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh_io import read_mesh
@@ -84,6 +85,34 @@ def test_the_fixture_passes_its_gates(person_run):
     for words in must_pass:
         found = [c for c in metrics["checks"] if words in c["name"]]
         assert found and all(c["status"] == "pass" for c in found), words
+
+
+def test_the_scans_webs_under_the_arms_are_cut_and_nothing_is_torn(person_run):
+    metrics = json.loads((person_run / "metrics.json").read_text())
+    cut = {name: numbers["web_faces"] for name, numbers in metrics["stages"]["40_transfer"].items()}
+    assert cut.pop("upper") > 20 and not any(cut.values())
+    assert 0.0 < metrics["stages"]["40_transfer"]["upper"]["web_area_share"] < 0.01
+    assert [c for c in metrics["checks"] if "stretch" in c["name"] and c["status"] != "pass"] == []
+
+
+def test_a_hard_pose_is_held_against_what_it_asks_of_the_hem(person_run):
+    metrics = json.loads((person_run / "metrics.json").read_text())
+    poses = metrics["stages"]["65_validate"]["hard poses"]
+    # The raised thigh pulls the skirt's hem; a shirt's hangs as before.
+    assert poses["lower"]["high_step"]["opening"] > 1.2 and abs(poses["upper"]["high_step"]["opening"] - 1.0) < 0.1
+    worst = max(one["p999"] / max(one["opening"], 1.0) for part in poses.values() for one in part.values())
+    (check,) = (c for c in metrics["checks"] if c["name"] == "edge stretch p99.9, hard poses")
+    assert check["value"] == pytest.approx(worst)
+
+
+def test_webs_stay_where_the_user_wants_them(small):
+    kept = small.build("run", small.inputs(), last="40_transfer", webs=WebConfig(rounds=0))
+    cut = small.build("run", small.inputs(), last="40_transfer")
+    assert kept["40_transfer"].ran and cut["40_transfer"].ran and not cut["30_clean"].ran
+    faces = [record["40_transfer"].manifest["numbers"]["upper"]["web_faces"] for record in (kept, cut)]
+    assert faces[0] == 0 < faces[1]
+    assert load_build(small.folder / "run")[1].webs == WebConfig()
+    assert Build(out=small.folder, keep_webs=True).config().webs.rounds == 0
 
 
 def test_metrics_json_and_manifests_state_what_was_done(person_run):

@@ -30,6 +30,11 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
     (weight,) = weights
     return {
         "Gaussians": f"{preset.fit.sampling.count:,}",
+        "Gaussians on the head, share": f"{preset.fit.sampling.head_share:.2g}",
+        "rates of the fit: colours; places, pixels": f"{preset.fit.rates.dc:g}; {preset.fit.rates.offset:g}",
+        "clothes held to skinning within, mm of the skin": (
+            "-" if teacher.track is None else f"{1e3 * teacher.track.tight_reach:g}"
+        ),
         "iterations of the fit": f"{preset.fit.iterations:,}",
         "teacher: maps in, out, pixels": f"{network.in_size}, {network.out_size}",
         "teacher: parameters, millions": f"{millions:.3g}",

@@ -49,7 +49,10 @@ class TrackConfig:
         smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
         body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
             parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
-        clothes. extrapolation: share of the motion between the two frames before that a frame starts with.
+            clothes.
+        tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
+            what lies on the body goes where the body goes. 0: no clothes do.
+        extrapolation: share of the motion between the two frames before that a frame starts with.
         weights: of the losses.
         reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
             comes first.
@@ -61,6 +64,7 @@ class TrackConfig:
     views: int = 4
     smoothness: float = 80.0
     body_motion_weight: float = 0.0
+    tight_reach: float = 0.0
     extrapolation: float = 1.0
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
@@ -76,6 +80,7 @@ class TrackConfig:
             ("views", 1),
             ("smoothness", 0),
             ("body_motion_weight", 0),
+            ("tight_reach", 0),
             ("extrapolation", 0),
         ):
             require_at_least(f"tracking: {name}", getattr(self, name), least)
@@ -163,7 +168,8 @@ class TrackTask(PhotometricTask):
         cage, controls = self.avatar.cage, self.avatar.controls
         total = total + self.track_config.smoothness * cage.roughness(controls)
         if self.track_config.body_motion_weight and not cage.off_clothes.all():
-            total = total + self.track_config.body_motion_weight * cage.motion_off_clothes(controls)
+            left = cage.motion_off_clothes(controls, reach=self.track_config.tight_reach)
+            total = total + self.track_config.body_motion_weight * left
         return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:

@@ -22,7 +22,7 @@ from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluat
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.arrays import load_arrays
-from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_weights
+from pipelines.runs.artefacts import load_cleaned_parts, load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
 from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE
 from pipelines.runs.stage import StageRecord, require_stage
@@ -170,7 +170,7 @@ def _scan_section(
 
 
 def _parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
-    parts = load_parts(run)
+    parts = load_cleaned_parts(run)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
     numbers = record.manifest["numbers"]
@@ -205,19 +205,30 @@ def _weights_section(run: Path, record: StageRecord, cameras: list[Camera], chec
     tint = np.where(matched[:, None], (90, 170, 120), (230, 160, 60)).astype(np.uint8)
     numbers = record.manifest["numbers"]
     rows = tuple(
-        (n, numbers[n]["matched_share"], numbers[n]["components"], ", ".join(numbers[n]["policies"])) for n in parts
+        (
+            n,
+            numbers[n]["matched_share"],
+            numbers[n]["components"],
+            ", ".join(numbers[n]["policies"]),
+            numbers[n]["web_faces"],
+            100.0 * numbers[n]["web_area_share"],
+        )
+        for n in parts
     )
     return Section(
         title="Skin weights",
         text=(
             "Weights of the body reach into the space around it; cloth takes them where it lies close and faces alike, "
-            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches.",
+            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches. Webs, where the "
+            "scan bridges two limbs, are cut.",
         ),
         pictures=(
             Picture("joints mixed by weight", _sheet(mesh, cameras, vertex_colors=colors)),
             Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
         ),
-        tables=(Table(("part", "matched share", "pieces", "policies"), rows, "transfer"),),
+        tables=(
+            Table(("part", "matched share", "pieces", "policies", "web faces cut", "of its area, %"), rows, "transfer"),
+        ),
         checks=checks,
     )
 

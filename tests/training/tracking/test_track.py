@@ -85,6 +85,21 @@ def test_with_a_prior_the_body_stays_and_the_dress_swings(frames, track, tmp_pat
         assert error(frames, frame, found.displacements(frame)) < 0.5 * error(frames, frame)
 
 
+def test_cloth_on_the_skin_counts_as_the_body_and_cloth_off_it_does_not(frames):
+    cage = TrackedAvatar(frames.rig, painted(), CONFIG.control_points).cage
+    cloth = ~cage.off_clothes
+    moved = torch.zeros(cage.count, 3)
+    moved[cloth] = 0.02
+    near, far = float(cage.from_body[cloth].min()), float(cage.from_body[cloth].max())
+    assert not cage.from_body[cage.off_clothes].any() and far > 0.0
+    assert cage.motion_off_clothes(moved) == 0.0 == cage.motion_off_clothes(moved, reach=0.5 * near)
+    tight, tighter = (float(cage.motion_off_clothes(moved, reach=reach)) for reach in (2.0 * far, 20.0 * far))
+    assert 0.0 < tight < tighter
+    # What the body does weighs the same with it and without.
+    body = torch.where(cage.off_clothes[:, None], torch.tensor(0.02), torch.tensor(0.0)).expand(-1, 3)
+    assert cage.motion_off_clothes(body) == cage.motion_off_clothes(body, reach=20.0 * far)
+
+
 def test_without_clothes_there_is_no_prior(frames):
     naked = AvatarSequence(frames.capture, template().naked())
     bound = sample_on_mesh(naked.rig.template, SamplingConfig(count=300, sh_degree=1))
@@ -170,7 +185,14 @@ def test_what_was_found_is_taken_up_without_a_step(frames, track, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"levels": ()}, {"levels": (Level(0, 0, 1e-3),)}, {"smoothness": -1.0}, {"body_motion_weight": -1.0}]
+    "change",
+    [
+        {"levels": ()},
+        {"levels": (Level(0, 0, 1e-3),)},
+        {"smoothness": -1.0},
+        {"body_motion_weight": -1.0},
+        {"tight_reach": -1.0},
+    ],
 )
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError):
