@@ -19,8 +19,12 @@ from avatar.training.teacher.fit_teacher import FitTeacherConfig
 from avatar.training.tracking.track import Level, TrackConfig
 from smplxpp.core.validation import require_choice
 
-LOCAL = {"parts": 256, "head_shapes": 5, "body_shapes": 11}
-"""Of `BlendShapeConfig`, for local blend shapes."""
+LOCAL_PARTS = 256
+
+
+def with_local_shapes(shapes: BlendShapeConfig) -> BlendShapeConfig:
+    """Return local blend shapes in the place of the paper's: parts of the Gaussians have coefficients of their own."""
+    return replace(shapes, parts=LOCAL_PARTS, head_shapes=5, body_shapes=11)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,7 @@ def ablate(
             config,
             force=how.force,
             in_time=bool(trainer.seconds_left()),
-            progress=lambda done, total, name=name: how.measuring(name, done, total),
+            progress=partial(how.measuring, name),
         )
         if measured is not None:
             found[name] = measured
@@ -177,7 +178,7 @@ def _write_strips(folder: Path, result: AblationResult) -> None:
     """A strip a view: the photograph, then what each row shows, under their titles."""
     first = next(iter(result.rows))
     for path in sorted(result.rows[first].folder.glob("*.png")):
-        pictures = []
+        pictures: list[np.ndarray] = []
         for one in result.rows.values():
             pair = one.folder / path.name
             if not pair.is_file():

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.report import EvalReport, view_key
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion
+from avatar.rig.posed import AvatarModel, PosedAvatar
+from avatar.rig.rig import Motion, Rig
 from pipelines.ablation.rows import Row
 from pipelines.figures import encode_png
 from pipelines.runs.digests import TRAINING
@@ -47,7 +47,9 @@ class RowResult:
 class WithoutCode(nn.Module):
     """An avatar that is driven by the null code in every frame, as it is online."""
 
-    def __init__(self, model: nn.Module) -> None:
+    rig: Rig
+
+    def __init__(self, model: AvatarModel) -> None:
         super().__init__()
         self.model, self.rig = model, model.rig
 
@@ -106,8 +108,9 @@ def measure_row(
         player = folder / PLAYER_FILE
         model.write_player(player, trainer.model(model))
         loaded = model.read_by(trainer, player)
+        shown: AvatarModel = WithoutCode(loaded) if row.null_code else loaded
         evaluation = evaluate_models(
-            {row.title: WithoutCode(loaded) if row.null_code else loaded},
+            {row.title: shown},
             trainer.sequence(CLOTHED),
             config,
             files={row.title: player},

@@ -13,7 +13,7 @@ from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import StudentConfig
-from avatar.training.presets import LOCAL, TrainingPreset
+from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shapes
 from avatar.training.student.bake import BakeConfig
 from pipelines.ablation.stages import BaselineStage, PrunedStage
 from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
@@ -57,9 +57,7 @@ PAPER_ROWS: Mapping[str, Row] = {
 }
 OPTION_ROWS: Mapping[str, Row] = {
     "no-tracking": Row("w/o tracking", "untracked", "the teacher starts from zero residuals, as in the paper"),
-    "local": Row(
-        "local blend shapes", "local", f"{LOCAL['parts']} parts of the Gaussians with coefficients of their own"
-    ),
+    "local": Row("local blend shapes", "local", f"{LOCAL_PARTS} parts of the Gaussians with coefficients of their own"),
     "pruned": Row(
         "pruned",
         "pruned",
@@ -126,6 +124,13 @@ class _Plan:
         self.preset, self.student = preset, preset.student()
         self.stages: dict[str, ModelStage] = {}
 
+    @property
+    def teacher(self) -> TeacherStage:
+        """The full system's."""
+        stage = self.stages["teacher"]
+        assert isinstance(stage, TeacherStage)
+        return stage
+
     def full_system(self, training_frames: int) -> None:
         """The paper's rows."""
         preset = self.preset
@@ -165,12 +170,10 @@ class _Plan:
             self.stages["untracked"] = self.stages["full"]
         else:
             from_zero = replace(teacher, track=None, pretrain=None)
-            self._add(
-                replace(self.stages["teacher"], name=_folder("untracked_teacher"), config=from_zero, elsewhere=())
-            )
+            self._add(replace(self.teacher, name=_folder("untracked_teacher"), config=from_zero, elsewhere=()))
             self._bake("untracked_bake", "untracked_teacher")
             self._compensate("untracked", "untracked_bake", teacher=None)
-        self._compensate("local", "bake", shapes=replace(preset.blend_shapes, **LOCAL))
+        self._compensate("local", "bake", shapes=with_local_shapes(preset.blend_shapes))
         self._compensate("gated", "bake", shapes=replace(preset.blend_shapes, gated=True))
         self._add(
             PrunedStage(
@@ -212,7 +215,7 @@ class _Plan:
         self._add(outer)
         self._add(
             replace(
-                self.stages["teacher"],
+                self.teacher,
                 name=_folder("outer_teacher"),
                 ground=OUTER,
                 gaussians=outer,

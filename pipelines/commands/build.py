@@ -140,7 +140,7 @@ class Build:
                 motion=motion if motion.is_file() else None,
                 body=self.body,
             )
-        if self.params is None:
+        if self.params is None or self.scan is None:
             raise InputError("input", expected="--params with --scan", received="no --params")
         return BuildInputs(
             subject=self.scan.stem,

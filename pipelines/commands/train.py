@@ -215,7 +215,8 @@ def _perceptual(name: str, preset: TrainingPreset) -> str:
 
     if name != "auto":
         # The first use of a metric: what is missing is said now.
-        {"lpips": load_lpips, "st-lpips": load_st_lpips, "none": lambda: None}[name]()
+        if name != "none":
+            (load_lpips if name == "lpips" else load_st_lpips)()
         return name
     if not any(stage.weights.perceptual for stage in (preset.teacher, preset.bake, preset.compensate)):
         return "none"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 
-def save_arrays(path: Path, groups: dict[str, dict[str, np.ndarray]]) -> None:
+def save_arrays(path: Path, groups: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write `{group: {name: array}}` as `group/name`."""
-    np.savez(path, **{f"{group}/{name}": array for group, arrays in groups.items() for name, array in arrays.items()})
+    flat: dict[str, Any] = {f"{g}/{name}": array for g, arrays in groups.items() for name, array in arrays.items()}
+    np.savez(path, **flat)
 
 
 def load_arrays(path: Path) -> dict[str, dict[str, np.ndarray]]:

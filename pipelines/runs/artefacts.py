@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,35 +16,35 @@ from smplxpp.core.skin_weights import SkinWeights
 
 
 def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
-    """The repaired scan of a run: mesh, (N, 3) colours, (N,) index of each vertex in the user's file."""
+    """Read the repaired scan of a run: mesh, (N, 3) colours, (N,) index of each vertex in the user's file."""
     arrays = load_arrays(run / SCAN)["scan"]
     return TriangleMesh(arrays["vertices"], arrays["faces"]), arrays["colors"], arrays["source_vertex"]
 
 
 def load_params_of_run(run: Path) -> BodyParams:
-    """The parameters of the reference frame."""
+    """Read the parameters of the reference frame."""
     return load_params(run / PARAMS)
 
 
 def load_scan_labels(run: Path) -> np.ndarray:
-    """(F,) labels of the scan's faces."""
+    """Read the (F,) labels of the scan's faces."""
     with np.load(run / SCAN_LABELS) as labels:
         return labels["face_labels"]
 
 
 def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:
-    """The fitted body in the reference frame, and its (J, 4, 4) `posed_from_rest`."""
+    """Read the fitted body in the reference frame, and its (J, 4, 4) `posed_from_rest`."""
     with np.load(run / POSED_BODY) as data:
         return body.mesh(data["vertices"]), data["posed_from_rest"]
 
 
 def load_cleaned_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    """The cleaned parts in the reference pose: mesh, and arrays `label`, `source_vertex`, `colors`."""
+    """Read the cleaned parts in the reference pose: mesh, and arrays `label`, `source_vertex`, `colors`."""
     return _parts(run / PARTS)
 
 
 def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    """The same as `load_cleaned_parts` without webs: what skin weights are for."""
+    """Read the same as `load_cleaned_parts` without webs: what skin weights are for."""
     return _parts(run / PARTS_WITHOUT_WEBS)
 
 
@@ -53,9 +54,10 @@ def _parts(file: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
 
 
 def load_weights(run: Path) -> dict[str, SkinWeights]:
-    """The parts' skin weights."""
+    """Read the parts' skin weights."""
     out = {}
     for name, arrays in load_arrays(run / WEIGHTS).items():
-        scalars = {"joint_count": int(arrays.pop("joint_count")), "policies": tuple(arrays.pop("policies").tolist())}
-        out[name] = SkinWeights(**arrays, **scalars)
+        joint_count, policies = int(arrays.pop("joint_count")), tuple(arrays.pop("policies").tolist())
+        kept: dict[str, Any] = dict(arrays)
+        out[name] = SkinWeights(**kept, joint_count=joint_count, policies=policies)
     return out

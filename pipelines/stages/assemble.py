@@ -29,7 +29,7 @@ from smplxpp.template.template import Template
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """body and parts as one `Template`, layers apart; npz, GLB and OBJ."""
+    """Write body and parts as one `Template`, layers apart; npz, GLB and OBJ."""
     body = load_body(build.inputs.body)
     canonical, weights, parts = load_arrays(build.run / CANONICAL), load_weights(build.run), {}
     source_vertex = load_arrays(build.run / SCAN)["scan"]["source_vertex"]

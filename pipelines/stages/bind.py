@@ -29,6 +29,7 @@ from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer
 from pipelines.stages.scene import silhouette_overlap
+from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 
 PREVIEWED_TRAINING_VIEWS = 3
@@ -95,7 +96,7 @@ class BindStage(ModelStage):
         template = GROUNDS[self.ground](trainer.scene.template)
         scene = FitScene(
             template,
-            template.pose(capture.params(frame))[0],
+            template.pose(_params(trainer))[0],
             read_views(capture, frame, capture.splits.train_cameras),
             read_views(capture, frame, capture.splits.novel_view_cameras),
             capture.recording.background or (0.0, 0.0, 0.0),
@@ -134,7 +135,14 @@ class BindStage(ModelStage):
 
 def _posed(trainer: Trainer) -> np.ndarray:
     """(V, 3) vertices of the person's template in the frame's pose, metres."""
-    return trainer.scene.template.pose(trainer.scene.capture.params(trainer.scene.frame))[0]
+    return trainer.scene.template.pose(_params(trainer))[0]
+
+
+def _params(trainer: Trainer) -> BodyParams:
+    """The frame's parameters, which were looked at when the scene was opened."""
+    params = trainer.scene.capture.params(trainer.scene.frame)
+    assert params is not None
+    return params
 
 
 def _write_strips(

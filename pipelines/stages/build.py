@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
@@ -126,7 +127,7 @@ def _run_stages(
             continue
         progress(name, False)
         stage, module = _stage(name, context, records), PARTS[name].module
-        records[name] = run_stage(context.run, stage, lambda folder, module=module: module.run(folder, context))
+        records[name] = run_stage(context.run, stage, partial(module.run, build=context))
         progress(name, True)
     return records
 

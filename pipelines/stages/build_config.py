@@ -110,12 +110,12 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
         choices = content["config"]
         config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
         values = content["inputs"]
-        paths = {name: None if values[name] is None else Path(values[name]) for name in _PATHS}
+        found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
+        found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         for name in ("labels", "cameras", "motion"):
-            if paths[name] is not None and not paths[name].exists():
-                paths[name] = None
-        maps = {name: Path(path) for name, path in values["label_maps"].items()}
-        rest = {f.name: values[f.name] for f in fields(BuildInputs) if f.name not in (*_PATHS, "label_maps")}
-        return BuildInputs(**paths, label_maps=maps, **rest), config
+            if found[name] is not None and not found[name].exists():
+                found[name] = None
+        found["label_maps"] = {name: Path(path) for name, path in values["label_maps"].items()}
+        return BuildInputs(**found), config
     except (OSError, ValueError, KeyError, TypeError):
         return None

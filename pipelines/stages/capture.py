@@ -18,7 +18,7 @@ GREY = 180
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """the scan in metres, +Y up, repaired; the frame's parameters."""
+    """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
     raw = read_raw_mesh(build.inputs.scan)
     vertices = convert_points(raw.vertices, units=build.config.units, up=build.config.up)
     try:

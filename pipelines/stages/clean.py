@@ -20,7 +20,7 @@ from smplxpp.metrics.distance import MM
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """one clean mesh within its face budget for every part that is not skin."""
+    """Write one clean mesh within its face budget for every part that is not skin."""
     scan, colors, _ = load_scan(build.run)
     face_labels = load_scan_labels(build.run)
     parts = clean_parts(scan, face_labels, config=PartsConfig(face_budgets=build.config.budgets), vertex_colors=colors)
@@ -30,9 +30,9 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             name: {
                 "vertices": part.mesh.vertices,
                 "faces": part.mesh.faces,
-                "label": np.int64(part.label),
+                "label": np.array(part.label),
                 "source_vertex": part.source_vertex,
-                "colors": part.vertex_colors,
+                "colors": np.asarray(part.vertex_colors),
             }
             for name, part in parts.items()
         },

@@ -21,7 +21,7 @@ from smplxpp.metrics.distance import MM
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """the posed body of the given fit, and how well the scan agrees with it.
+    """Write the posed body of the given fit, and how well the scan agrees with it.
 
     A scan is never deeper inside the body than its noise: the share that is, tells a bad fit without any labels.
     """

@@ -336,11 +336,11 @@ def _digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, st
         for array in ARRAY_NAMES:
             numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
     splits, used = capture.splits, 0
-    for camera, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
+    for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
         for kind in ("image", "mask", "normal"):
-            path = capture.file(camera, frame, kind)
+            path = capture.file(view, frame, kind)
             if path is not None:
-                files.update(f"{kind} {camera} {frame} {path.name} {path.stat().st_size}\n".encode())
+                files.update(f"{kind} {view} {frame} {path.name} {path.stat().st_size}\n".encode())
                 used += 1
     return {
         "capture/cameras": cameras.hexdigest(),

@@ -23,14 +23,16 @@ from smplxpp.segment import read_label_map, read_labels, segment_scan, vote_on_f
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """a label, a confidence and a seen flag for every face."""
+    """Write a label, a confidence and a seen flag for every face."""
     scan, _, source_vertex = load_scan(build.run)
     if build.inputs.labels is None and build.inputs.label_maps:
-        cameras = {camera.name: camera for camera in read_cameras(build.inputs.cameras)}
+        file = build.inputs.cameras
+        assert file is not None  # the build has checked it
+        cameras = {camera.name: camera for camera in read_cameras(file)}
         missing = sorted(set(build.inputs.label_maps) - set(cameras))
         if missing:
             raise InputError(
-                f"camera file {build.inputs.cameras.name}",
+                f"camera file {file.name}",
                 expected=f"cameras {', '.join(missing)}",
                 received=f"cameras {', '.join(sorted(cameras))}",
             )

@@ -13,7 +13,7 @@ from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.presets import LOCAL, TrainingPreset
+from avatar.training.presets import TrainingPreset, with_local_shapes
 from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest
 from pipelines.stages.bake import BakeStage
@@ -53,7 +53,8 @@ class TrainConfig:
     @property
     def shapes(self) -> BlendShapeConfig:
         """The blend shapes of the student."""
-        return replace(self.preset.blend_shapes, **(LOCAL if self.blend_shapes == "local" else {}))
+        shapes = self.preset.blend_shapes
+        return with_local_shapes(shapes) if self.blend_shapes == "local" else shapes
 
     @property
     def max_bytes(self) -> float | None:

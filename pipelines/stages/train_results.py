@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.speed import parameter_counts
 from avatar.metrics.view_quality import CONVENTION
@@ -68,6 +69,7 @@ def write_student(
     bytes_of = {name: save_avatar(folder / name, student), compact: save_avatar(folder / compact, small, compact=True)}
     # As a player has it: half precision, and without what was pruned.
     stored = load_avatar(folder / compact, sequence.rig)
+    assert isinstance(stored, Student)
     quiet = replace(context, preview=lambda images: None)
     figures = CompensateTask(sequence, stored, config, quiet).evaluate(config.iterations)
     measured = {kind: figures[kind] for kind in KINDS if kind in figures}
@@ -78,7 +80,7 @@ def training_output(
     trainer: Trainer,
     session: Session,
     folder: Path,
-    model: TeacherAvatar | Student,
+    model: TeacherAvatar | Student | Baseline,
     done: Progress,
     write: Callable[[], Mapping[str, Any]],
 ) -> StageOutput:
@@ -96,7 +98,7 @@ def training_output(
 
 def _output(
     folder: Path,
-    model: TeacherAvatar | Student,
+    model: TeacherAvatar | Student | Baseline,
     done: Progress,
     sequence: AvatarSequence,
     numbers: Mapping[str, Any],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +30,12 @@ from smplxpp.transfer import TransferConfig, transfer_weights
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """Skin weights of every part from the posed body, and the parts without the webs that the weights show."""
+    """Write skin weights of every part from the posed body, and the parts without the webs that the weights show."""
     body = load_body(build.inputs.body)
-    groups, parts, checks, numbers = {}, {}, [], {}
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    parts: dict[str, dict[str, np.ndarray]] = {}
+    checks: list[Check] = []
+    numbers: dict[str, Any] = {}
     for name, (cleaned, arrays) in load_cleaned_parts(build.run).items():
         label = LABELS[int(arrays["label"])].name
         settings = transfer_config(label, body, build.config)
@@ -46,7 +50,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         groups[name] = {
             "joint_indices": weights.joint_indices,
             "joint_weights": weights.joint_weights,
-            "joint_count": np.int64(weights.joint_count),
+            "joint_count": np.array(weights.joint_count),
             "matched": weights.matched,
             "distance": weights.distance,
             "angle": weights.angle,

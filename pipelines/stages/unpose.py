@@ -20,7 +20,7 @@ from smplxpp.skinning import unpose
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """the parts in the T-pose, by the inverse of the skinning that will drive them."""
+    """Write the parts in the T-pose, by the inverse of the skinning that will drive them."""
     body = load_body(build.inputs.body)
     _, posed_from_rest = load_posed_body(build.run, body)
     weights, groups, checks, numbers = load_weights(build.run), {}, [], {}

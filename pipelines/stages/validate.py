@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ MOTION_FRAMES = 12
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
-    """distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
+    """Write distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
     template = Template.load(build.run / TEMPLATE)
     scan, _, _ = load_scan(build.run)
     face_labels = load_scan_labels(build.run)
@@ -75,14 +76,16 @@ def _against_scan(
     face_labels: np.ndarray,
     config: BuildConfig,
 ) -> tuple[list[Check], dict]:
-    common = {"samples": config.samples, "seed": config.seed, "config": CompareConfig(visible_only=True)}
-    forth = directed_distances(posed, scan, source_labels=vertex_labels, target_labels=face_labels, **common)
-    back = directed_distances(scan, posed, source_labels=face_labels, target_labels=vertex_labels, **common)
+    measured = partial(
+        directed_distances, samples=config.samples, seed=config.seed, config=CompareConfig(visible_only=True)
+    )
+    forth = measured(posed, scan, source_labels=vertex_labels, target_labels=face_labels)
+    back = measured(scan, posed, source_labels=face_labels, target_labels=vertex_labels)
     result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0)
     save_arrays(
         folder / "errors.npz",
         {
-            name: {"distance_mm": (d.distance * MM).astype(np.float32), "label": d.label.astype(np.int8)}
+            name: {"distance_mm": (d.distance * MM).astype(np.float32), "label": np.asarray(d.label).astype(np.int8)}
             for name, d in (("template_to_scan", forth), ("scan_to_template", back))
         },
     )
