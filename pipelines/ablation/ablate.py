@@ -25,6 +25,7 @@ from pipelines.ablation.rows import Row, ablation_stages
 from pipelines.ablation.table import AblationResult, ablation_table, row_figures
 from pipelines.figures import caption, encode_png, row
 from pipelines.runs.layout import ABLATION
+from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
@@ -90,6 +91,12 @@ def ablate(
     options = TrainOptions(max_seconds=how.max_seconds, bar=_bar(how))
     trainer = Trainer(run, scene, options, Distributed(device=how.device), scale=inputs.scale, perceptual=perceptual)
     stages = ablation_stages(preset, training_frames=len(trainer.sequence(CLOTHED).train_frames))
+    own = trainer.sequence(CLOTHED)
+    known = replace(
+        input_protocol(run, inputs, scene.capture),
+        training_frames=len(own.train_frames),
+        training_cameras=len(own.train_cameras),
+    )
     made: set[str] = set()
     found: dict[str, Any] = {}
     for name in sorted(rows, key=lambda name: name != "full"):
@@ -102,6 +109,7 @@ def ablate(
             rows[name],
             model,
             config,
+            known=known,
             force=how.force,
             in_time=bool(trainer.seconds_left()),
             progress=partial(how.measuring, name),

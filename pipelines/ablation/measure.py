@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor, nn
 
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
+from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.report import EvalReport, view_key
 from avatar.rig.posed import AvatarModel, PosedAvatar
 from avatar.rig.rig import Motion, Rig
@@ -95,11 +96,16 @@ def measure_row(
     model: ModelStage,
     config: EvaluationConfig,
     *,
+    known: InputProtocol,
     force: bool = False,
     in_time: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RowResult | None:
-    """Measure a row unless it stands; None where it does not stand and there is no time left for it."""
+    """Measure a row unless it stands; None where it does not stand and there is no time left for it.
+
+    Args:
+        known: what is known of the inputs, for the report. in_time: whether there is time left.
+    """
     stage = row_stage(trainer, name, row, model, config)
     if decide(trainer.run, stage, force=force) != "skip" and not in_time:
         return None
@@ -116,7 +122,7 @@ def measure_row(
             files={row.title: player},
             progress=progress,
         )
-        evaluation.report.save(folder / REPORT_FILE)
+        replace(evaluation.report, inputs=known).save(folder / REPORT_FILE)
         _keep_pictures(folder / PICTURES, evaluation)
         return StageOutput()
 

@@ -16,8 +16,8 @@ from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.training.engine.device import fixed_seed
+from avatar.training.engine.session import Session
 from avatar.training.student.prune import coefficient_std, pruned_to
-from avatar.training.train import Session
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_results import training_output

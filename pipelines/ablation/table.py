@@ -29,7 +29,7 @@ class AblationResult:
         models = {title: model for report in reports for title, model in report.models.items()}
         alone = next((report.skinning_alone for report in reports if report.skinning_alone), {})
         conventions = {name: text for report in reports for name, text in report.conventions.items()}
-        return EvalReport(reports[0].capture, reports[0].metric, models, alone, conventions)
+        return EvalReport(reports[0].capture, reports[0].metric, models, alone, conventions, reports[0].inputs)
 
 
 def ablation_table(result: AblationResult) -> FigureTable:

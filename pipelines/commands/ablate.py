@@ -43,8 +43,8 @@ class Ablate:
     """Number of Gaussians, in the place of the preset's."""
     scale: float = 1.0
     """Size of the images to train and measure on, 1 for every pixel."""
-    every: int = 4
-    """Measure every n-th frame."""
+    every: int = 1
+    """Measure every n-th of the held-out frames."""
     metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
     """Perceptual distance to measure, and to train with where the preset does."""
     samples: int = 100_000

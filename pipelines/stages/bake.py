@@ -9,8 +9,8 @@ from typing import Any
 
 from avatar.models.student import StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.training.student.bake import BakeConfig
-from avatar.training.train import Session, bake
+from avatar.training.engine.session import Session
+from avatar.training.student.bake import BakeConfig, bake
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_results import training_output, write_model

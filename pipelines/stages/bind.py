@@ -19,9 +19,9 @@ from avatar.metrics.view_quality import CONVENTION, mean_quality
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
+from avatar.training.engine.session import Session
 from avatar.training.reference_fit.config import FitConfig
 from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
-from avatar.training.train import Session
 from pipelines.figures.comparison import write_strip
 from pipelines.runs import gates
 from pipelines.runs.digests import sha256_file

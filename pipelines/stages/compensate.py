@@ -7,12 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from avatar.data.sequence import AvatarSequence
+from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.training.student.compensate import CompensateConfig
-from avatar.training.train import Session, compensate
+from avatar.models.student import Student
+from avatar.training.engine.photometric_task import TaskContext
+from avatar.training.engine.session import Session
+from avatar.training.student.compensate import CompensateConfig, CompensateTask, compensate
+from avatar.training.student.prune import pruned_to
+from pipelines.runs.layout import COMPACT_STUDENT, STUDENT
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer
-from pipelines.stages.train_results import training_output, write_student
+from pipelines.stages.train_names import KINDS
+from pipelines.stages.train_results import training_output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,3 +79,30 @@ class CompensateStage(ModelStage):
     def _fitting(self, trainer: Trainer) -> BlendShapeConfig:
         """The blend shapes of the template's body."""
         return replace(self.shapes, expression_size=trainer.scene.template.body.num_expressions)
+
+
+def write_student(
+    folder: Path,
+    student: Student,
+    sequence: AvatarSequence,
+    config: CompensateConfig,
+    *,
+    max_bytes: float | None,
+    context: TaskContext,
+) -> dict[str, Any]:
+    """Write a student with blend shapes, whole and compact; bytes, and figures of the compact one read back.
+
+    Args:
+        max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
+        context: of the training.
+    """
+    name, compact = (Path(file).name for file in (STUDENT, COMPACT_STUDENT))
+    small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
+    bytes_of = {name: save_avatar(folder / name, student), compact: save_avatar(folder / compact, small, compact=True)}
+    # As a player has it: half precision, and without what was pruned.
+    stored = load_avatar(folder / compact, sequence.rig)
+    assert isinstance(stored, Student)
+    quiet = replace(context, preview=lambda images: None)
+    figures = CompensateTask(sequence, stored, config, quiet).evaluate(config.iterations)
+    measured = {kind: figures[kind] for kind in KINDS if kind in figures}
+    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}

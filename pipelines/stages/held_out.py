@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from pipelines.runs.stage import read_manifest
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import InputError
 
+log = logging.getLogger(__name__)
 NAMED = 8
 """Cameras and frames that a refusal names."""
 
@@ -24,8 +26,13 @@ class Seen:
 
 
 def seen_by(run: Path, stages: Iterable[str]) -> Seen:
-    """What the models of a run's stages have seen."""
-    found = [((read_manifest(run / name) or {}).get("numbers") or {}).get("seen") or {} for name in stages]
+    """What the models of a run's stages have seen; a model without a record of it is logged."""
+    found = []
+    for name in stages:
+        seen = (read_manifest(run / name) or {}).get("numbers", {}).get("seen")
+        if seen is None:
+            log.warning("%s: what its model has seen is not recorded; whether views are novel is not known", name)
+        found.append(seen or {})
     return Seen(
         frozenset(camera for one in found for camera in one.get("cameras", ())),
         frozenset(frame for one in found for frame in one.get("frames", ())),

@@ -22,7 +22,7 @@ from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import explain_resource_errors
-from avatar.training.train import Session
+from avatar.training.engine.session import Session
 from pipelines.figures.comparison import write_strip
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.lock import own_run_folder

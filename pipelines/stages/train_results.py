@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +11,15 @@ from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.speed import parameter_counts
 from avatar.metrics.view_quality import CONVENTION
-from avatar.models.model_file import load_avatar, save_avatar
+from avatar.models.model_file import save_avatar
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.engine.resources import peak_memory
-from avatar.training.student.compensate import CompensateConfig, CompensateTask
-from avatar.training.student.prune import pruned_to
-from avatar.training.train import PRETRAIN, TRACK, Session
+from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from pipelines.runs import gates
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import COMPACT_STUDENT, STUDENT
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
 from pipelines.stages.train_names import KINDS, kind_name
@@ -47,33 +42,6 @@ def keep_logs(work: Path, folder: Path) -> None:
 def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
     """Write a model; the number of its bytes."""
     return {"bytes": {path.name: save_avatar(path, model)}}
-
-
-def write_student(
-    folder: Path,
-    student: Student,
-    sequence: AvatarSequence,
-    config: CompensateConfig,
-    *,
-    max_bytes: float | None,
-    context: TaskContext,
-) -> dict[str, Any]:
-    """Write a student with blend shapes, whole and compact; bytes, and figures of the compact one read back.
-
-    Args:
-        max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
-        context: of the training.
-    """
-    name, compact = (Path(file).name for file in (STUDENT, COMPACT_STUDENT))
-    small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
-    bytes_of = {name: save_avatar(folder / name, student), compact: save_avatar(folder / compact, small, compact=True)}
-    # As a player has it: half precision, and without what was pruned.
-    stored = load_avatar(folder / compact, sequence.rig)
-    assert isinstance(stored, Student)
-    quiet = replace(context, preview=lambda images: None)
-    figures = CompensateTask(sequence, stored, config, quiet).evaluate(config.iterations)
-    measured = {kind: figures[kind] for kind in KINDS if kind in figures}
-    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
 
 
 def training_output(

@@ -36,7 +36,7 @@ def test_workers_sleep_once_a_package_is_imported(package):
 
 
 def test_torchs_workers_sleep_too():
-    assert spins("import avatar.training.train, torch; torch.ones(200_000).exp()") == 0
+    assert spins("import avatar.training.student.bake, torch; torch.ones(200_000).exp()") == 0
 
 
 def test_what_the_environment_says_stands():

@@ -27,7 +27,7 @@ from pipelines.figures.evaluation import read_tiles, surface_picture, write_tile
 from pipelines.report import Report, write_report
 from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES
 from pipelines.stages.evaluate_inputs import input_protocol
@@ -193,7 +193,7 @@ def test_inputs_are_what_capture_build_and_training_say(tmp_path):
     save_build(run, BuildInputs("doll", tmp_path / "other.ply", root / "params" / "000000.npz"), BuildConfig())
     assert known().labels == "not known"
     (run / "85_bake").mkdir()
-    manifest = {"schema": 1, "numbers": {"training_frames": 4, "training_cameras": 6}}
+    manifest = {"schema": SCHEMA, "numbers": {"training_frames": 4, "training_cameras": 6}}
     (run / "85_bake" / "manifest.json").write_text(json.dumps(manifest))
     assert known().sentence().endswith("trained on 4 frames of 6 cameras")
     say(parameters="good")
@@ -319,3 +319,32 @@ def test_the_overview_shows_the_last_novel_view(evaluated, tmp_path):
         np.testing.assert_array_equal(found, expected)
     with pytest.raises(InputError, match="Run `smplxpp train` and `smplxpp evaluate`"):
         held_out_view(write_dressed(tmp_path / "bare"))
+
+
+def seeing(run: Path, *, cameras: tuple[str, ...] = (), frames: tuple[int, ...] = ()) -> Path:
+    """The run with a record of what its student has seen."""
+    manifest = {"schema": SCHEMA, "numbers": {"seen": {"cameras": cameras, "frames": frames}}}
+    (run / "90_compensate" / "manifest.json").write_text(json.dumps(manifest))
+    return run
+
+
+def test_views_that_a_model_has_seen_are_not_called_novel(trained, capture, tmp_path, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    splits = open_capture(capture).splits
+    seeing(run, cameras=(*splits.train_cameras, *HELD_OUT), frames=splits.train_frames)
+    message = refused(capsys, run, capture)
+    assert all(camera in message for camera in HELD_OUT) and "90_compensate" in message
+    seeing(run, cameras=splits.train_cameras, frames=splits.train_frames)
+    shown = splits.train_frames[-2:]
+    message = refused(capsys, run, capture, "--hold-out-frames", *map(str, shown))
+    assert all(str(frame) in message for frame in shown) and "frames" in message
+    # What was kept from training by hand is what is novel.
+    seeing(run, cameras=(*splits.train_cameras[1:], *HELD_OUT), frames=splits.train_frames)
+    assert f"--hold-out {splits.train_cameras[0]}" in refused(capsys, run, capture)
+
+
+def test_a_model_without_a_record_of_what_it_saw_is_told(trained, capture, tmp_path, caplog):
+    run = shutil.copytree(trained, tmp_path / "run")
+    with caplog.at_level("WARNING"):
+        assert evaluate(run, capture, "--sets", "novel_view") == 0
+    assert "90_compensate" in caplog.text and "not recorded" in caplog.text

@@ -94,7 +94,8 @@ def test_inputs_are_the_files_of_earlier_stages(trained):
     assert all({"60_assemble/smplxpp.npz", "capture/parameters", "capture/cameras"} <= i for i in inputs.values())
     code = {stage: set(read_manifest(trained / stage)["code"]) for stage in STAGES}
     assert all("avatar.training.engine.loop" in modules for modules in code.values())
-    assert "pipelines.stages.compensate" not in code["80_teacher"] | code["85_bake"]
+    assert "avatar.training.student.compensate" not in code["80_teacher"] | code["85_bake"]
+    assert not any(name.startswith("avatar.training.student") for name in code["80_teacher"])
 
 
 def test_the_models_load_and_the_students_blend_shapes_fit_the_template(trained):

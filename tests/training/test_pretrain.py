@@ -17,12 +17,12 @@ from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import OptimizationTask
 from avatar.training.engine.pretraining import PretrainConfig
-from avatar.training.student.bake import BakeConfig
+from avatar.training.engine.session import PRETRAIN, TRACK, Session
+from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
-from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
 from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.track import Level
-from avatar.training.train import PRETRAIN, TRACK, Session, bake, fit_teacher
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import dance, gaussians, sequence, template, write_dance
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER

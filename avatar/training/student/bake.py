@@ -10,16 +10,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
 from avatar.models.networks.deformation_field import show_null_code
-from avatar.models.student import Student
+from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.avatar_view import Rendering
 from avatar.rig.rig import Motion
+from avatar.training.engine.device import fixed_seed
+from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.session import PRETRAIN, Session
 from avatar.training.student.distillation import DistillationTargets
+from avatar.training.student.pretrain import PretrainFieldTask
 from smplxpp.core.validation import require_at_least, require_between, require_choice
 
 
@@ -138,3 +143,39 @@ def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:
     """Return the semantic map that was drawn with an image."""
     assert rendering.extra is not None
     return rendering.extra
+
+
+def bake(
+    sequence: AvatarSequence,
+    gaussians: BoundGaussians,
+    student: StudentConfig,
+    config: BakeConfig,
+    session: Session,
+    *,
+    teacher: TeacherAvatar | None,
+) -> tuple[Student, Progress]:
+    """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
+    with fixed_seed(config.seed):
+        made = Student(student, sequence.rig, gaussians, sequence.train_frames)
+    if config.pretrain is not None and teacher is not None and made.field is not None:
+        pretrain = config.pretrain
+        progress = session.within(PRETRAIN).run_alone(
+            lambda: PretrainFieldTask(
+                sequence,
+                made,
+                teacher,
+                pretrain,
+                config.seed,
+                code_lr_factor=config.code_lr_factor,
+                null_share=config.null_share,
+                imagined=config.imagined,
+            ),
+            pretrain,
+        )
+        if not progress.finished:
+            return made.eval(), progress
+        session = session.after(progress)
+        if config.null_share or config.imagined:
+            show_null_code(made)  # on the processes that only waited for the pretraining, too
+    progress = session.run(lambda: BakeTask(sequence, made, config, session.context, teacher=teacher), config)
+    return made.eval(), progress

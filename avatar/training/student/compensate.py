@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.learning_rates import pixel_size
+from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import (
     ALONE,
@@ -17,6 +21,8 @@ from avatar.training.engine.photometric_task import (
     PhotometricTask,
     TaskContext,
 )
+from avatar.training.engine.session import Session
+from avatar.training.student.init_blend_shapes import init_blend_shapes
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_between
 
@@ -84,3 +90,25 @@ class CompensateTask(PhotometricTask):
         posed = self.student(motion, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         return total, {"loss": float(total.detach()), **terms}
+
+
+def compensate(
+    sequence: AvatarSequence,
+    student: Student,
+    shapes: BlendShapeConfig,
+    config: CompensateConfig,
+    session: Session,
+    *,
+    teacher: TeacherAvatar | None = None,
+) -> tuple[Student, Progress]:
+    """Give a baked student blend shapes and train them.
+
+    Args:
+        teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so.
+    """
+    with fixed_seed(config.seed):
+        made = student.with_blend_shapes(shapes)
+        if config.init_from_track and teacher is not None and teacher.track is not None:
+            init_blend_shapes(made, sequence, teacher.track)
+    progress = session.run(lambda: CompensateTask(sequence, made, config, session.context), config)
+    return made.eval(), progress

@@ -9,13 +9,19 @@ import torch
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
-from avatar.models.networks.teacher import Residuals
+from avatar.gaussians.binding import BoundGaussians
+from avatar.models.networks.teacher import Residuals, TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.posed import PosedAvatar
+from avatar.training.engine.device import fixed_seed
+from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
-from avatar.training.tracking.track import TrackConfig
+from avatar.training.engine.session import PRETRAIN, TRACK, Session
+from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.track import TrackConfig, follow_surface
+from smplxpp.core.spread import spread_inside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,3 +89,38 @@ def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> float:
     """Return the mean length of the Gaussians' displacement, mm."""
     with torch.no_grad():
         return 1e3 * float((posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean())
+
+
+CENTRED_ON = 256
+"""Frames, spread over the training's, that centred inputs are measured on."""
+
+
+def fit_teacher(
+    sequence: AvatarSequence,
+    gaussians: BoundGaussians,
+    networks: TeacherConfig,
+    config: FitTeacherConfig,
+    session: Session,
+) -> tuple[TeacherAvatar, Progress]:
+    """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
+    with fixed_seed(config.seed):
+        teacher = TeacherAvatar(networks, sequence.rig, gaussians)
+    teacher.centre(sequence.motion(frame) for frame in spread_inside(sequence.train_frames, CENTRED_ON))
+    track = None
+    if config.track is not None:
+        track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))
+        if not progress.finished:
+            return teacher.eval(), progress
+        teacher.remember(track)
+        session = session.after(progress)
+    # Networks whose output is zero know zero residuals already.
+    if config.pretrain is not None and (track is not None or not networks.zero_output):
+        pretrain = config.pretrain
+        progress = session.within(PRETRAIN).run_alone(
+            lambda: PretrainTeacherTask(sequence, teacher, pretrain, config.seed, track), pretrain
+        )
+        if not progress.finished:
+            return teacher.eval(), progress
+        session = session.after(progress)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, session.context), config)
+    return teacher.eval(), progress

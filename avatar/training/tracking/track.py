@@ -15,10 +15,14 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
+from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
+from avatar.training.engine.processes import Distributed
+from avatar.training.engine.session import Session
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
@@ -220,3 +224,18 @@ class TrackTask(PhotometricTask):
         if self.track_config.reference is not None:
             solved -= self.solved[self.row[self.track_config.reference]]
         return Track(self.row, solved, self.avatar.cage)
+
+
+def follow_surface(
+    sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
+) -> tuple[Track, Progress]:
+    """Find the displacements of every training frame, one frame after the other.
+
+    Steps have one frame each: of several processes the first follows it, and the others hear what it found.
+    """
+    avatar = TrackedAvatar(sequence.rig, gaussians, min(config.control_points, len(sequence.rig.vertices)))
+    task = TrackTask(sequence, avatar, config, replace(session.context, distributed=None))
+    progress = session.run_alone(lambda: task, task.config)
+    processes = session.distributed or Distributed()
+    task.solved.copy_(processes.run_on_rank0(lambda: task.solved.cpu()))
+    return task.track(), progress

@@ -18,11 +18,11 @@ from avatar.models.tracked_surface import ControlCage, Track
 from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.photometric_task import TaskContext
-from avatar.training.student.bake import BakeConfig, BakeTask
-from avatar.training.student.compensate import CompensateConfig, CompensateTask
+from avatar.training.engine.session import Session
+from avatar.training.student.bake import BakeConfig, BakeTask, bake
+from avatar.training.student.compensate import CompensateConfig, CompensateTask, compensate
 from avatar.training.student.distillation import DistillationTargets
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
-from avatar.training.train import Session, bake, compensate, fit_teacher
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask, fit_teacher
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, varied, write_dance
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER

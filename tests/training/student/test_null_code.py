@@ -11,8 +11,8 @@ from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.training.student.bake import BakeConfig, BakeTask
-from avatar.training.train import Session, bake
+from avatar.training.engine.session import Session
+from avatar.training.student.bake import BakeConfig, BakeTask, bake
 from tests.dolls.dancing import gaussians, sequence, write_dance
 from tests.dolls.tiny import TINY_FIELD
 

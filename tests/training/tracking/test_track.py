@@ -15,10 +15,10 @@ from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.pretraining import PretrainConfig
-from avatar.training.teacher.fit_teacher import FitTeacherConfig
+from avatar.training.engine.session import Session
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
 from avatar.training.teacher.pretrain import PretrainTeacherTask
-from avatar.training.tracking.track import Level, TrackConfig, TrackTask
-from avatar.training.train import Session, fit_teacher, follow_surface
+from avatar.training.tracking.track import Level, TrackConfig, TrackTask, follow_surface
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, template, true_vertices, write_dance
 from tests.dolls.tiny import TINY_TEACHER
