@@ -243,7 +243,7 @@ class PhotometricTask(OptimizationTask[Item]):
         """Say once that a term of the loss which was asked for is missing."""
         if not self._told_of_normals:
             self._told_of_normals = True
-            log.warning(
+            log.info(
                 "the loss has no normal term (weight %g) where a view has no normal map; the first such view is %s's",
                 self.config.weights.normal,
                 view.name,

@@ -322,6 +322,7 @@ def test_half_precision_is_the_networks_alone(frames):
 
 
 def test_a_normal_loss_without_normal_maps_is_told_once(frames, caplog):
+    caplog.set_level("INFO")
     steps(make("compensate", frames), 3)
     told = [record.getMessage() for record in caplog.records if "normal" in record.getMessage()]
     assert len(told) == 1 and "no normal map" in told[0] and "0.02" in told[0]
@@ -331,6 +332,7 @@ def test_a_normal_loss_without_normal_maps_is_told_once(frames, caplog):
 
 
 def test_a_normal_loss_with_normal_maps_tells_nothing(frames, caplog, monkeypatch):
+    caplog.set_level("INFO")
     view = type(frames).view
 
     def with_normals(self, camera, frame):
