@@ -15,7 +15,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import StudentConfig
 from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shapes
 from avatar.training.student.bake import BakeConfig
-from pipelines.ablation.stages import BaselineStage, PrunedStage
+from pipelines.ablation.stages import BaselineStage, PruneConfig, PrunedStage
 from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
@@ -179,8 +179,7 @@ class _Plan:
             PrunedStage(
                 name=_folder("pruned"),
                 student=self.stages["full"],
-                keep=PRUNED_SHARE,
-                max_bytes=1e6 * PRUNED_MEGABYTES,
+                config=PruneConfig(keep=PRUNED_SHARE, max_bytes=1e6 * PRUNED_MEGABYTES),
             )
         )
         self._bake("control_bake", student=replace(self.student, control_points=CONTROL_POINTS))

@@ -25,35 +25,46 @@ from smplxpp.core.atomic import atomic_write_bytes
 
 
 @dataclass(frozen=True, kw_only=True)
+class PruneConfig:
+    """What is left of a student's blend shapes.
+
+    Attributes:
+        keep: share of the Gaussians that keep theirs, or less: the compact file has at most `max_bytes`.
+        seed, iterations: nothing is drawn, and it is done in one.
+    """
+
+    keep: float
+    max_bytes: float
+    seed: int = 0
+    iterations: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
 class PrunedStage(ModelStage):
     """A student whose least important Gaussians lost their blend shapes.
 
     Attributes:
         student: the stage that trains it.
-        keep: share of the Gaussians that keep theirs, or less: the compact file has at most `max_bytes`.
     """
 
     file = "student.safetensors"
     resumable = False
     alone = True
-    seed = 0
-    iterations = 1
 
     student: ModelStage
-    keep: float
-    max_bytes: float
+    config: PruneConfig
 
     @property
     def needs(self) -> Mapping[str, ModelStage]:
         return {"student": self.student}
 
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
-        return {"keep": self.keep, "max_bytes": self.max_bytes}
+        return {"pruning": self.config}
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
         student, sequence = trainer.model(self.student), trainer.sequence(self.ground)
-        shapes = student.blend_shapes.pruned(coefficient_std(student, sequence), keep=self.keep)
-        small, kept = pruned_to(student.with_blend_shapes(shapes), sequence, self.max_bytes)
+        shapes = student.blend_shapes.pruned(coefficient_std(student, sequence), keep=self.config.keep)
+        small, kept = pruned_to(student.with_blend_shapes(shapes), sequence, self.config.max_bytes)
         size = save_avatar(folder / self.file, small.eval())
         return StageOutput(numbers={"bytes": {self.file: size}, "kept_blend_shapes": kept, "finished": True})
 
@@ -75,14 +86,6 @@ class BaselineStage(ModelStage):
     @property
     def needs(self) -> Mapping[str, ModelStage]:
         return {"gaussians": self.gaussians}
-
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
-    @property
-    def iterations(self) -> int:
-        return self.config.iterations
 
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {

@@ -34,14 +34,6 @@ class BakeStage(ModelStage):
     def needs(self) -> Mapping[str, ModelStage]:
         return {"source": self.source}
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
-    @property
-    def iterations(self) -> int:
-        return self.config.iterations
-
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
             "training": self.config,

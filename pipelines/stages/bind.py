@@ -53,14 +53,6 @@ class BindStage(ModelStage):
     def needs(self) -> Mapping[str, ModelStage]:
         return {}
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
-    @property
-    def iterations(self) -> int:
-        return self.config.iterations
-
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         splits, capture = trainer.scene.capture.splits, trainer.scene.capture
         return {

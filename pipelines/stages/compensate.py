@@ -44,14 +44,6 @@ class CompensateStage(ModelStage):
     def needs(self) -> Mapping[str, ModelStage]:
         return {"student": self.student, **({} if self.teacher is None else {"teacher": self.teacher})}
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
-    @property
-    def iterations(self) -> int:
-        return self.config.iterations
-
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
             "training": self.config,

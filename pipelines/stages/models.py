@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -70,12 +70,24 @@ class TrainOptions:
     bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
 
 
+class StageConfig(Protocol):
+    """What the configuration of every stage says."""
+
+    @property
+    def seed(self) -> int:
+        """The seed of what is drawn."""
+
+    @property
+    def iterations(self) -> int:
+        """Steps of the training."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelStage(ABC):
     """A model that is trained once. Its settings and the files that it needs decide what comes out.
 
     Attributes:
-        name: its folder in the run.
+        name: its folder in the run. config: of the training.
         ground: among `GROUNDS`, the template that it is trained on.
         elsewhere: other folders of the run in which the same stage may stand already.
     """
@@ -87,6 +99,7 @@ class ModelStage(ABC):
     """Of several processes the first trains it; the others wait."""
 
     name: str
+    config: StageConfig
     ground: str = CLOTHED
     elsewhere: tuple[str, ...] = ()
 
@@ -96,14 +109,14 @@ class ModelStage(ABC):
         """The stages whose models it is made from, by the part that they play."""
 
     @property
-    @abstractmethod
     def seed(self) -> int:
         """The seed of what is drawn."""
+        return self.config.seed
 
     @property
-    @abstractmethod
     def iterations(self) -> int:
         """Steps of the training, for its progress."""
+        return self.config.iterations
 
     @abstractmethod
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:

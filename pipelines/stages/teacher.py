@@ -33,14 +33,6 @@ class TeacherStage(ModelStage):
     def needs(self) -> Mapping[str, ModelStage]:
         return {"gaussians": self.gaussians}
 
-    @property
-    def seed(self) -> int:
-        return self.config.seed
-
-    @property
-    def iterations(self) -> int:
-        return self.config.iterations
-
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
             "training": self._training(trainer),
