@@ -120,12 +120,12 @@ def _print(record: StageRecord, report: Path) -> None:
         table.add_column(name, justify="right")
     keys = ("psnr", "psnr_image", "ssim", "psnr_head")
 
-    def add(name: str, figures: dict[str, Any], **style: Any) -> None:
+    def add(name: str, figures: dict[str, Any], style: str | None = None) -> None:
         cells = [
             f"{figures[key]:.4f}" if key == "ssim" else "-" if figures.get(key) is None else f"{figures[key]:.2f}"
             for key in keys
         ]
-        table.add_row(name, *cells, **style)
+        table.add_row(name, *cells, style=style)
 
     for name, figures in numbers["held_out"].items():
         add(name, figures)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from avatar.data.views import read_view
 from pipelines.figures import colormap, encode_png, heat_colors
+from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes
 
 ERROR_LIMIT = 64
@@ -47,3 +50,16 @@ def read_strip(path: Path) -> tuple[Picture, Picture, Picture]:
 def enlarge(image: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Draw every pixel as a square of `factor` pixels: nothing is smoothed away."""
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
+    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
+    background = capture.recording.background or (0.0, 0.0, 0.0)
+
+    def write(images: Mapping[str, np.ndarray]) -> None:
+        for name, image in images.items():
+            camera, frame = name.rsplit(" ", 1)
+            real = read_view(capture, camera, int(frame)).photograph(background)
+            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
+
+    return write

@@ -10,11 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-import numpy as np
-
 from avatar.baselines.outer_template import outer_template
 from avatar.data.sequence import AvatarSequence
-from avatar.data.views import read_view
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
@@ -23,7 +20,7 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import explain_resource_errors
 from avatar.training.engine.session import Session
-from pipelines.figures.comparison import write_strip
+from pipelines.figures.comparison import preview_writer
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import (
@@ -37,7 +34,6 @@ from pipelines.runs.stage import (
     standing,
 )
 from pipelines.stages.scene import TrainScene
-from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
@@ -339,19 +335,6 @@ class Trainer:
         if scene.template_frame is not None:
             frames.add(scene.template_frame)
         return {"cameras": sorted(cameras), "frames": sorted(frames)}
-
-
-def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
-    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
-    background = capture.recording.background or (0.0, 0.0, 0.0)
-
-    def write(images: Mapping[str, np.ndarray]) -> None:
-        for name, image in images.items():
-            camera, frame = name.rsplit(" ", 1)
-            real = read_view(capture, camera, int(frame)).photograph(background)
-            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
-
-    return write
 
 
 def _nothing() -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,13 +13,14 @@ from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.stages.build_config import load_build
+from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
@@ -147,7 +147,7 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
-    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **_digests(capture, params)}
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **capture_digests(capture, params)}
     return TrainScene(template, capture, frame, built_frame, _template_frame(run, inputs), overlap, digests)
 
 
@@ -320,34 +320,6 @@ def _overlap(template: Template, capture: Capture, params: Mapping[int, BodyPara
             remedy="look at them with `smplxpp capture check`",
         )
     return float(np.mean(values))
-
-
-def _digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
-    """SHA-256 of cameras, parameters, splits, and of the names and sizes of all files that training may read.
-
-    The content of the files is left out: a sequence has hundreds of gigabytes of them.
-    """
-    cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
-    for name, camera in capture.cameras.items():
-        cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
-        cameras.update(f"{camera.width} {camera.height}".encode())
-    for frame, row in params.items():
-        numbers.update(str(frame).encode())
-        for array in ARRAY_NAMES:
-            numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
-    splits, used = capture.splits, 0
-    for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
-        for kind in ("image", "mask", "normal"):
-            path = capture.file(view, frame, kind)
-            if path is not None:
-                files.update(f"{kind} {view} {frame} {path.name} {path.stat().st_size}\n".encode())
-                used += 1
-    return {
-        "capture/cameras": cameras.hexdigest(),
-        "capture/parameters": numbers.hexdigest(),
-        f"capture/names and sizes of {used} files": files.hexdigest(),
-        "capture/splits": hashlib.sha256(repr((splits, capture.recording.background)).encode()).hexdigest(),
-    }
 
 
 def _warn(message: str) -> None:

@@ -118,7 +118,7 @@ class Camera:
         return Camera(K, _look_at_pose(eye, np.asarray(center, float), up), size, size, orthographic=True)
 
 
-def _look_at_pose(eye: np.ndarray, target: np.ndarray, up: tuple) -> np.ndarray:
+def _look_at_pose(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) -> np.ndarray:
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, np.asarray(up, float))
     x /= np.linalg.norm(x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -37,7 +39,7 @@ def print_check(check: CaptureCheck, console: Console) -> None:
         console.print(Text(f"{counts[1]} to look at", style="yellow" if counts[1] else "dim"))
 
 
-def _print_head(check: CaptureCheck, content: dict, console: Console) -> None:
+def _print_head(check: CaptureCheck, content: dict[str, Any], console: Console) -> None:
     sizes = sorted({f"{camera['width']} x {camera['height']}" for camera in content["cameras"]})
     rate = f" at {content['fps']:g} a second" if content["fps"] else ""
     console.print(Text(content["name"], style="bold") + Text(f"  {content['capture']}", style="dim"), soft_wrap=True)
@@ -63,7 +65,7 @@ def _print_head(check: CaptureCheck, content: dict, console: Console) -> None:
     console.print()
 
 
-def _camera_table(content: dict) -> Table:
+def _camera_table(content: dict[str, Any]) -> Table:
     table = _table(("camera", "set"), ("images", "masks", "outside", "worst", "overlap"), ("fit",))
     for camera in content["cameras"]:
         fit = camera["fit"]
@@ -72,7 +74,7 @@ def _camera_table(content: dict) -> Table:
     return table
 
 
-def _frame_table(content: dict) -> Table:
+def _frame_table(content: dict[str, Any]) -> Table:
     """List the frames that do not fit well, worst first."""
     table = _table(("frame",), ("bad views", "outside", "worst", "overlap"), ("fit",))
     doubtful = [(frame, fit) for frame, fit in content["frame_fits"].items() if fit["verdict"] != "good"]
@@ -106,6 +108,6 @@ def _table(left: tuple[str, ...], right: tuple[str, ...], last: tuple[str, ...])
     return table
 
 
-def _figures(fit: dict) -> tuple[str, str, str, Text]:
+def _figures(fit: dict[str, Any]) -> tuple[str, str, str, Text]:
     verdict = Text(fit["verdict"], style=_STYLES[fit["verdict"]])
     return f"{fit['outside']:.1%}", f"{fit['worst']:.1%}", f"{fit['iou']:.2f}", verdict

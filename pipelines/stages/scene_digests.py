@@ -1,0 +1,39 @@
+"""What a training reads of a capture, as digests."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from smplxpp.capture import Capture
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+
+
+def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
+    """Return the SHA-256 of cameras, parameters, splits, and of the names and sizes of all files that training may read.
+
+    The content of the files is left out: a sequence has hundreds of gigabytes of them.
+    """
+    cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+    for name, camera in capture.cameras.items():
+        cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
+        cameras.update(f"{camera.width} {camera.height}".encode())
+    for frame, row in params.items():
+        numbers.update(str(frame).encode())
+        for array in ARRAY_NAMES:
+            numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
+    splits, used = capture.splits, 0
+    for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
+        for kind in ("image", "mask", "normal"):
+            path = capture.file(view, frame, kind)
+            if path is not None:
+                files.update(f"{kind} {view} {frame} {path.name} {path.stat().st_size}\n".encode())
+                used += 1
+    return {
+        "capture/cameras": cameras.hexdigest(),
+        "capture/parameters": numbers.hexdigest(),
+        f"capture/names and sizes of {used} files": files.hexdigest(),
+        "capture/splits": hashlib.sha256(repr((splits, capture.recording.background)).encode()).hexdigest(),
+    }
