@@ -12,7 +12,7 @@ from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 
 def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
-    """Return the SHA-256 of cameras, parameters, splits, and of the names and sizes of all files that training may read.
+    """Return the SHA-256 of cameras, parameters, splits, and of names and sizes of all files that training may read.
 
     The content of the files is left out: a sequence has hundreds of gigabytes of them.
     """
