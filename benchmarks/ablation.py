@@ -39,6 +39,8 @@ class AblationBenchmark:
     """Rows and groups."""
     iterations_share: float = 1.0
     """Share of the preset's iterations."""
+    name: str | None = None
+    """Of the stored file, `ablation_NAME`; the capture's by default."""
 
     def run(self) -> None:
         """Run what is asked for, print the table, store the figures."""
@@ -46,7 +48,8 @@ class AblationBenchmark:
             Ablate(self.run_folder, self.capture, self.preset, self.rows, iterations_share=self.iterations_share).run()
         results = read_results(self.run_folder)
         print((self.run_folder / ABLATION / "table.txt").read_text())
-        path = store_results(f"ablation_{results['evaluation']['capture']}", results["command"], figures(results))
+        name = self.name or results["evaluation"]["capture"]
+        path = store_results(f"ablation_{name}", results["command"], figures(results))
         print(f"stored {path.name}")
 
 

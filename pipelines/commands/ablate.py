@@ -60,7 +60,7 @@ class Ablate:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Of everything random."""
+    """Decides everything random."""
     force: bool = False
     """Train the rows anew even if they stand."""
     json: bool = False

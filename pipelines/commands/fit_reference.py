@@ -54,7 +54,7 @@ class FitReference:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Of the Gaussians' places and of the views' order."""
+    """Decides the Gaussians' places and the views' order."""
     force: bool = False
     """Fit anew even if the fit stands."""
     no_report: bool = False

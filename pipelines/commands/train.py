@@ -85,7 +85,7 @@ class Train:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Decides everything that is drawn."""
     force: bool = False
     """Train anew even what stands; checkpoints go. A reference fit that you made stays."""
     tensorboard: bool = False

@@ -58,7 +58,7 @@ class TrainConfig:
 
     @property
     def max_bytes(self) -> float | None:
-        """Of the compact file; None where it has all blend shapes."""
+        """The compact file has at most as many bytes; None where it has all blend shapes."""
         return 1e6 * self.max_megabytes if self.blend_shapes == "pruned" else None
 
 
