@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -44,8 +45,8 @@ class Evaluate:
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     scale: float = 1.0
     """Size of the images to compare, 1 for every pixel."""
-    metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
-    """Perceptual distance; lpips needs the package lpips."""
+    metric: Literal["auto", "st-lpips", "lpips", "none"] = "auto"
+    """Perceptual distance; auto: ST-LPIPS where stlpips-pytorch is installed."""
     samples: int = 100_000
     """Points of a mesh for its distance to the truth; 0 leaves the surface out."""
     speed_size: tuple[int, int] = (512, 512)
@@ -88,7 +89,7 @@ class Evaluate:
             raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
         config = EvaluationConfig(
             protocol=protocol,
-            metric=self.metric,
+            metric=_metric(self.metric),
             samples=self.samples,
             seed=self.seed,
             speed_size=self.speed_size,
@@ -123,3 +124,13 @@ class Evaluate:
             if page.is_file():
                 console.print(f"report  {page}", soft_wrap=True, highlight=False)
         return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
+
+
+def _metric(name: str) -> str:
+    """The metric's name for "auto"."""
+    if name != "auto":
+        return name
+    if find_spec("stlpips_pytorch") is not None:
+        return "st-lpips"
+    log.info("no perceptual distance is measured: stlpips-pytorch is not installed (pip install --no-deps)")
+    return "none"

@@ -348,3 +348,12 @@ def test_a_model_without_a_record_of_what_it_saw_is_told(trained, capture, tmp_p
     with caplog.at_level("WARNING"):
         assert evaluate(run, capture, "--sets", "novel_view") == 0
     assert "90_compensate" in caplog.text and "not recorded" in caplog.text
+
+
+def test_a_perceptual_distance_that_nobody_asked_for_is_no_warning(monkeypatch, caplog):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    assert command._metric("auto") == "none" and "stlpips-pytorch" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["INFO"]
+    monkeypatch.setattr(command, "find_spec", lambda name: object())
+    assert command._metric("auto") == "st-lpips" and command._metric("lpips") == "lpips"
