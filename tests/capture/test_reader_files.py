@@ -76,6 +76,17 @@ def test_broken_colmap_files_are_refused_or_read(colmap_files, tmp_path_factory,
         assert isinstance(cameras, dict) and isinstance(images, list)
 
 
+def test_a_number_of_points_beyond_all_memory_is_refused(colmap_files, tmp_path):
+    for path in colmap_files["bin"].glob("*.bin"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    content = bytearray((tmp_path / "images.bin").read_bytes())
+    name_ends = content.index(b"\0", 8 + 64)
+    content[name_ends + 1 : name_ends + 9] = b"\xff" * 8
+    (tmp_path / "images.bin").write_bytes(bytes(content))
+    with pytest.raises(InputError, match=r"images\.bin"):
+        read_model(tmp_path)
+
+
 def test_numbered_files(tmp_path):
     for name in ("A_rgb000007.jpg", "A_rgb000002.PNG", "A_rgb12.jpg", "A_rgb000002.jpg", "B_rgb1.jpg", "A_rgbx.jpg"):
         (tmp_path / name).touch()

@@ -97,7 +97,7 @@ def _read_table(reader: Callable[[Path], T], path: Path) -> T:
         return reader(path)
     except InputError:
         raise
-    except (ValueError, IndexError, struct.error, OSError) as error:
+    except (ValueError, IndexError, OverflowError, struct.error, OSError) as error:
         raise InputError(
             f"file {path}",
             expected=f"COLMAP's {path.stem} as {path.suffix[1:]}",
