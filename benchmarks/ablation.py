@@ -65,7 +65,7 @@ def read_results(run: Path) -> dict[str, Any]:
         raise InputError(
             f"ablation of {run}",
             expected="finished rows",
-            received=f"still to train: {', '.join(results['waiting'])}" if results.get("waiting") else "none",
+            received=f"still to do: {', '.join(results['waiting'])}" if results.get("waiting") else "none",
             remedy="make them with `smplxpp ablate --run RUN --capture DIR`",
         )
     return results

@@ -59,7 +59,7 @@ class AblationOutcome:
 
     Attributes:
         folder: `RUN/ablation`. table: of the finished rows. results: as in `results.json`.
-        waiting: stages that are still to be trained; none when all is finished.
+        waiting: stages still to be trained, then rows still to be measured; none when all is finished.
     """
 
     folder: Path
@@ -118,7 +118,8 @@ def ablate(
             found[name] = measured
     result = AblationResult({name: found[name] for name in rows if name in found})
     needed = {stage.name: stage for name in rows if name not in found for stage in closure(stages[rows[name].model])}
-    waiting = [Path(name).name for name, stage in needed.items() if not _stands(trainer, stage)]
+    untrained = [Path(name).name for name, stage in needed.items() if not _stands(trainer, stage)]
+    waiting = list(dict.fromkeys([*untrained, *(name for name in rows if name not in found)]))
     about = {"command": how.command, "preset": preset, "scale": inputs.scale, "device": how.device}
     return _write(run / ABLATION, result, about, waiting)
 

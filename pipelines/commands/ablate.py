@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
+from pipelines.runs.stage import goes_on
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ class Ablate:
     body: OptionalPath = None
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     max_minutes: float = math.inf
-    """Stop after as many minutes and print the rows that are finished; the same command then goes on."""
+    """Stop after as many minutes and print the rows that are finished; the same command
+    then goes on (without --force, which would begin anew)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
@@ -95,7 +97,7 @@ class Ablate:
                 ),
             )
         if not self.json:
-            _print(outcome)
+            _print(outcome, goes_on(force=self.force))
         return outcome.results
 
     def command(self) -> str:
@@ -169,10 +171,10 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, Measuring]]:
         yield training, measuring
 
 
-def _print(outcome: AblationOutcome) -> None:
+def _print(outcome: AblationOutcome, goes_on: str) -> None:
     console = Console()
     if outcome.results["rows"]:
         console.print(outcome.table.text(), soft_wrap=True, highlight=False)
     if outcome.waiting:
-        console.print(f"still to train: {', '.join(outcome.waiting)}; the same command goes on", soft_wrap=True)
+        console.print(f"still to do: {', '.join(outcome.waiting)}; {goes_on}", soft_wrap=True)
     console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
 from pipelines.commands.progress import training_progress
-from pipelines.runs.stage import StageRecord
+from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class FitReference:
     scale: float = 1.0
     """Size of the images to work on, 1 for every pixel."""
     max_minutes: float = math.inf
-    """Stop after as many minutes of iterations and write what there is; the same command then goes on."""
+    """Stop after as many minutes of iterations and write what there is; the same command
+    then goes on (without --force, which would begin anew)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
@@ -88,7 +89,7 @@ class FitReference:
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
         if not self.json:
-            _print(record, report)
+            _print(record, report, force=self.force)
         numbers = record.manifest["numbers"]
         return {**numbers, "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
@@ -111,7 +112,7 @@ class FitReference:
         return replace(config, sampling=sampling, iterations=iterations, seed=self.seed)
 
 
-def _print(record: StageRecord, report: Path) -> None:
+def _print(record: StageRecord, report: Path, *, force: bool) -> None:
     console = Console()
     numbers = record.manifest["numbers"]
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
@@ -134,7 +135,7 @@ def _print(record: StageRecord, report: Path) -> None:
             add(label, numbers["mean"][which], style="bold" if which == "held_out" else "dim")
     console.print(table)
     done, total = numbers["iterations_done"], numbers["iterations"]
-    state = "finished" if numbers["finished"] else "stopped; the same command goes on"
+    state = "finished" if numbers["finished"] else f"stopped; {goes_on(force=force)}"
     console.print(
         f"{numbers['gaussians']:,} Gaussians, {done:,} of {total:,} iterations in {numbers['seconds_of_steps']:.1f} s "
         f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}",

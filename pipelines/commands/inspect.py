@@ -14,11 +14,18 @@ from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
 from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, TRAIN_STAGES
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import is_finished, read_manifest
 from smplxpp.core.errors import InputError
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
-_STATES = {"done": "green", "missing": "yellow", "outdated": "yellow", "incomplete": "red", "unreadable": "red"}
+_STATES = {
+    "done": "green",
+    "missing": "yellow",
+    "unfinished": "yellow",
+    "outdated": "yellow",
+    "incomplete": "red",
+    "unreadable": "red",
+}
 
 
 @dataclass(frozen=True)
@@ -100,7 +107,8 @@ def _stage(run: Path, name: str) -> dict[str, Any]:
     if not manifest:
         state = "unreadable" if (folder / "manifest.json").exists() else "missing"
     else:
-        state = "done" if len(present) == len(files) else "incomplete"
+        whole = "done" if is_finished(manifest) else "unfinished"
+        state = whole if len(present) == len(files) else "incomplete"
     records = manifest.get("checks", [])
     return {
         "stage": name,

@@ -293,7 +293,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
     )
     table.add_column("frame", no_wrap=True, min_width=9)
     for column in columns:
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", overflow="fold")  # a number cut short is another number
 
     def add(name: str, values: dict[str, Any], *, style: str | None = None, end_section: bool = False) -> None:
         cells = ["-" if values.get(key) is None else f"{values[key]:.4g}" for key in columns.values()]

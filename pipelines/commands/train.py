@@ -18,7 +18,7 @@ from rich.table import Table
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.layout import BIND_STAGE
-from pipelines.runs.stage import StageRecord
+from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,7 +49,8 @@ class Train:
     until: Literal["fit", "teacher", "bake", "compensate"] = "compensate"
     """The last stage to train."""
     max_minutes: float = math.inf
-    """Stop after as many minutes and write what there is; the same command then goes on."""
+    """Stop after as many minutes and write what there is; the same command
+    then goes on (without --force, which would begin anew)."""
     iterations_share: OptionalFloat = None
     """Share of the preset's iterations, of all stages."""
     fit_iterations: OptionalInt = None
@@ -184,7 +185,7 @@ class Train:
         if not self.no_report and (ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report")
         if not self.json:
-            _print(records, report)
+            _print(records, report, force=self.force)
         stages = {
             name: {**record.manifest["numbers"], "ran": record.ran, "checks": record.manifest["checks"]}
             for name, record in records.items()
@@ -230,7 +231,7 @@ def _perceptual(name: str, preset: TrainingPreset) -> str:
     return "none"
 
 
-def _print(records: dict[str, StageRecord], report: Path) -> None:
+def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> None:
     console = Console()
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("stage", no_wrap=True)
@@ -246,7 +247,7 @@ def _print(records: dict[str, StageRecord], report: Path) -> None:
             else (numbers.get("novel_view", {}))
         )
         poses = numbers.get("novel_pose", {})
-        state = "" if numbers["finished"] else "stopped: the same command goes on"
+        state = "" if numbers["finished"] else f"stopped: {goes_on(force=force)}"
         table.add_row(
             stage,
             f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",

@@ -117,7 +117,12 @@ class StageRecord:
 
 def is_finished(manifest: Mapping[str, Any]) -> bool:
     """Whether a stage came to its end; one that says nothing of it did."""
-    return bool(manifest["numbers"].get("finished", True))
+    return bool(manifest.get("numbers", {}).get("finished", True))
+
+
+def goes_on(*, force: bool) -> str:
+    """What to say of a stage that a limit of time stopped."""
+    return "the same command without --force goes on" if force else "the same command goes on"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
@@ -142,13 +147,16 @@ def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
     if force:
         return "redo"
     found = standing(run / stage.name, stage)
+    work = run / stage.work_name
+    record = _record(work / STATE_RECORD) or {}
+    own, begun = record.get("key") == stage.key, any(work.rglob("*.safetensors"))
+    if own and begun and record.get("forced"):  # a training anew that was killed goes on, whatever it is to replace
+        return "resume"
     if found is not None and found.finished:
         return "skip"
-    work = run / stage.work_name
-    if not any(work.rglob("*.safetensors")):
+    if not begun:
         return "redo" if found is None else "resume"
-    record = _record(work / STATE_RECORD) or {}
-    if record.get("key") != stage.key:
+    if not own:
         raise InputError(
             f"state of {stage.name} in {work}",
             expected="these options, inputs and code",
@@ -175,13 +183,18 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
     decision = decide(run, stage, force=force)
     if decision == "skip":
         log.info("%s: stands, skipped", stage.name)
-        shutil.rmtree(state, ignore_errors=True)
+        if (_record(state / STATE_RECORD) or {}).get("key") == stage.key:
+            shutil.rmtree(state, ignore_errors=True)
+        elif state.is_dir():
+            log.warning("%s holds the state of another training, which is kept; delete it if it is of no use", state)
         return StageRecord(folder, read_manifest(folder) or {}, ran=False)
     if decision == "redo":
         shutil.rmtree(state, ignore_errors=True)
     if stage.resumable:
+        forced = force or bool((_record(state / STATE_RECORD) or {}).get("forced"))
         state.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(state / STATE_RECORD, json.dumps({"key": stage.key, **stage.recorded}, indent=1))
+        record = {"key": stage.key, "forced": forced, **stage.recorded}
+        atomic_write_text(state / STATE_RECORD, json.dumps(record, indent=1))
     begin = time.perf_counter()
     with atomic_folder(folder) as temporary:
         output = work(temporary)
@@ -193,7 +206,9 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
     return StageRecord(folder, manifest, ran=True)
 
 
-def require_stage(run: Path, name: str) -> StageRecord:
+def require_stage(
+    run: Path, name: str, *, remedy: str = "run the build without --from-stage, or from an earlier stage"
+) -> StageRecord:
     """A stage that must already be there (after `--from`).
 
     Raises:
@@ -206,7 +221,7 @@ def require_stage(run: Path, name: str) -> StageRecord:
             f"stage {name} of {run}",
             expected="a finished stage with its files unchanged",
             received="none" if manifest is None else "changed or missing files",
-            remedy="run the build without --from-stage, or from an earlier stage",
+            remedy=remedy,
         )
     return StageRecord(folder, manifest, ran=False)
 

@@ -77,6 +77,8 @@ class BindStage(ModelStage):
         for name in (*capture.splits.train_cameras, *capture.splits.novel_view_cameras):
             camera = capture.cameras[name]
             out[f"capture/{name} camera"] = of(camera.K, camera.cam_from_world)
+            if name in capture.recording.distortions:
+                out[f"capture/{name} lens"] = repr(capture.recording.distortions[name])
             for kind in ("image", "mask"):
                 path = capture.file(name, scene.frame, kind)
                 if path is not None:

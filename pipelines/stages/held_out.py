@@ -15,6 +15,7 @@ from smplxpp.core.errors import InputError
 log = logging.getLogger(__name__)
 NAMED = 8
 """Cameras and frames that a refusal names."""
+TRAIN_ANEW = "train without them (smplxpp train --force; the capture's split says which frames are held out)"
 
 
 @dataclass(frozen=True)
@@ -39,23 +40,27 @@ def seen_by(run: Path, stages: Iterable[str]) -> Seen:
     )
 
 
-def refuse_seen(run: Path, stages: Iterable[str], splits: Splits) -> None:
-    """Refuse models that have seen cameras or frames which count as held out.
+def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, anew: str = TRAIN_ANEW) -> None:
+    """Refuse models that have seen cameras or frames which count as held out; `anew` says how to make others.
 
     Raises:
         InputError: names the stages and what they saw.
     """
-    names = tuple(sorted(stages))
-    seen = seen_by(run, names)
+    each = {name: seen_by(run, (name,)) for name in sorted(stages)}
+    seen = Seen(
+        frozenset().union(*(one.cameras for one in each.values())),
+        frozenset().union(*(one.frames for one in each.values())),
+    )
     cameras = [camera for camera in splits.novel_view_cameras if camera in seen.cameras]
     frames = [frame for frame in splits.novel_pose_frames if frame in seen.frames]
     if not cameras and not frames:
         return
     known = sorted({*splits.train_cameras, *splits.novel_view_cameras})
     never = [camera for camera in known if camera not in seen.cameras]
-    remedy = "train anew without them (--force)"
+    names = [name for name, one in each.items() if one.cameras.intersection(cameras) or one.frames.intersection(frames)]
+    remedy = anew
     if cameras and never:
-        remedy = f"hold out what they did not see (--hold-out {' '.join(never[:NAMED])}), or {remedy}"
+        remedy = f"hold out what they did not see (--hold-out {' '.join(never[:NAMED])}), or {anew}"
     what = [f"{kind} {_named(values)}" for kind, values in (("cameras", cameras), ("frames", frames)) if values]
     raise InputError(
         f"held-out views of run {run}",

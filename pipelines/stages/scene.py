@@ -148,7 +148,16 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
     digests = {TEMPLATE: sha256_file(run / TEMPLATE), **capture_digests(capture, params)}
-    return TrainScene(template, capture, frame, built_frame, _template_frame(run, inputs), overlap, digests)
+    template_frame = _template_frame(run, inputs)
+    if template_frame in capture.splits.novel_pose_frames:
+        raise InputError(
+            f"held-out frames of capture {capture.name}",
+            expected="frames that neither the template nor a model has seen",
+            received=f"frame {template_frame}, whose scan the template of {run} was built from",
+            remedy="hold out other frames (in the capture's split, or with --hold-out-frames of evaluate), or build "
+            "the template from a training frame",
+        )
+    return TrainScene(template, capture, frame, built_frame, template_frame, overlap, digests)
 
 
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:

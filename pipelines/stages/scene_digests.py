@@ -20,6 +20,8 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
     for name, camera in capture.cameras.items():
         cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
         cameras.update(f"{camera.width} {camera.height}".encode())
+        if name in capture.recording.distortions:
+            cameras.update(repr(capture.recording.distortions[name]).encode())
     for frame, row in params.items():
         numbers.update(str(frame).encode())
         for array in ARRAY_NAMES:

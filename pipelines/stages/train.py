@@ -15,7 +15,7 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset, with_local_shapes
 from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TEMPLATE
-from pipelines.runs.stage import StageRecord, is_finished, read_manifest
+from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
 from pipelines.stages.compensate import CompensateStage
@@ -143,14 +143,16 @@ def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord |
     numbers = manifest["numbers"]
     if not (numbers["by_hand"] and is_finished(manifest)):
         return None
-    refuse_seen(run, (fit.name,), scene.capture.splits)
+    anew = f"fit without them (smplxpp fit-reference), or delete {run / fit.name}"
+    refuse_seen(run, (fit.name,), scene.capture.splits, anew=anew)
+    record = require_stage(run, fit.name, remedy=f"fit it anew (smplxpp fit-reference), or delete {run / fit.name}")
     log.info(
         "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
         fit.name,
         f"{numbers['gaussians']:,}",
         f"{numbers['iterations']:,}",
     )
-    return StageRecord(run / fit.name, manifest, ran=False)
+    return record
 
 
 def with_perceptual(preset: TrainingPreset) -> TrainingPreset:

@@ -100,3 +100,13 @@ def test_json_and_exit_status(run, capsys):
     assert main(["inspect", str(run)]) == 0
     assert main(["inspect", str(run), "--strict"]) == 1
     assert main(["inspect", str(run / "nothing")]) == 2
+
+
+def test_a_training_that_the_time_stopped_is_unfinished(run, capsys):
+    path = run / BUILD_STAGES[-1] / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps({**manifest, "numbers": {"finished": False}}))
+    summary, _ = summarise_run(run)
+    assert summary["stages"][-1]["state"] == "unfinished" and summary["unfinished"] == [BUILD_STAGES[-1]]
+    Inspect(run).run()
+    assert "unfinished" in capsys.readouterr().out

@@ -14,6 +14,7 @@ from PIL import Image
 from pipelines.commands import options
 from pipelines.commands import train as command
 from pipelines.runs.stage import read_manifest
+from pipelines.stages import scene as scene_module
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
@@ -237,3 +238,22 @@ def test_what_runs_out_is_said_and_finished_stages_stay(run, original, capsys, m
     assert "memory" in message or "disk" in message
     assert read_manifest(run / "70_bind")["numbers"]["finished"] and not (run / "80_teacher").exists()
     assert (run / "80_teacher_work").is_dir()
+
+
+def test_a_template_of_a_held_out_frame_is_refused_before_training(run, capture, monkeypatch):
+    monkeypatch.setattr(scene_module, "_template_frame", lambda run, inputs: 4)
+    with pytest.raises(InputError, match="frame 4, whose scan the template"):
+        opened(run, capture)
+    monkeypatch.setattr(scene_module, "_template_frame", lambda run, inputs: 1)
+    assert opened(run, capture).template_frame == 1
+
+
+def test_another_lens_is_another_capture(run, capture):
+    before = opened(run, capture).digests
+    path = capture / "cameras.json"
+    content = json.loads(path.read_text())
+    cameras = content["cameras"]
+    first = cameras[0] if isinstance(cameras, list) else next(iter(cameras.values()))
+    first["dist"] = [0.1, 0.0, 0.0, 0.0, 0.0]
+    path.write_text(json.dumps(content))
+    assert opened(run, capture).digests["capture/cameras"] != before["capture/cameras"]

@@ -166,3 +166,25 @@ def test_a_difference_names_what_changed(tmp_path):
     old, new = (stage_of("s", config={"a": {"b": k}, "c": 1}, inputs={"x": f"{k}"}) for k in (1, 2))
     assert differences(old.recorded, new) == "config a.b was 1, is 2; inputs x"
     assert "missing" in differences(old.recorded, old)
+
+
+def test_a_training_anew_that_was_killed_goes_on_without_force(tmp_path):
+    training = Training(tmp_path)
+    training()
+    with pytest.raises(RuntimeError):
+        training(stop=3, kill=True, force=True)
+    assert decide(tmp_path, training.stage) == "resume"
+    with pytest.raises(RuntimeError):
+        training(stop=0, kill=True)
+    assert training().manifest["numbers"]["began"] == 3
+    assert decide(tmp_path, training.stage) == "skip" and not training.state.parent.exists()
+
+
+def test_the_state_of_another_training_outlives_a_stage_that_stands(tmp_path, caplog):
+    training, other = Training(tmp_path), Training(tmp_path, config={"lr": 0.2})
+    training()
+    with pytest.raises(RuntimeError):
+        other(stop=1, kill=True)
+    assert not training().ran and other.state.read_text() == "1"
+    assert "the state of another training" in caplog.text
+    assert other().manifest["numbers"]["began"] == 1
