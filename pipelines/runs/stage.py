@@ -191,6 +191,7 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
     if decision == "redo":
         shutil.rmtree(state, ignore_errors=True)
     if stage.resumable:
+        _tell_replaced(folder, stage)
         forced = force or bool((_record(state / STATE_RECORD) or {}).get("forced"))
         state.mkdir(parents=True, exist_ok=True)
         record = {"key": stage.key, "forced": forced, **stage.recorded}
@@ -204,6 +205,13 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
         shutil.rmtree(state, ignore_errors=True)
     log.info("%s: %.2f s", stage.name, manifest["seconds"])
     return StageRecord(folder, manifest, ran=True)
+
+
+def _tell_replaced(folder: Path, stage: Stage) -> None:
+    """Log what a finished training differs in that this one will take the place of."""
+    old = read_manifest(folder)
+    if old is not None and is_finished(old) and old.get("key") != stage.key:
+        log.warning("%s is trained anew and replaces one made otherwise: %s", stage.name, differences(old, stage))
 
 
 def require_stage(

@@ -68,7 +68,9 @@ def test_table_figures_and_pictures(finished, capsys, capture):
 def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, capture, capsys):
     run = write_moving_run(tmp_path / "run")
     assert ablate(run, capture, "--max-minutes", "1e-6") == 0
-    assert "still to do: gaussians, teacher, bake, lbs, no-gaussians; the same command goes on" in capsys.readouterr().out
+    assert (
+        "still to do: gaussians, teacher, bake, lbs, no-gaussians; the same command goes on" in capsys.readouterr().out
+    )
     assert json.loads((run / "ablation" / "results.json").read_text())["rows"] == {}
 
 

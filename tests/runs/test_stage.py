@@ -188,3 +188,10 @@ def test_the_state_of_another_training_outlives_a_stage_that_stands(tmp_path, ca
     assert not training().ran and other.state.read_text() == "1"
     assert "the state of another training" in caplog.text
     assert other().manifest["numbers"]["began"] == 1
+
+
+def test_what_a_finished_training_is_replaced_for_is_told(tmp_path, caplog):
+    Training(tmp_path)()
+    assert "replaces" not in caplog.text
+    Training(tmp_path, config={"lr": 0.2})()
+    assert "replaces one made otherwise: config lr was 0.1, is 0.2" in caplog.text
