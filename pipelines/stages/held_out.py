@@ -20,24 +20,19 @@ TRAIN_ANEW = "train without them (smplxpp train --force; the capture's split say
 
 @dataclass(frozen=True)
 class Seen:
-    """Cameras and frames that models learned from, by themselves or through what they were made from."""
+    """Cameras and frames that a model learned from, by itself or through what it was made from."""
 
     cameras: frozenset[str]
     frames: frozenset[int]
 
 
-def seen_by(run: Path, stages: Iterable[str]) -> Seen:
-    """What the models of a run's stages have seen; a model without a record of it is logged."""
-    found = []
-    for name in stages:
-        seen = (read_manifest(run / name) or {}).get("numbers", {}).get("seen")
-        if seen is None:
-            log.warning("%s: what its model has seen is not recorded; whether views are novel is not known", name)
-        found.append(seen or {})
-    return Seen(
-        frozenset(camera for one in found for camera in one.get("cameras", ())),
-        frozenset(frame for one in found for frame in one.get("frames", ())),
-    )
+def _seen_by(run: Path, stage: str) -> Seen:
+    """What the model of a stage has seen; a model without a record of it is logged."""
+    seen = (read_manifest(run / stage) or {}).get("numbers", {}).get("seen")
+    if seen is None:
+        log.warning("%s: what its model has seen is not recorded; whether views are novel is not known", stage)
+        seen = {}
+    return Seen(frozenset(seen.get("cameras", ())), frozenset(seen.get("frames", ())))
 
 
 def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, anew: str = TRAIN_ANEW) -> None:
@@ -46,17 +41,13 @@ def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, anew: str =
     Raises:
         InputError: names the stages and what they saw.
     """
-    each = {name: seen_by(run, (name,)) for name in sorted(stages)}
-    seen = Seen(
-        frozenset().union(*(one.cameras for one in each.values())),
-        frozenset().union(*(one.frames for one in each.values())),
-    )
-    cameras = [camera for camera in splits.novel_view_cameras if camera in seen.cameras]
-    frames = [frame for frame in splits.novel_pose_frames if frame in seen.frames]
+    each = {name: _seen_by(run, name) for name in sorted(stages)}
+    cameras = [camera for camera in splits.novel_view_cameras if any(camera in one.cameras for one in each.values())]
+    frames = [frame for frame in splits.novel_pose_frames if any(frame in one.frames for one in each.values())]
     if not cameras and not frames:
         return
     known = sorted({*splits.train_cameras, *splits.novel_view_cameras})
-    never = [camera for camera in known if camera not in seen.cameras]
+    never = [camera for camera in known if all(camera not in one.cameras for one in each.values())]
     names = [name for name, one in each.items() if one.cameras.intersection(cameras) or one.frames.intersection(frames)]
     remedy = anew
     if cameras and never:

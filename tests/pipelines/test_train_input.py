@@ -13,8 +13,9 @@ from PIL import Image
 
 from pipelines.commands import options
 from pipelines.commands import train as command
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages import scene as scene_module
+from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
@@ -257,3 +258,12 @@ def test_another_lens_is_another_capture(run, capture):
     first["dist"] = [0.1, 0.0, 0.0, 0.0, 0.0]
     path.write_text(json.dumps(content))
     assert opened(run, capture).digests["capture/cameras"] != before["capture/cameras"]
+
+
+def test_a_refusal_names_the_stages_that_saw_what_is_held_out_alone(run, original):
+    for name, frames in (("70_bind", [0]), ("80_teacher", [0, 4])):
+        (run / name).mkdir()
+        seen = {"seen": {"cameras": list(TRAIN), "frames": frames}}
+        (run / name / "manifest.json").write_text(json.dumps({"schema": SCHEMA, "numbers": seen}))
+    with pytest.raises(InputError, match="frames 4, which 80_teacher learned from"):
+        refuse_seen(run, ("70_bind", "80_teacher"), opened(run, original).capture.splits)
