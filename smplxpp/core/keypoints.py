@@ -52,7 +52,7 @@ class Keypoints2D:
             raise InputError(
                 "keypoints",
                 expected="confidences from 0 to 1",
-                received=f"{np.nanmin(confidence):g} to {np.nanmax(confidence):g}, NaN: {bool(np.isnan(confidence).any())}",
+                received=f"{np.nanmin(confidence):g} to {np.nanmax(confidence):g}",
             )
         if not np.isfinite(points[confidence > 0]).all():
             raise InputError("keypoints", expected="finite pixels where the confidence is above 0", received="others")
