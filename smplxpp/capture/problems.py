@@ -19,7 +19,8 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
     Missing: cameras without images, frames that not every camera has, images without a mask where others have one,
     frames without parameters. Unusable: parameters and keypoints that cannot be read or hold NaN; with `decode` (which
     reads every file) damaged images, masks, label and normal maps, ones of another size than the calibration's, and
-    images that are not on the declared background. `capture.without(problems)` leaves out what is named, and then has no problems but those of the whole capture.
+    images that are not on the declared background. `capture.without(problems)` leaves out what is named, and then has
+    no problems but those of the whole capture.
 
     Args:
         capture: as opened; its own `problems` come first.
