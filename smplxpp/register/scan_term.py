@@ -16,8 +16,8 @@ from smplxpp.register.config import RegisterConfig
 from smplxpp.register.gaps import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import NormalEquations
-from smplxpp.register.robust import geman_mcclure
 from smplxpp.register.observations import ScanObservation
+from smplxpp.register.robust import geman_mcclure
 
 # Labels in groups: skin, unknown, and each thing that is worn.
 _UNKNOWN_GROUP, _GROUPS = 0, 16

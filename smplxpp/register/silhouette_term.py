@@ -17,8 +17,8 @@ from smplxpp.register.gaps import Gaps
 from smplxpp.register.keypoint_term import projected
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import NormalEquations
-from smplxpp.register.robust import geman_mcclure
 from smplxpp.register.outline import Outline
+from smplxpp.register.robust import geman_mcclure
 
 # A vertex is at the rim where its normal is this near to perpendicular to the ray: sine of the angle.
 _RIM = 0.13
