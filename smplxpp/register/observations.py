@@ -42,6 +42,7 @@ class Observations:
             in the cameras' pixels; None: nothing of the kind.
         scans: by frame.
         initial: a fit to start from, a row a frame.
+        shape_frames: the frames that the shape is solved on; None: all. Held-out frames are not among them.
         fps: frames a second, None where not known.
     """
 
@@ -52,4 +53,5 @@ class Observations:
     labels: ViewMap | None = None
     scans: Mapping[int, ScanObservation] = field(default_factory=dict)
     initial: BodyParams | None = None
+    shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
