@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 CAPTURE_STAGE = "00_capture"
-REGISTER_STAGE = "10_register"
+POSE_BODY_STAGE = "10_body"
 SEGMENT_STAGE = "20_segment"
 CLEAN_STAGE = "30_clean"
 TRANSFER_STAGE = "40_transfer"
@@ -19,7 +19,7 @@ ABLATION = "ablation"
 
 BUILD_STAGES = (
     CAPTURE_STAGE,
-    REGISTER_STAGE,
+    POSE_BODY_STAGE,
     SEGMENT_STAGE,
     CLEAN_STAGE,
     TRANSFER_STAGE,
@@ -35,7 +35,7 @@ ALL_STAGES = (*BUILD_STAGES, *MODEL_STAGES, EVALUATE_STAGE)
 
 SCAN = f"{CAPTURE_STAGE}/scan.npz"
 PARAMS = f"{CAPTURE_STAGE}/params.npz"
-POSED_BODY = f"{REGISTER_STAGE}/body.npz"
+POSED_BODY = f"{POSE_BODY_STAGE}/body.npz"
 SCAN_LABELS = f"{SEGMENT_STAGE}/labels.npz"
 PARTS = f"{CLEAN_STAGE}/parts.npz"
 WEIGHTS = f"{TRANSFER_STAGE}/weights.npz"

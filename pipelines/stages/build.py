@@ -18,7 +18,7 @@ from pipelines.runs.layout import (
     CAPTURE_STAGE,
     CLEAN_STAGE,
     METRICS_FILE,
-    REGISTER_STAGE,
+    POSE_BODY_STAGE,
     SEGMENT_STAGE,
     TRANSFER_STAGE,
     UNPOSE_STAGE,
@@ -26,7 +26,7 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
-from pipelines.stages import assemble, capture, clean, register, segment, transfer, unpose, validate
+from pipelines.stages import assemble, capture, clean, pose_body, segment, transfer, unpose, validate
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
 from smplxpp.body import load_body, load_params
 from smplxpp.core.atomic import atomic_write_text
@@ -58,18 +58,18 @@ PARTS: dict[str, _Part] = {
     CAPTURE_STAGE: _Part(
         capture, (), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
     ),
-    REGISTER_STAGE: _Part(register, (CAPTURE_STAGE,), files=("body",)),
+    POSE_BODY_STAGE: _Part(pose_body, (CAPTURE_STAGE,), files=("body",)),
     SEGMENT_STAGE: _Part(
         segment, (CAPTURE_STAGE,), settings=("label_set",), files=("labels", "label_maps", "cameras", "scan")
     ),
     CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
     TRANSFER_STAGE: _Part(
-        transfer, (REGISTER_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
+        transfer, (POSE_BODY_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
     ),
-    UNPOSE_STAGE: _Part(unpose, (REGISTER_STAGE, TRANSFER_STAGE), files=("body",)),
+    UNPOSE_STAGE: _Part(unpose, (POSE_BODY_STAGE, TRANSFER_STAGE), files=("body",)),
     ASSEMBLE_STAGE: _Part(
         assemble,
-        (CAPTURE_STAGE, REGISTER_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+        (CAPTURE_STAGE, POSE_BODY_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
         settings=("clearance_mm",),
         files=("body",),
     ),

@@ -59,7 +59,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     scan, colors, _ = load_scan(run)
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
-    early = tuple(c for c in checks if c.stage in ("00_capture", "10_register", "20_segment"))
+    early = tuple(c for c in checks if c.stage in ("00_capture", "10_body", "20_segment"))
     sections = (
         _scan_section(run, scan, colors, cameras, early),
         _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
