@@ -43,9 +43,7 @@ class BodyState:
 
     def select(self, rows: slice | Integer[np.ndarray, " n"]) -> BodyState:
         """Some of the frames."""
-        return replace(
-            self, rotations=self.rotations[rows], transl=self.transl[rows], expression=self.expression[rows]
-        )
+        return replace(self, rotations=self.rotations[rows], transl=self.transl[rows], expression=self.expression[rows])
 
     @staticmethod
     def of_params(body: BodyModel, params: BodyParams) -> BodyState:
@@ -213,9 +211,7 @@ class Kinematics:
     def posture(self, state: BodyState, row: int) -> Posture:
         """Pose the skeleton of one frame."""
         rest = self.rest_joints + self.joint_dirs @ state.betas
-        transforms, joints = forward_kinematics(
-            rest, self.parents, state.rotations[row], transl=state.transl[row]
-        )
+        transforms, joints = forward_kinematics(rest, self.parents, state.rotations[row], transl=state.transl[row])
         turned = transforms[:, :3, :3]
         parent = np.where((self.parents < 0)[:, None, None], np.eye(3), turned[np.maximum(self.parents, 0)])
         feature = (state.rotations[row, 1:] - np.eye(3)).ravel()
