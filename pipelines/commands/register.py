@@ -41,7 +41,7 @@ class Register:
     protocol: OptionalText = None
     """Protocol of the capture, which names the files that are read."""
     frames: OptionalText = None
-    """Frames to register: numbers and ranges START:STOP:STEP with commas between; by default all that the split names."""
+    """Frames to register: numbers and ranges START:STOP:STEP with commas; by default all that the split names."""
     frame: int = 0
     """Reference frame: the one of --scan and --labels."""
     labels: OptionalPath = None
