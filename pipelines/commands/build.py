@@ -16,7 +16,7 @@ from pipelines.commands.progress import stage_progress
 from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REGISTER_STAGE, TRAIN_STAGES
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
-from pipelines.stages.register_config import RegisterInputs, load_register
+from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, said_of_inputs, said_of_parameters
 from smplxpp.capture import find_reference
 from smplxpp.core.errors import InputError
@@ -191,8 +191,9 @@ class Build:
             or read_manifest(self.out / REGISTER_STAGE) is None
         ):
             return None
+        params = named_params(self.capture, self.params)
         same = found.capture.resolve() == self.capture.resolve()
-        return found if same and self.params in (None, found.params) else None
+        return found if same and (params is None or params.resolve() == found.params) else None
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
         """What the body is registered to, None where the parameters are given."""
@@ -200,7 +201,7 @@ class Build:
             return None
         return self._standing_registration() or RegisterInputs(
             capture=self.capture,
-            params=self.params,
+            params=named_params(self.capture, self.params),
             body=self.body,
             scan=self.scan,
             frame=self.frame,

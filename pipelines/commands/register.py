@@ -102,7 +102,7 @@ class Register:
             InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
         """
         from pipelines.commands.capture import selected_frames
-        from pipelines.stages.register_config import RegisterInputs
+        from pipelines.stages.register_config import RegisterInputs, named_params
         from smplxpp.capture import open_capture
 
         if self.capture is None and self.scan is None:
@@ -120,7 +120,7 @@ class Register:
             frames = selected_frames(self.frames, open_capture(self.capture))
         return RegisterInputs(
             capture=self.capture,
-            params=self.params,
+            params=named_params(self.capture, self.params),
             start=self.initial == "params",
             protocol=self.protocol,
             frames=frames,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import REGISTER_FILE
+from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.atomic import atomic_write_text
 
 
@@ -41,6 +42,11 @@ class RegisterInputs:
     label_set: str = "capture"
     units: str = "m"
     up: str = "y"
+
+
+def named_params(capture: Path | None, params: Path | None) -> Path | None:
+    """The file or folder that a user means by parameters: by path, or by its name in the capture's `params/`."""
+    return stacked_params(capture, params) if params is not None and capture is not None else params
 
 
 _PATHS = ("capture", "params", "body", "scan", "labels")

@@ -34,7 +34,7 @@ HEIGHT = 560
 REFERENCE_VIEWS, WORST_FRAMES = 2, 3
 STRIP_COLUMNS = 240
 PROBLEMS_SHOWN = 20
-_MARGIN = 0.14
+_MARGIN, _WHOLE = 0.14, 0.95
 _EYES = ("left_eye_smplhf", "right_eye_smplhf")
 
 
@@ -135,14 +135,28 @@ def _pictures(inputs: RegisterInputs, fits: _Fits, content: Mapping[str, Any]) -
         chosen = [(reference, REFERENCE_VIEWS, "reference frame")]
         chosen += [(frame, 1, f"largest residual, {words}") for frame, words in worst if frame != reference]
         for frame, count, why in chosen:
-            seen = [name for name in content["cameras"] if capture.file(name, frame) is not None]
-            for name in spread(seen, count):
+            for name in _cameras_shown(capture, content["cameras"], frame, fits)[:count]:
                 pictures.append(_on_photograph(capture, name, frame, fits, why))
     scans = {} if inputs.capture is None else find_scans(inputs.capture)
     scans |= {} if inputs.scan is None else {inputs.frame: inputs.scan}
     if reference in scans:
         pictures.append(_on_scan(scans[reference], inputs, reference, fits))
     return pictures
+
+
+def _cameras_shown(capture: Capture, names: Sequence[str], frame: int, fits: _Fits) -> list[str]:
+    """Two cameras with an image, if there are: of those that show the whole body the first, and one a quarter on."""
+    seen = [name for name in names if capture.file(name, frame) is not None]
+    joints = fits.posed(frame)["after"].joints
+    whole = []
+    for name in seen:
+        camera = capture.cameras[name]
+        pixels = camera.screen_from_world(joints)
+        inside = (pixels[:, :2] >= 0) & (pixels[:, :2] <= (camera.width, camera.height))
+        if (inside.all(axis=1) & (pixels[:, 2] > 0)).mean() > _WHOLE:
+            whole.append(name)
+    chosen = whole or seen
+    return list(dict.fromkeys([chosen[0], chosen[len(chosen) // 4]])) if chosen else []
 
 
 def worst_frames(content: Mapping[str, Any], count: int) -> list[tuple[int, str]]:
