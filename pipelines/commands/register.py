@@ -71,14 +71,12 @@ class Register:
         from pipelines.runs.layout import REGISTER_STAGE
         from pipelines.runs.lock import own_run_folder
         from pipelines.stages.register_capture import register_capture
-        from smplxpp.register.config import RegisterConfig
 
         require_at_least("option seed", self.seed, 0)
         require_at_least("option frame", self.frame, 0)
         inputs = self.inputs()
         with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
-            config = RegisterConfig(seed=self.seed)
-            record = register_capture(self.out, inputs, config, force=self.force, progress=progress)
+            record = register_capture(self.out, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
         content = jsonlib.loads((record.folder / "registration.json").read_text())
         if not self.json:
@@ -132,6 +130,7 @@ class Register:
             label_set=self.label_set,
             units=self.units,
             up=self.up,
+            seed=self.seed,
         )
 
     def _report(self, record: StageRecord) -> Path:

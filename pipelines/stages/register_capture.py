@@ -33,7 +33,6 @@ def _silent(what: str, share: float) -> None:
 def register_capture(
     run: Path,
     inputs: RegisterInputs,
-    config: RegisterConfig | None = None,
     *,
     force: bool = False,
     progress: Report = _silent,
@@ -43,7 +42,7 @@ def register_capture(
     Raises:
         InputError: inputs that nothing can be registered to, or not a single frame that was.
     """
-    config = config or RegisterConfig()
+    config = RegisterConfig(seed=inputs.seed)
     body = load_body(inputs.body)
     observed = observe(inputs, body)
     digests = dict(observed.digests)

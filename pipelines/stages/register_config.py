@@ -27,6 +27,7 @@ class RegisterInputs:
         scan: the reference frame's scan, in the place of the capture's. frame: its number.
         labels: of that scan's vertices or faces; None: votes of the frame's label maps.
         label_set: of the scan's labels. units, up: how scans are written.
+        seed: of the points that are sampled.
     """
 
     capture: Path | None = None
@@ -42,6 +43,7 @@ class RegisterInputs:
     label_set: str = "capture"
     units: str = "m"
     up: str = "y"
+    seed: int = 0
 
 
 def named_params(capture: Path | None, params: Path | None) -> Path | None:
