@@ -1,14 +1,15 @@
-"""A stand-in for the solver, with known answers, and keypoints of the embedded person: for tests of what lies around."""
+"""A stand-in for the solver, with known answers, and keypoints of the embedded person."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.stages import register_capture
-from smplxpp.body import load_body, load_params
+from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.capture import Capture
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import BodyParams
@@ -21,7 +22,7 @@ HELD_OUT = "Cam004"
 
 @dataclass
 class Solver:
-    """Gives the exact parameters, reads every map, and remembers what it was shown; `fails` are frames without a fit."""
+    """Gives the exact parameters, reads every map, remembers what it was shown; `fails` are frames without a fit."""
 
     fails: tuple[int, ...] = ()
     doubtful: tuple[int, ...] = ()
@@ -45,15 +46,22 @@ class Solver:
         return BodyFit(frames, exact().select(list(frames)), confidence, after, before, problems)
 
 
+@cache
 def exact() -> BodyParams:
     """The embedded person's parameters of all frames."""
     return load_params(FIXTURE / "params" / "params.npz")
 
 
+@cache
+def posed_joints() -> tuple[BodyModel, np.ndarray]:
+    """The body and its joints in all frames."""
+    body = load_body()
+    return body, body.forward(exact()).joints
+
+
 def joints_in(capture: Capture, camera: str) -> Keypoints2D:
     """The person's joints as a camera sees them, exact."""
-    body = load_body()
-    joints = body.forward(exact()).joints
+    body, joints = posed_joints()
     pixels = capture.cameras[camera].screen_from_world(joints.reshape(-1, 3))[:, :2].reshape(*joints.shape[:2], 2)
     return Keypoints2D(tuple(body.joint_names), np.arange(len(joints)), pixels, np.full(joints.shape[:2], 0.9))
 

@@ -16,7 +16,7 @@ from pipelines.stages.params_in_use import params_in_use
 from pipelines.stages.register_capture import register_capture
 from pipelines.stages.register_config import RegisterInputs, load_register
 from smplxpp.body import load_params
-from smplxpp.capture import open_capture
+from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.params import BodyParams
@@ -36,9 +36,16 @@ def solver(monkeypatch, asked):
     return use_solver(monkeypatch)
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """The person without scans, which take a second each."""
+    unused = shutil.ignore_patterns("geometry", "normals", "scans")
+    return shutil.copytree(FIXTURE, tmp_path_factory.mktemp("plain") / "person", ignore=unused)
+
+
 @pytest.fixture
 def capture(tmp_path):
-    """A copy to spoil, without photographs."""
+    """A copy to spoil."""
     return shutil.copytree(FIXTURE, tmp_path / "capture", ignore=shutil.ignore_patterns("geometry", "normals"))
 
 
@@ -49,8 +56,8 @@ def inputs_of(folder=FIXTURE, **changes) -> RegisterInputs:
 # --- what the solver is shown ---------------------------------------------------------------------------------------
 
 
-def test_held_out_cameras_are_never_looked_at(tmp_path, solver, asked):
-    register_capture(tmp_path, inputs_of(frames=None))
+def test_held_out_cameras_are_never_looked_at(tmp_path, solver, asked, plain):
+    register_capture(tmp_path, inputs_of(plain, frames=None))
     (shown,) = solver.shown
     splits = open_capture(FIXTURE).splits
     assert tuple(shown.cameras) == splits.train_cameras and HELD_OUT not in shown.keypoints
@@ -59,8 +66,8 @@ def test_held_out_cameras_are_never_looked_at(tmp_path, solver, asked):
     assert shown.mask("Cam001", 0).max() == 255
 
 
-def test_held_out_frames_get_poses_and_no_say_in_the_shape(tmp_path, solver):
-    record = register_capture(tmp_path, inputs_of(frames=None))
+def test_held_out_frames_get_poses_and_no_say_in_the_shape(tmp_path, solver, plain):
+    record = register_capture(tmp_path, inputs_of(plain, frames=None))
     (shown,) = solver.shown
     splits = open_capture(FIXTURE).splits
     assert shown.frames == tuple(range(16)) and shown.shape_frames == splits.train_frames
@@ -69,13 +76,13 @@ def test_held_out_frames_get_poses_and_no_say_in_the_shape(tmp_path, solver):
     assert json.loads((tmp_path / REGISTRATION).read_text())["held_out_frames"] == [13, 14, 15]
 
 
-def test_other_cameras_may_be_held_out(tmp_path, solver):
-    register_capture(tmp_path, inputs_of(hold_out=("Cam001", "Face1")))
+def test_other_cameras_may_be_held_out(tmp_path, solver, plain):
+    register_capture(tmp_path, inputs_of(plain, hold_out=("Cam001", "Face1")))
     assert set(solver.shown[0].cameras) == {"Cam002", "Cam003", "Cam004", "Cam005", "Cam006", "Face2"}
 
 
-def test_label_maps_are_ours_and_255_elsewhere(tmp_path, solver):
-    register_capture(tmp_path, inputs_of())
+def test_label_maps_are_ours_and_255_elsewhere(tmp_path, solver, plain):
+    register_capture(tmp_path, inputs_of(plain))
     capture, ours = open_capture(FIXTURE), solver.shown[0].labels("Cam001", 0)
     theirs = capture.labels("Cam001", 0)
     assert ours.dtype == np.uint8 and set(np.unique(ours)) <= {*range(len(LABELS)), 255}
@@ -95,19 +102,19 @@ def test_votes_label_the_scan_unless_a_file_is_named(tmp_path, solver):
     assert (voted.labels == given.labels)[known].mean() > 0.95
 
 
-def test_the_start_is_the_named_fit_or_none(tmp_path, solver):
-    register_capture(tmp_path / "fit", inputs_of())
-    register_capture(tmp_path / "none", inputs_of(params=None, start=False))
+def test_the_start_is_the_named_fit_or_none(tmp_path, solver, plain):
+    register_capture(tmp_path / "fit", inputs_of(plain))
+    register_capture(tmp_path / "none", inputs_of(plain, params=None, start=False))
     fit, none = solver.shown
     np.testing.assert_array_equal(fit.initial.body_pose, load_params(TRACKED).select(list(FRAMES)).body_pose)
     assert none.initial is None and not (tmp_path / "none" / REGISTER_STAGE / "initial.npz").exists()
 
 
-def test_a_frame_without_a_fit_starts_from_its_neighbours(tmp_path, capture, solver):
+def test_a_frame_without_a_fit_starts_from_its_neighbours(tmp_path, plain, solver):
     arrays = dict(np.load(TRACKED))
     arrays["transl"][1] = np.nan
-    np.savez(capture / "params" / "params_noisy.npz", **arrays)
-    register_capture(tmp_path / "run", inputs_of(capture, params=capture / "params" / "params_noisy.npz"))
+    np.savez(tmp_path / "gaps.npz", **arrays)
+    register_capture(tmp_path / "run", inputs_of(plain, params=tmp_path / "gaps.npz"))
     np.testing.assert_array_equal(solver.shown[0].initial.transl[1], solver.shown[0].initial.transl[0])
     problems = json.loads((tmp_path / "run" / REGISTRATION).read_text())["problems"]
     assert any("frame 1: no fit to start from, that of frame 0" in words for words in problems)
@@ -124,9 +131,9 @@ def test_one_scan_with_a_fit(tmp_path, solver):
 # --- files and gates ------------------------------------------------------------------------------------------------
 
 
-def test_rows_are_frames_and_a_capture_reads_them(tmp_path, monkeypatch, asked):
+def test_rows_are_frames_and_a_capture_reads_them(tmp_path, monkeypatch, asked, plain):
     use_solver(monkeypatch, fails=(1,))
-    record = register_capture(tmp_path, inputs_of())
+    record = register_capture(tmp_path, inputs_of(plain))
     capture = open_capture(FIXTURE, params=tmp_path / REGISTERED_PARAMS)
     np.testing.assert_array_equal(capture.params(13).transl, exact().frame(13).transl)
     with pytest.raises(InputError, match="row 1"):
@@ -153,15 +160,16 @@ def test_gates_say_what_is_doubtful(tmp_path, monkeypatch, asked):
     assert confident["status"] == "warn" and confident["value"] == 0.5 and "frames 13" in confident["explanation"]
 
 
-def test_no_frame_at_all_is_an_error(tmp_path, monkeypatch, asked):
+def test_no_frame_at_all_is_an_error(tmp_path, monkeypatch, asked, plain):
     use_solver(monkeypatch, fails=FRAMES)
     with pytest.raises(InputError, match="nobody is in the pictures"):
-        register_capture(tmp_path, inputs_of())
+        register_capture(tmp_path, inputs_of(plain))
     assert not (tmp_path / REGISTER_STAGE).exists()
 
 
 def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypatch):
     run = tmp_path / "run"
+    shutil.rmtree(capture / "scans")
 
     def ran(**changes) -> bool:
         return register_capture(run, inputs_of(capture, **changes)).ran
@@ -172,16 +180,9 @@ def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypa
     mask = capture / "masks" / "Cam001" / "Cam001_mask000001.png"
     mask.write_bytes(mask.read_bytes() + b"\0")
     assert ran()
-    monkeypatch.setattr(
-        type(open_capture(capture)),
-        "keypoints",
-        lambda self, name: replace(joints_in(self, name), confidence=ones(self)),
-    )
+    surer = lambda self, name: replace(joints_in(self, name), confidence=np.ones((16, 55)))  # noqa: E731
+    monkeypatch.setattr(Capture, "keypoints", surer)
     assert ran() and not ran()
-
-
-def ones(capture) -> np.ndarray:
-    return np.ones((16, 55))
 
 
 # --- what is wrong with the inputs, and the rest goes on ------------------------------------------------------------
@@ -199,20 +200,20 @@ def test_a_damaged_mask_and_a_damaged_scan_are_named_and_the_rest_goes_on(tmp_pa
     assert set(solver.shown[0].scans) == {0} and solver.shown[0].mask("Cam003", 1) is None
 
 
-def write_other_params(folder) -> BodyParams:
+def write_other_params() -> BodyParams:
     arrays = exact().as_dict()
     return BodyParams(**{**arrays, "betas": np.ones((16, 300)) * 0.1})
 
 
-def test_parameters_of_another_body_are_named(tmp_path, capture, solver):
-    write_other_params(capture).save(tmp_path / "other.npz")
+def test_parameters_of_another_body_are_named(tmp_path, plain, solver):
+    write_other_params().save(tmp_path / "other.npz")
     with pytest.raises(InputError, match=r"betas.*at most 20 numbers.*received 300.*--body"):
-        register_capture(tmp_path / "run", inputs_of(capture, params=tmp_path / "other.npz"))
-    arrays = {name: array for name, array in exact().as_dict().items()}
+        register_capture(tmp_path / "run", inputs_of(plain, params=tmp_path / "other.npz"))
+    arrays = exact().as_dict()
     arrays["body_pose"] = arrays["body_pose"][:, :60]
     np.savez(tmp_path / "joints.npz", **arrays)
     with pytest.raises(InputError, match=r"body_pose.*63"):
-        register_capture(tmp_path / "run", inputs_of(capture, params=tmp_path / "joints.npz"))
+        register_capture(tmp_path / "run", inputs_of(plain, params=tmp_path / "joints.npz"))
     assert not (tmp_path / "run" / REGISTER_STAGE).exists()
 
 
@@ -233,10 +234,10 @@ def test_unusable_inputs_are_refused_in_words(tmp_path, solver, changes, words):
     assert not solver.shown
 
 
-def test_neither_keypoints_nor_a_fit(tmp_path, solver, monkeypatch):
-    monkeypatch.setattr(type(open_capture(FIXTURE)), "keypoints", lambda self, name: None)
+def test_neither_keypoints_nor_a_fit(tmp_path, solver, monkeypatch, plain):
+    monkeypatch.setattr(Capture, "keypoints", lambda self, name: None)
     with pytest.raises(InputError, match="or a fit to start from"):
-        register_capture(tmp_path, inputs_of(start=False, params=None))
+        register_capture(tmp_path, inputs_of(plain, start=False, params=None))
 
 
 def test_neither_cameras_nor_scans_and_keypoints_without_cameras(tmp_path, capture, solver):
@@ -273,16 +274,16 @@ def test_a_build_takes_the_reference_frame_of_its_registration(tmp_path, solver)
     assert "share of frames registered" in {check["name"] for check in metrics["checks"]}
 
 
-def test_a_build_whose_reference_frame_failed_says_so(tmp_path, monkeypatch, asked):
+def test_a_build_whose_reference_frame_failed_says_so(tmp_path, monkeypatch, asked, plain):
     use_solver(monkeypatch, fails=(0,))
     with pytest.raises(InputError, match=r"reference frame 0.*--frame"):
-        build(tmp_path, build_inputs(), BuildConfig(), registration=inputs_of(), last="10_body")
+        build(tmp_path, build_inputs(), BuildConfig(), registration=inputs_of(plain), last="10_body")
 
 
-def test_trainings_take_what_was_given_then_refined_then_registered(tmp_path, solver):
+def test_trainings_take_what_was_given_then_refined_then_registered(tmp_path, solver, plain):
     given = tmp_path / "mine.npz"
     assert params_in_use(tmp_path, None) is None and params_in_use(tmp_path, given) == given
-    register_capture(tmp_path, inputs_of())
+    register_capture(tmp_path, inputs_of(plain))
     assert params_in_use(tmp_path, None) == tmp_path / REGISTERED_PARAMS
     refined = tmp_path / REFINED_PARAMS
     refined.parent.mkdir()
