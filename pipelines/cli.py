@@ -70,6 +70,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "CaptureConvertCommand",
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
+    "keypoints convert": (
+        "pipelines.commands.keypoints",
+        "KeypointsConvert",
+        "keypoints of OpenPose, EasyMocap, mmpose, COCO or MediaPipe to ours",
+    ),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }
 HELP = ("-h", "--help")

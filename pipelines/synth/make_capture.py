@@ -14,12 +14,13 @@ from jaxtyping import Bool, UInt8
 
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
-from pipelines.synth.motion import Performance, tracker_noise
+from pipelines.synth.motion import Performance
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
 from pipelines.synth.person_file import load_person
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
 from pipelines.synth.soft_light import LightConfig, vertex_light
+from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import LitFrame, RenderedView, hidden_faces, normal_map, render_view
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json

@@ -7,6 +7,8 @@ from pathlib import Path
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
+from smplxpp.capture.keypoint_files import KeypointOptions
+from smplxpp.capture.keypoints import with_keypoints
 from smplxpp.capture.masks import with_masks
 from smplxpp.capture.readers import (
     actorshq,
@@ -36,6 +38,8 @@ def open_capture(
     format: str | None = None,
     masks: str | Path | None = None,
     params: str | Path | None = None,
+    keypoints: str | Path | None = None,
+    person: int | None = None,
     body: BodyModel | None = None,
     hold_out_every: int | None = None,
     cache_bytes: int = 1 << 30,
@@ -47,6 +51,9 @@ def open_capture(
         format: name of the layout; None: told by the files that are there.
         masks: a folder of mattes to take instead of the capture's own masks, matched to the images by their names.
         params: body parameters to take instead of the capture's own (a tracker's, say).
+        keypoints: a folder of keypoints of any tool to take instead of the capture's own: a file or a folder for each
+            camera, in a layout of docs/captures.md.
+        person: whose keypoints, where there are several people; None: in each frame the surest.
         body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
         hold_out_every: hold out every n-th training camera as a novel view.
         cache_bytes: bound of the decoded images kept, in each process that reads.
@@ -61,10 +68,12 @@ def open_capture(
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
     reader = READERS[format or detect_format(root)]
-    options = ReaderOptions(params=None if params is None else Path(params), body=body)
+    options = ReaderOptions(params=None if params is None else Path(params), body=body, person=person)
     recording = reader.read(root, options)
     if masks is not None:
         recording = with_masks(recording, Path(masks))
+    if keypoints is not None:
+        recording = with_keypoints(recording, Path(keypoints), KeypointOptions(person=person))
     splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
     if hold_out_every is not None:
         splits = splits.hold_out_cameras(hold_out_every)

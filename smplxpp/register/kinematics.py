@@ -234,15 +234,19 @@ class Kinematics:
         hanging = self.hangs_on.astype(np.float64)
         arm = np.einsum("nkx,kj->njx", moved, hanging, optimize=True)
         arm -= (points.weights @ hanging)[..., None] * posture.joints
-        # -[a]_x P, column by column: P_c x a, with a sign.
-        axes = posture.parent_turned.transpose(0, 2, 1)  # (J, axis, 3)
-        pose = np.cross(axes[None], arm[:, :, None, :])  # (N, J, axis, 3)
+        # -[a]_x P, column by column: P_c x a.
+        px, py, pz = posture.parent_turned.transpose(1, 0, 2)[:, None]  # each (1, J, axis)
+        ax, ay, az = (arm[..., k, None] for k in range(3))
+        pose = np.empty((len(arm), 3, count, 3))
+        np.subtract(py * az, pz * ay, out=pose[:, 0])
+        np.subtract(pz * ax, px * az, out=pose[:, 1])
+        np.subtract(px * ay, py * ax, out=pose[:, 2])
         blended = (points.weights @ posture.turned.reshape(count, 9)).reshape(-1, 3, 3)
         shape = blended @ points.shape_dirs
         shape += np.einsum("nk,kxb->nxb", points.weights, self._joint_shape(posture), optimize=True)
         return PointsMotion(
             points=moved.sum(axis=1),
-            pose=np.ascontiguousarray(pose.transpose(0, 3, 1, 2)),
+            pose=pose,
             shape=shape,
             expression=blended @ points.expression_dirs,
         )

@@ -24,8 +24,17 @@ _RIM = 0.13
 # Gaps that are believed, metres.
 _LEAST_GAP, _LARGEST_GAP = -0.02, 0.12
 _LEAST_SEEN = 8
-# Pixels beyond a rim where there must be no body.
-_BEYOND = (2.0, 4.0)
+# Pixels beyond a rim where there must be no body, and the height of the picture in which that is looked up.
+_BEYOND = (2.5, 5.0)
+_DRAWN_HEIGHT = 320
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Pixels that a body covers, of a smaller picture: `scale` of its pixels to one of the image's."""
+
+    covered: Bool[np.ndarray, "h w"]
+    scale: Float64[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +127,7 @@ class SilhouetteTerm:
         for name, camera in self.cameras.items():
             outline = self.outlines.get((name, row))
             if outline is not None:
-                covered = rasterize_mesh(drawn, camera).face_id >= 0
-                view = points[self.index], normals[self.index], covered
+                view = points[self.index], normals[self.index], _drawn(drawn, camera)
                 found.append(self._of_camera(camera, outline, *view, learn=learn, in_pixels=in_pixels))
         if not found:
             none = np.zeros(0)
@@ -133,7 +141,7 @@ class SilhouetteTerm:
         outline: Outline,
         points: np.ndarray,
         normals: np.ndarray,
-        covered: Bool[np.ndarray, "H W"],
+        drawn: _Drawn,
         *,
         learn: bool,
         in_pixels: bool,
@@ -151,7 +159,7 @@ class SilhouetteTerm:
         gap = np.where(self.bare, 0.0, self.gaps.median)[at_rim] / metres
         keep = seen & known & (outward > 0)
         for further in _BEYOND:
-            keep &= ~_at(covered, pixels + direction * (gap + further * outline.factor)[:, None])
+            keep &= ~_at(drawn, pixels + direction * (gap + further * outline.factor)[:, None])
         index, distance, gradient, jacobian = at_rim[keep], distance[keep], gradient[keep], jacobian[keep]
         metres = metres[keep]
         direction = np.einsum("na,nax->nx", gradient, jacobian) * metres[:, None]
@@ -176,9 +184,18 @@ class SilhouetteTerm:
         return index, direction, residual, weight
 
 
-def _at(covered: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def _drawn(mesh: TriangleMesh, camera: Camera) -> _Drawn:
+    factor = max(1.0, camera.height / _DRAWN_HEIGHT)
+    small = camera.resized(round(camera.width / factor), round(camera.height / factor))
+    # One thread: images so small are not worth two.
+    covered = rasterize_mesh(mesh, small, threads=1).face_id >= 0
+    return _Drawn(covered, np.array([small.width / camera.width, small.height / camera.height]))
+
+
+def _at(drawn: _Drawn, pixels: np.ndarray) -> np.ndarray:
     """Whether pixels are covered; those outside the image are not."""
-    column, row = np.floor(pixels).astype(np.int64).T
+    covered = drawn.covered
+    column, row = np.floor(pixels * drawn.scale).astype(np.int64).T
     inside = (column >= 0) & (column < covered.shape[1]) & (row >= 0) & (row < covered.shape[0])
     return inside & covered[np.where(inside, row, 0), np.where(inside, column, 0)]
 

@@ -12,6 +12,7 @@ import numpy as np
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfolders
+from smplxpp.capture.keypoints import found_keypoints
 from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.params import ParamFiles, find_params
 from smplxpp.capture.readers.common import read_json
@@ -81,6 +82,7 @@ def _described(
         label_set=str(description.get("label_set", "capture")),
         params=_params(root, options),
         meshes=PosedTopology(topology, FileSeries.find(topology.parent, frames)) if topology.is_file() else None,
+        keypoints=found_keypoints(root / "keypoints", cameras, format="auto", person=options.person),
         fps=None if description.get("fps") is None else float(description["fps"]),
         problems=tuple(problems),
     )
