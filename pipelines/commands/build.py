@@ -13,9 +13,11 @@ import tyro
 
 from pipelines.commands.options import OptionalPath
 from pipelines.commands.progress import stage_progress
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, TRAIN_STAGES
-from pipelines.runs.stage import StageRecord
+from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REGISTER_STAGE, TRAIN_STAGES
+from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
+from pipelines.stages.register_config import RegisterInputs, load_register, named_params
+from pipelines.stages.said_of_inputs import TRACKED, said_of_inputs, said_of_parameters
 from smplxpp.capture import find_reference
 from smplxpp.core.errors import InputError
 
@@ -45,6 +47,10 @@ class Build:
     """Reference frame, near T-pose."""
     body: OptionalPath = None
     """SMPL-X-layout body file; the open body by default."""
+    register: Literal["auto", "on", "off"] = "auto"
+    """Register the body to the capture (or to the scan) before anything else, starting from the parameters if there are
+    any. auto: where the capture says that its parameters are tracked, where it has keypoints and no parameters, and
+    where `smplxpp register` has written into this run."""
     units: Literal["m", "cm", "mm", "inch"] = "m"
     """Units of the scan file."""
     up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
@@ -81,10 +87,19 @@ class Build:
         from pipelines.stages.build import build
 
         config, inputs = self.config(), self.inputs()
-        count = BUILD_STAGES.index(self.until_stage) - BUILD_STAGES.index(self.from_stage) + 1
+        bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
+        count = sum(name in inputs.stages for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
-            records = build(self.out, inputs, config, first=self.from_stage, last=self.until_stage, progress=step)
+            records = build(
+                self.out,
+                inputs,
+                config,
+                registration=self.registration(inputs),
+                first=self.from_stage,
+                last=self.until_stage,
+                progress=step,
+            )
             if whole and not self._report_stands(records):
                 step("report", False)
                 write_build_report(self.out, inputs, config, records)
@@ -117,7 +132,8 @@ class Build:
             )
         label_set = self.label_set
         if self.capture is not None:
-            found = find_reference(self.capture, frame=self.frame, params=self.params)
+            registered = self._registers()
+            found = find_reference(self.capture, frame=self.frame, params=self.params, fitted=not registered)
             labels = self.labels or (found.scan_labels if self.label_source != "views" else None)
             if labels is None and not found.label_maps:
                 raise InputError(
@@ -130,14 +146,14 @@ class Build:
             return BuildInputs(
                 subject=found.subject,
                 scan=found.scan,
-                params=found.params,
+                params=None if registered else found.params,
                 frame=found.frame,
                 params_row=found.params_frame,
                 labels=labels,
                 label_maps={} if labels else found.label_maps,
                 cameras=None if labels else found.cameras_file,
                 label_set="capture" if label_set == "auto" else label_set,
-                motion=motion if motion.is_file() else None,
+                motion=motion if motion.is_file() and not registered else None,
                 body=self.body,
             )
         if self.params is None or self.scan is None:
@@ -145,12 +161,54 @@ class Build:
         return BuildInputs(
             subject=self.scan.stem,
             scan=self.scan,
-            params=self.params,
+            params=None if self.register == "on" else self.params,
             frame=self.frame,
             params_row=self.frame,
             labels=self.labels,
             label_set="4ddress" if label_set == "auto" else label_set,
             body=self.body,
+        )
+
+    def _registers(self) -> bool:
+        """Whether the parameters come from a registration of the capture."""
+        assert self.capture is not None
+        if self.register != "auto":
+            return self.register == "on"
+        if self._standing_registration() is not None:
+            return True
+        if self.params is None and not any((self.capture / "params").glob("*.npz")):
+            return (self.capture / "keypoints").is_dir()
+        said = said_of_inputs(self.capture).get("parameters") if self.capture.is_dir() else None
+        return said_of_parameters(said, self.params, self.capture) == TRACKED
+
+    def _standing_registration(self) -> RegisterInputs | None:
+        """What `smplxpp register` has made in this run of this capture, from these parameters if any are named."""
+        found = load_register(self.out)
+        if (
+            found is None
+            or found.capture is None
+            or self.capture is None
+            or read_manifest(self.out / REGISTER_STAGE) is None
+        ):
+            return None
+        params = named_params(self.capture, self.params)
+        same = found.capture.resolve() == self.capture.resolve()
+        return found if same and (params is None or params.resolve() == found.params) else None
+
+    def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
+        """What the body is registered to, None where the parameters are given."""
+        if inputs.params is not None:
+            return None
+        return self._standing_registration() or RegisterInputs(
+            capture=self.capture,
+            params=named_params(self.capture, self.params),
+            body=self.body,
+            scan=self.scan,
+            frame=self.frame,
+            labels=inputs.labels,
+            label_set=inputs.label_set,
+            units=self.units,
+            up=self.up,
         )
 
     def config(self) -> BuildConfig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +9,11 @@ from avatar.evaluation.input_protocol import NOT_KNOWN, InputProtocol
 from pipelines.runs.layout import TRAIN_STAGES
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_build
+from pipelines.stages.params_in_use import params_in_use
+from pipelines.stages.said_of_inputs import TRACKED, said_of_inputs, said_of_parameters
 from pipelines.stages.scene import TrainInputs
 from smplxpp.capture import Capture
 from smplxpp.capture.readers import simple
-from smplxpp.capture.readers.common import read_json
-from smplxpp.core.errors import InputError
-
-DESCRIPTIONS = ("capture.json", "manifest.json")
-"""Files in a capture's folder that may say it, under the key "inputs"; the first that is there."""
-OWN_PARAMETERS = "params.npz"
 
 
 def input_protocol(run: Path, inputs: TrainInputs, capture: Capture) -> InputProtocol:
@@ -31,11 +26,11 @@ def input_protocol(run: Path, inputs: TrainInputs, capture: Capture) -> InputPro
         InputError: a capture that says it in other words than docs/captures.md.
     """
     root = capture.recording.root
-    said = _said(root) if capture.recording.format == simple.NAME else {}
+    said = said_of_inputs(root) if capture.recording.format == simple.NAME else {}
     has_normals = any(capture.recording.files.get("normal", {}).values())
     frames, cameras = _trained_on(run)
     return InputProtocol(
-        parameters=_of_parameters(said.get("parameters"), inputs.params, root),
+        parameters=_of_parameters(said.get("parameters"), run, inputs.params, root),
         labels=said.get("labels", NOT_KNOWN) if _labelled_by(run, root) else NOT_KNOWN,
         normals=said.get("normals", NOT_KNOWN) if has_normals else "none",
         training_frames=frames,
@@ -43,27 +38,11 @@ def input_protocol(run: Path, inputs: TrainInputs, capture: Capture) -> InputPro
     )
 
 
-def _said(root: Path) -> Mapping[str, Any]:
-    """Read what a capture of our own layout says of its inputs."""
-    path = next((root / name for name in DESCRIPTIONS if (root / name).is_file()), None)
-    said = {} if path is None else read_json(path).get("inputs", {})
-    if not isinstance(said, Mapping):
-        raise InputError(f"file {path}", expected='an object under "inputs", see docs/captures.md', received=repr(said))
-    return said
-
-
-def _of_parameters(said: Any, chosen: Path | None, root: Path) -> str:
-    """Return what the capture says of the parameters in use.
-
-    Args:
-        said: a word for its own parameters, or a word by the name of a file in `params/`.
-        chosen: another file than its own.
-    """
-    if isinstance(said, Mapping):
-        name = OWN_PARAMETERS if chosen is None else chosen.name
-        own = chosen is None or simple.stacked_params(root, chosen).resolve() == (root / "params" / name).resolve()
-        return str(said.get(name, NOT_KNOWN)) if own else NOT_KNOWN
-    return NOT_KNOWN if said is None or chosen is not None else str(said)
+def _of_parameters(said: Any, run: Path, chosen: Path | None, root: Path) -> str:
+    """The word for the parameters in use: those that a run has fitted are tracked, whatever it started from."""
+    if params_in_use(run, chosen) != chosen:
+        return TRACKED
+    return said_of_parameters(said, chosen, root) or NOT_KNOWN
 
 
 def _labelled_by(run: Path, root: Path) -> bool:

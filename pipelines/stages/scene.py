@@ -11,8 +11,10 @@ import numpy as np
 
 from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import TEMPLATE
+from pipelines.runs.layout import REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
 from pipelines.stages.build_config import load_build
+from pipelines.stages.held_out import refuse_seen
+from pipelines.stages.params_in_use import params_in_use
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -29,6 +31,7 @@ CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
 """Training frames, and cameras of each, in whose images the template has to stand."""
 STANDS_IN_IMAGES = 0.3
 """Overlap of template and masks below which nothing can be learned."""
+REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
 OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
 """Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
 
@@ -39,7 +42,8 @@ class TrainInputs:
 
     Attributes:
         capture: folder of any known layout.
-        params: other parameters than the capture's own. body: what they are for, None for the open body.
+        params: other parameters than those that the run has made (`params_in_use`) or the capture's own. body: what
+            they are for, None for the open body.
         hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
         scale: of the images, 1 for all pixels.
     """
@@ -99,6 +103,7 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             that does not stand in the images.
     """
     template = open_template(run)
+    inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture, train, held_out = open_cameras(inputs)
     if frame not in capture.frames:
         raise InputError(
@@ -135,8 +140,11 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
+    inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture, params = _with_params(_opened(inputs))
     capture = _with_masks(capture)
+    if inputs.params == run / REGISTERED_PARAMS:
+        refuse_seen(run, (REGISTER_STAGE,), capture.splits, anew=REGISTER_ANEW)
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)

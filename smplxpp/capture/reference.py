@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from smplxpp.capture.files import FileSeries
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
 
@@ -17,7 +18,8 @@ class ReferenceFrame:
     Attributes:
         subject: name of the capture's folder.
         frame: number of the frame.
-        scan, params: files that must be there. `params_frame` is the row of `params` that belongs to the frame.
+        scan, params: files; no parameters where there need be none. `params_frame` is the row of `params` that belongs
+            to the frame.
         scan_labels: labels of the scan's vertices, or None.
         label_maps: label image of each camera by name, with `cameras_file` their cameras.
     """
@@ -25,19 +27,22 @@ class ReferenceFrame:
     subject: str
     frame: int
     scan: Path
-    params: Path
+    params: Path | None
     params_frame: int
     scan_labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
     cameras_file: Path | None = None
 
 
-def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | None = None) -> ReferenceFrame:
+def find_reference(
+    capture: str | Path, *, frame: int = 0, params: str | Path | None = None, fitted: bool = True
+) -> ReferenceFrame:
     """Find frame `frame` in a capture folder of our simple layout.
 
     The layout: `scans/scan_FFFFFF.ply` (`.obj`), `scans/scan_FFFFFF_labels.npz`, `params/params.npz` (stacked) or
     `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `cameras.json` or `calibration.csv`. `params` names another
-    stacked parameter file (for instance a tracker's).
+    stacked parameter file (for instance a tracker's). Without `fitted` there need be no parameters: a registration is
+    to make them.
 
     Raises:
         InputError: no such folder, or scan or parameters missing.
@@ -58,7 +63,7 @@ def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | 
     single = root / "params" / f"{number}.npz"
     own = params is None and single.is_file()
     params_file, row = (single, 0) if own else (stacked_params(root, params), frame)
-    if not params_file.is_file():
+    if fitted and not params_file.is_file():
         raise InputError(
             f"capture {root.name}",
             expected=f"params/{number}.npz or params/params.npz",
@@ -74,7 +79,7 @@ def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | 
         subject=root.resolve().name,
         frame=frame,
         scan=scan,
-        params=params_file,
+        params=params_file if params_file.is_file() else None,
         params_frame=row,
         scan_labels=_first(root / "scans", [f"scan_{number}_labels.npz"]),
         label_maps=maps,
@@ -84,3 +89,9 @@ def find_reference(capture: str | Path, *, frame: int = 0, params: str | Path | 
 
 def _first(folder: Path, names: list[str]) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def find_scans(capture: str | Path) -> dict[int, Path]:
+    """Find the scans of a capture folder of our simple layout, `scans/scan_FFFFFF.ply` (`.obj`, `.glb`), by frame."""
+    series = FileSeries.find(Path(capture) / "scans", r"scan_(?P<frame>\d{6})\.(ply|obj|glb)")
+    return {int(frame): series.required(int(frame)) for frame in series.numbers}

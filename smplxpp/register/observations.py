@@ -44,6 +44,8 @@ class Observations:
         initial: a fit to start from, a row a frame.
         shape_frames: the frames that the shape is solved on; None: all. Held-out frames are not among them.
         fps: frames a second, None where not known.
+        shape_frames: those that the shape, and whatever else all frames share, is solved on; None: all. Frames held out
+            are none of them: they get their poses alone.
     """
 
     frames: tuple[int, ...]
@@ -55,3 +57,4 @@ class Observations:
     initial: BodyParams | None = None
     shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
+    shape_frames: tuple[int, ...] | None = None

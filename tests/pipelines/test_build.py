@@ -189,8 +189,8 @@ def test_only_what_is_damaged_or_changed_runs_again(small):
 
 def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
     run = small.folder / "run"
-    (run / ".10_register.abc").mkdir(parents=True)
-    (run / ".10_register.abc" / "body.npz").write_bytes(b"half")
+    (run / ".10_body.abc").mkdir(parents=True)
+    (run / ".10_body.abc" / "body.npz").write_bytes(b"half")
     (run / ".metrics.abc.json").write_text("{")
     (run / ".notes").write_text("mine")
     small.build("run", small.inputs(), last="00_capture")
