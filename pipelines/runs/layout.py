@@ -10,6 +10,7 @@ TRANSFER_STAGE = "40_transfer"
 UNPOSE_STAGE = "50_unpose"
 ASSEMBLE_STAGE = "60_assemble"
 VALIDATE_STAGE = "65_validate"
+REFINE_STAGE = "66_refine"
 BIND_STAGE = "70_bind"
 TEACHER_STAGE = "80_teacher"
 BAKE_STAGE = "85_bake"
@@ -31,7 +32,7 @@ BUILD_STAGES = (
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
-ALL_STAGES = (*BUILD_STAGES, *MODEL_STAGES, EVALUATE_STAGE)
+ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
 
 SCAN = f"{CAPTURE_STAGE}/scan.npz"
 PARAMS = f"{CAPTURE_STAGE}/params.npz"
@@ -51,6 +52,9 @@ TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
 BAKED = f"{BAKE_STAGE}/student.safetensors"
 STUDENT = f"{COMPENSATE_STAGE}/student.safetensors"
 COMPACT_STUDENT = f"{COMPENSATE_STAGE}/student_compact.safetensors"
+REGISTERED_PARAMS = "05_register/params.npz"
+REFINED_PARAMS = f"{REFINE_STAGE}/params.npz"
+REFINED_HELD_OUT_PARAMS = f"{REFINE_STAGE}/params_held_out.npz"
 EVALUATION = f"{EVALUATE_STAGE}/metrics.json"
 
 BUILD_FILE = "build.json"

@@ -118,7 +118,7 @@ class GaussianMotion:
         strength = evidence.curvature.diagonal(dim1=1, dim2=2).sum(-1) * self.firmness
         rows = torch.nonzero(strength > NOTHING * strength.mean()).flatten()
         every = max(1, len(rows) // SAMPLED)
-        rows = rows[::every]
+        rows = rows[::every].contiguous()
         J = self.jacobian(placed, evidence.means, rows)
         M = evidence.curvature[rows] * (every * self.firmness[rows, None, None])
         moved = M @ J
