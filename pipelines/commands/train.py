@@ -49,8 +49,8 @@ class Train:
     until: Literal["refine", "fit", "teacher", "bake", "compensate"] = "compensate"
     """The last stage to train."""
     refine_poses: Literal["auto", "on", "off"] = "auto"
-    """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where the
-    capture says that its parameters are tracked, or the run has registered or refined some."""
+    """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where
+    the capture says that its parameters are tracked, or the run has registered or refined some."""
     max_minutes: float = math.inf
     """Stop after as many minutes and write what there is; the same command
     then goes on (without --force, which would begin anew)."""

@@ -174,7 +174,8 @@ def figures(found: Refinement) -> dict[str, Any]:
 def _rows(capture: Capture, template: Template, found: list[Refinement]) -> Mapping[int, BodyParams]:
     """Parameters of every frame that has any: refined ones, or those of the capture with hands complete."""
     source, rows = capture.recording.params, {}
-    for frame in [] if source is None else map(int, source.frames()):
+    assert source is not None, "the scene was opened with parameters"
+    for frame in map(int, source.frames()):
         try:
             given = source.read(frame)
         except InputError:

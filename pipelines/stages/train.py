@@ -121,9 +121,10 @@ def train(
             remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
         )
     records: dict[str, StageRecord] = {}
-    if "refine" in steps and config.refine is not None:
+    how = config.refine
+    if "refine" in steps and how is not None:
         begin = time.monotonic()
-        records["refine"] = together.run_on_rank0(lambda: _refined(run, inputs, config.refine, options))
+        records["refine"] = together.run_on_rank0(lambda: _refined(run, inputs, how, options))
         scene = together.run_on_rank0(lambda: open_scene(run, inputs))
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
