@@ -14,8 +14,10 @@ class ReaderOptions:
 
     Attributes:
         params: a parameter file or folder instead of the set's own.
+        protocol: name of the protocol whose files are read; None: without one.
         body: the body model that the parameters are for; None: the open body.
     """
 
     params: Path | None = None
     body: BodyModel | None = None
+    protocol: str | None = None
