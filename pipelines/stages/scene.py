@@ -13,6 +13,7 @@ from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.stages.build_config import load_build
+from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -42,6 +43,7 @@ class TrainInputs:
         params: other parameters than the capture's own. body: what they are for, None for the open body.
         hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
         scale: of the images, 1 for all pixels.
+        protocol: of the capture; None: the run's.
     """
 
     capture: Path
@@ -49,6 +51,7 @@ class TrainInputs:
     body: Path | None = None
     hold_out: tuple[str, ...] = ()
     scale: float = 1.0
+    protocol: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,7 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             that does not stand in the images.
     """
     template = open_template(run)
+    inputs = _of_protocol(run, inputs)
     capture, train, held_out = open_cameras(inputs)
     if frame not in capture.frames:
         raise InputError(
@@ -123,18 +127,23 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
-def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
+def open_scene(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainScene:
     """Open the template of a run and a capture, and look at both.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
 
+    Args:
+        measures: nothing is trained; then another protocol than the run's is logged and not refused.
+
     Raises:
-        InputError: no template; no training camera, image, mask or parameters; images of another size than their
-            camera; nobody in the masks; a template that does not stand in the images, or parameters of another body.
+        InputError: no template; another protocol than the template's; no training camera, image, mask or parameters;
+            images of another size than their camera; nobody in the masks; a template that does not stand in the images,
+            or parameters of another body.
     """
     template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
+    inputs = _of_protocol(run, inputs, measures=measures)
     capture, params = _with_params(_opened(inputs))
     capture = _with_masks(capture)
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
@@ -160,6 +169,13 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     return TrainScene(template, capture, frame, built_frame, template_frame, overlap, digests)
 
 
+def _of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainInputs:
+    """The inputs with the protocol that is read."""
+    own_params = inputs.params is not None
+    protocol = chosen_protocol(run, inputs.protocol, own_params=own_params, measures=measures)
+    return replace(inputs, protocol=protocol)
+
+
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
@@ -175,7 +191,7 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
         InputError: unknown cameras, none, or none to train on.
     """
     body = None if inputs.body is None else load_body(inputs.body)
-    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body, protocol=inputs.protocol)
     if not capture.cameras or not capture.presence().any():
         raise InputError(
             f"capture {capture.name}",

@@ -21,7 +21,8 @@ class ReferenceFrame:
         scan, params: files that must be there. `params_frame` is the row of `params` that belongs to the frame.
         motion: parameters of the capture's frames from the same source as `params`, or None.
         scan_labels: labels of the scan's vertices, or None.
-        label_maps: label image of each camera by name, with `cameras_file` their cameras.
+        label_maps: label image of each camera by name, without those that the capture holds out; with `cameras_file`
+            their cameras.
     """
 
     subject: str
@@ -51,7 +52,8 @@ def find_reference(
     root = Path(capture)
     if not root.is_dir():
         raise InputError("capture", expected="an existing folder", received=str(root))
-    files = choose_protocol(root, read_description(root), protocol)
+    description = read_description(root)
+    files = choose_protocol(root, description, protocol)
     number = f"{frame:06d}"
     scan = _first(root / "scans", [f"scan_{number}{suffix}" for suffix in (".ply", ".obj", ".glb")])
     if scan is None:
@@ -78,10 +80,10 @@ def find_reference(
             remedy="convert your fit with `smplxpp params convert`",
         )
     pattern = re.compile(rf"^(?P<camera>.+)_label{number}\.(png|npy)$")
-    maps = {}
+    maps, held_out = {}, set(map(str, description.get("novel_views", ())))
     folder = () if files.labels is None else (root / files.labels).glob(f"*/*_label{number}.*")
     for path in sorted(folder):
-        if match := pattern.match(path.name):
+        if (match := pattern.match(path.name)) and match["camera"] not in held_out:
             maps[match["camera"]] = path
     return ReferenceFrame(
         subject=root.resolve().name,
