@@ -87,7 +87,7 @@ class InputProtocol:
             )
         made = f" ({self.stage})" if self.stage else ""
         there, all_views = self.views_with_normals, self.training_views
-        some = there is not None and all_views is not None and there < all_views and self.normals != "none"
+        some = there is not None and all_views is not None and 0 < there < all_views and self.normals != "none"
         views = f" ({there:,} of {counted(all_views or 0, 'view')})" if some else ""
         return f"parameters {self.parameters}{made}, labels {self.labels}, normals {self.normals}{views}, {trained}"
 

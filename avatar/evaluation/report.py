@@ -186,7 +186,8 @@ def _model(values: Mapping[str, Any]) -> ModelFigures:
 
 def _pose(values: Mapping[str, Any]) -> PoseError:
     # Distances of vertices that there are none of are null.
-    return PoseError(**{name: float("nan") if value is None else value for name, value in values.items()})
+    figures = {name: float("nan") if value is None else value for name, value in values.items() if name != "frames"}
+    return PoseError(frames=int(values["frames"]), **figures)
 
 
 def _quality(values: Mapping[str, Any]) -> ViewQuality:

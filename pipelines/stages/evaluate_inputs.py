@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from avatar.evaluation.input_protocol import EXACT, MIXED, NOT_KNOWN, TRACKED, InputProtocol
 from pipelines.runs.layout import REFINED_PARAMS, REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import BuildInputs, load_build
+from pipelines.stages.scene import normal_maps
 from smplxpp.capture import Capture
 from smplxpp.capture.params import ParamFiles, StackedParams
 from smplxpp.capture.protocols import ProtocolFiles, description_file, read_description, read_protocols
@@ -45,8 +44,11 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
         of_template = said.parameters(run, build[0].params)[0]
         parameters = NOT_KNOWN if NOT_KNOWN in (parameters, of_template) else MIXED
     used, frames, cameras = _trained(run)
-    there, all_views = _normal_maps(capture)
-    normals = "none" if not there or used == "none" else said.of_views("normals", _folder(capture, "normal"))
+    there, all_views = normal_maps(capture)
+    if used == "surface":
+        normals = "estimated"
+    else:
+        normals = "none" if not there or used == "none" else said.of_views("normals", _folder(capture, "normal"))
     return InputProtocol(
         parameters=parameters,
         stage=stage,
@@ -150,14 +152,6 @@ def _folder(capture: Capture, kind: str) -> str | None:
     """Name of the folder with the maps of a kind."""
     series = next(iter(capture.recording.files.get(kind, {}).values()), None)
     return None if series is None else series.folder.parent.name
-
-
-def _normal_maps(capture: Capture) -> tuple[int, int]:
-    """Training views that have a normal map, and all training views."""
-    splits = capture.splits
-    rows = np.isin(list(capture.cameras), splits.train_cameras)
-    views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
-    return int((views & capture.presence("normal")).sum()), int(views.sum())
 
 
 def _trained(run: Path) -> tuple[str | None, int | None, int | None]:

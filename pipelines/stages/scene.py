@@ -218,6 +218,14 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
     return capture, train, tuple(held_out)
 
 
+def normal_maps(capture: Capture) -> tuple[int, int]:
+    """Training views that have a normal map, and all training views."""
+    splits = capture.splits
+    rows = np.isin(list(capture.cameras), splits.train_cameras)
+    views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
+    return int((views & capture.presence("normal")).sum()), int(views.sum())
+
+
 def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:
     """Mean intersection over union of the posed template's silhouette and the masks.
 

@@ -21,8 +21,9 @@ from pipelines.stages.bind import BindStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
-from pipelines.stages.scene import TrainInputs, TrainScene
+from pipelines.stages.scene import TrainInputs, TrainScene, normal_maps
 from pipelines.stages.teacher import TeacherStage
+from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -113,6 +114,7 @@ def train(
             received="none",
             remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
         )
+    _tell_of_normals(scene.capture, config, steps)
     metric = load_metric(config.perceptual, device=together.device)
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
@@ -129,6 +131,20 @@ def train(
         if not records[step].finished:
             break
     return records
+
+
+def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ...]) -> None:
+    """Say once what a loss with a normal term goes without."""
+    trainings = [getattr(config.preset, name) for name in ("teacher", "bake", "compensate") if name in steps]
+    there, views = normal_maps(capture)
+    if there == views or not any(training.weights.normal for training in trainings):
+        return
+    if there:
+        log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
+    elif config.teacher and config.preset.teacher.track is not None:
+        log.info("capture %s has no normal maps: those of the followed surface stand for them", capture.name)
+    else:
+        log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:

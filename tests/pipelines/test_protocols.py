@@ -13,6 +13,7 @@ import pytest
 
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.report import EvalReport
+from avatar.training.presets import training_preset
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.runs.stage import SCHEMA
@@ -21,6 +22,7 @@ from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.evaluate_poses import covered_vertices
 from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene import TrainInputs, open_frame, open_scene
+from pipelines.stages.train import STEPS, TrainConfig, _tell_of_normals
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -306,3 +308,28 @@ def test_exact_poses_are_not_compared_with_themselves(root, tmp_path):
     assert main(["evaluate", str(run), "--capture", str(root), "--device", "cpu", *QUICK, "--no-report", "--json"]) == 0
     report = EvalReport.load(run / "95_evaluate" / "metrics.json")
     assert report.poses == {} and report.inputs.name == "exact"
+
+
+# --- normals --------------------------------------------------------------------------------------------------------
+
+
+def test_what_the_loss_goes_without_is_said_once(root, caplog):
+    caplog.set_level(logging.INFO)
+    config = TrainConfig(preset=training_preset("demo"))
+    paper = TrainConfig(preset=training_preset("paper"))
+
+    def told(capture, config, steps=STEPS) -> list[str]:
+        caplog.clear()
+        _tell_of_normals(capture, config, steps)
+        return [record.getMessage() for record in caplog.records]
+
+    bare = open_capture(root)
+    assert told(bare, config) == ["capture doll has no normal maps: those of the followed surface stand for them"]
+    for alone in (paper, replace(config, teacher=False)):
+        assert told(bare, alone) == ["capture doll has no normal maps: the loss has no normal term"]
+    assert told(bare, config, ("fit",)) == []
+    (root / "normals" / "Ring0").mkdir()
+    for frame in range(4):
+        (root / "normals" / "Ring0" / f"Ring0_normal{frame:06d}.png").touch()
+    some = "4 of 28 training views have a normal map: the loss has no normal term in the others"
+    assert told(open_capture(root), config) == [some]
