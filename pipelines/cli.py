@@ -70,6 +70,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "CaptureConvertCommand",
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
+    "capture degrade": (
+        "pipelines.commands.degrade",
+        "CaptureDegradeCommand",
+        "a capture with exact inputs to one with a tracker's: noisy parameters, keypoints, estimated labels",
+    ),
     "keypoints convert": (
         "pipelines.commands.keypoints",
         "KeypointsConvert",

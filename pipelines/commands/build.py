@@ -13,7 +13,14 @@ import tyro
 
 from pipelines.commands.options import OptionalPath
 from pipelines.commands.progress import stage_progress
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REGISTER_STAGE, TRAIN_STAGES
+from pipelines.runs.layout import (
+    BIND_STAGE,
+    BUILD_STAGES,
+    EVALUATE_STAGE,
+    REFINE_STAGE,
+    REGISTER_STAGE,
+    TRAIN_STAGES,
+)
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
@@ -114,7 +121,9 @@ class Build:
         """Whether the report was written after every stage, those of other commands among them."""
         report = self.out / "report.html"
         manifests = [record.folder / "manifest.json" for record in records.values()]
-        manifests += [self.out / name / "manifest.json" for name in (BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)]
+        manifests += [
+            self.out / name / "manifest.json" for name in (REFINE_STAGE, BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)
+        ]
         made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
         return report.is_file() and report.stat().st_mtime_ns > max(made)
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
-from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, TEMPLATE_STAGES, TRAIN_STAGES
+from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, REFINE_STAGE, TEMPLATE_STAGES, TRAIN_STAGES
 from pipelines.runs.stage import is_finished, read_manifest
 from smplxpp.core.errors import InputError
 
@@ -94,7 +94,7 @@ def _remedy(run: Path, stage: str) -> str:
     """Return the command that makes a stage."""
     if stage == BIND_STAGE:
         return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
-    if stage in TRAIN_STAGES:
+    if stage in (REFINE_STAGE, *TRAIN_STAGES):
         return f"smplxpp train --run {run} --capture DIR (with the training's options)"
     if stage == EVALUATE_STAGE:
         return f"smplxpp evaluate {run} --capture DIR (with the evaluation's options)"

@@ -35,11 +35,10 @@ BUILD_STAGES = (REGISTER_STAGE, *TEMPLATE_STAGES)
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
-ALL_STAGES = (*BUILD_STAGES, *MODEL_STAGES, EVALUATE_STAGE)
+ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
 
 REGISTERED_PARAMS = f"{REGISTER_STAGE}/params.npz"
 REGISTRATION = f"{REGISTER_STAGE}/registration.json"
-REFINED_PARAMS = f"{REFINE_STAGE}/params.npz"
 SCAN = f"{CAPTURE_STAGE}/scan.npz"
 PARAMS = f"{CAPTURE_STAGE}/params.npz"
 POSED_BODY = f"{POSE_BODY_STAGE}/body.npz"
@@ -58,6 +57,8 @@ TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
 BAKED = f"{BAKE_STAGE}/student.safetensors"
 STUDENT = f"{COMPENSATE_STAGE}/student.safetensors"
 COMPACT_STUDENT = f"{COMPENSATE_STAGE}/student_compact.safetensors"
+REFINED_PARAMS = f"{REFINE_STAGE}/params.npz"
+REFINED_HELD_OUT_PARAMS = f"{REFINE_STAGE}/params_held_out.npz"
 EVALUATION = f"{EVALUATE_STAGE}/metrics.json"
 
 BUILD_FILE = "build.json"

@@ -11,10 +11,10 @@ import numpy as np
 
 from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
-from pipelines.stages.params_in_use import params_in_use
+from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -32,6 +32,7 @@ CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
 STANDS_IN_IMAGES = 0.3
 """Overlap of template and masks below which nothing can be learned."""
 REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
+REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
 OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
 """Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
 
@@ -128,10 +129,13 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
-def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
+def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True) -> TrainScene:
     """Open the template of a run and a capture, and look at both.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
+
+    Args:
+        refined: with the run's refined parameters, if it has any that began with these.
 
     Raises:
         InputError: no template; no training camera, image, mask or parameters; images of another size than their
@@ -140,11 +144,15 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
-    inputs = replace(inputs, params=params_in_use(run, inputs.params))
+    inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
     capture, params = _with_params(_opened(inputs))
     capture = _with_masks(capture)
+    made: dict[str, str] = {}
     if inputs.params == run / REGISTERED_PARAMS:
         refuse_seen(run, (REGISTER_STAGE,), capture.splits, anew=REGISTER_ANEW)
+    if inputs.params == run / REFINED_PARAMS:
+        refuse_seen(run, (REFINE_STAGE,), capture.splits, anew=REFINE_ANEW)
+        made = {REFINED_PARAMS: sha256_file(inputs.params)}
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)
@@ -155,7 +163,7 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
-    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **capture_digests(capture, params)}
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **made, **capture_digests(capture, params)}
     template_frame = _template_frame(run, inputs)
     if template_frame in capture.splits.novel_pose_frames:
         raise InputError(

@@ -128,7 +128,11 @@ def detector_keypoints(
 
 
 def estimated_labels(
-    labels: UInt8[np.ndarray, "H W"], *, seed: int | Sequence[int], share: float = 0.05
+    labels: UInt8[np.ndarray, "H W"],
+    *,
+    seed: int | Sequence[int],
+    share: float = 0.05,
+    background: Sequence[int] = (0,),
 ) -> UInt8[np.ndarray, "H W"]:
     """A label map as a parser would give it: borders between labels wander smoothly, and small blobs beside them are
     wrong.
@@ -137,11 +141,12 @@ def estimated_labels(
     foreground wrong, less where labels have hardly a border.
 
     Args:
-        labels: 0 is background.
+        labels: numbers of any set.
         seed: of this view's errors.
         share: of the foreground's pixels.
+        background: numbers of the background.
     """
-    foreground = labels > 0
+    foreground = ~np.isin(labels, background)
     if not foreground.any() or (labels[foreground] == labels[foreground][0]).all():
         return labels.copy()
     rng = np.random.default_rng(seed)

@@ -47,9 +47,9 @@ def register(
 ) -> BodyFit:
     """Fit pose, shape and translation of a body to keypoints, masks, label maps and scans in any mixture.
 
-    Gauss-Newton on the sum of squares of: keypoints (robust, pixels), masks (`SilhouetteTerm`), scans (`ScanTerm`), joint
-    ranges, a zero-mean pose prior and unit betas (`Anatomy`; no data set was learned from), robust accelerations, and a
-    given fit as far as its own noise says. Keypoints alone come first. One shape for all frames, told by
+    Gauss-Newton on the sum of squares of: keypoints (robust, pixels), masks (`SilhouetteTerm`), scans (`ScanTerm`),
+    joint ranges, a zero-mean pose prior and unit betas (`Anatomy`; no data set was learned from), robust accelerations,
+    and a given fit as far as its own noise says. Keypoints alone come first. One shape for all frames, told by
     `observed.shape_frames`. Clothes never pull the body onto themselves: they keep a gap that is learned (`Gaps`).
 
     Args:
@@ -125,7 +125,8 @@ class _Registration:
         return Columns(np.flatnonzero(turns), len(names), E if face else 0, E, self.body.num_betas)
 
     def _outlines(self) -> dict[tuple[str, int], Outline]:
-        read, out = self.observed.mask, {}
+        read = self.observed.mask
+        out: dict[tuple[str, int], Outline] = {}
         if read is None:
             return out
         missing: dict[str, list[int]] = {}

@@ -1,8 +1,8 @@
 """How far what a body wears stands off from it, learned while the body is fitted.
 
 Clothes say where a body is as far as they keep their distance. For every place on the body the distances that were seen
-(over views and frames) have a median, the gap, and a spread about it: a tight shirt holds the body to millimetres, the hem
-of a skirt to nothing. So a surface of clothes is never pulled onto the body, and a loose one does not pull at all.
+(over views and frames) have a median, the gap, and a spread about it: a tight shirt holds the body to millimetres, the
+hem of a skirt to nothing. So a surface of clothes is never pulled onto the body, and a loose one does not pull at all.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from smplxpp.body import BodyModel
 from smplxpp.core.camera import Camera
 from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.register.kinematics import BodyPoints, Kinematics, PointsMotion, Posture
+from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.landmarks import LandmarkModel
 from smplxpp.register.normal_equations import NormalEquations
 

@@ -5,9 +5,9 @@ hangs on it about the posed joint p_j:
 
     dx_i = sum_{k in descendants(j)} w_ik (P_j d) x (G_k x_i - p_j) = -[A_ij - W_ij p_j]_x P_j d
 
-with P_j the parent's posed rotation, `A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j, itself
-among them. Shape moves the rest points and the joints; the change of pose correctives with the pose is left out of the
-derivative (they are millimetres), not of the points.
+with P_j the parent's posed rotation, `A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j,
+itself among them. Shape moves the rest points and the joints; the change of pose correctives with the pose is left out
+of the derivative (they are millimetres), not of the points.
 """
 
 from __future__ import annotations
@@ -123,10 +123,10 @@ class BodyPoints:
         width = have[0].shape[2] if have else 0
         dirs = [np.zeros((len(p), 3, width)) if p.pose_dirs is None else p.pose_dirs for p in parts]
         return BodyPoints(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("rest", "shape_dirs", "expression_dirs", "weights")
-            ),
+            np.concatenate([part.rest for part in parts]),
+            np.concatenate([part.shape_dirs for part in parts]),
+            np.concatenate([part.expression_dirs for part in parts]),
+            np.concatenate([part.weights for part in parts]),
             np.concatenate(dirs) if have else None,
         )
 

@@ -1,7 +1,7 @@
 """The normal equations of a sequence: a dense block a frame, smoothness between frames, one shape for all.
 
-Unknowns of a frame are the turns of its free joints, its translation and, where it is free, its expression; those of the
-shape come last and are shared. `H x = -g` with
+Unknowns of a frame are the turns of its free joints, its translation and, where it is free, its expression; those of
+the shape come last and are shared. `H x = -g` with
 
     H = [ D + S    C ]      D block-diagonal, S the smoothness (it couples a column of one frame with the same column of
         [   C^T    B ]      the two next ones alone, so that D + S is banded), C and B from the shape.
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float64, Int64
-from scipy.linalg import cho_solve, cholesky, cholesky_banded, cho_solve_banded
+from scipy.linalg import cho_solve, cho_solve_banded, cholesky, cholesky_banded
 
 from smplxpp.register.kinematics import PointsMotion
 

@@ -19,7 +19,8 @@ class Outline:
     """Signed distances to the contour of one mask, negative inside.
 
     Attributes:
-        field: quarters of a reduced pixel, of a window of the image. corner: x, y of the window's corner, reduced pixels.
+        field: quarters of a reduced pixel, of a window of the image. corner: x, y of the window's corner, in reduced
+            pixels.
         factor: pixels of the image to a reduced one. width, height: of the reduced image.
     """
 
@@ -55,7 +56,7 @@ class Outline:
     def sample(
         self, pixels: Float64[np.ndarray, "N 2"]
     ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, "N 2"], np.ndarray]:
-        """Signed distance of pixels of the full image, its gradient, and where it is known (within the window and near)."""
+        """Signed distance of pixels of the full image, its gradient, and where it is known (in the window, near)."""
         place = pixels / self.factor - 0.5 - np.asarray(self.corner)
         h, w = self.field.shape
         known = (place > 0).all(axis=1) & (place[:, 0] < w - 1) & (place[:, 1] < h - 1)

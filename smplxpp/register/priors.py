@@ -167,7 +167,8 @@ def white_noise(state: BodyState, frames: Int64[np.ndarray, " T"]) -> tuple[floa
     speed = rotvec_from_matrix(state.rotations[1:] @ state.rotations[:-1].transpose(0, 1, 3, 2))
     turn = (speed[1:] - speed[:-1])[triples]
     moved = np.diff(state.transl, n=2, axis=0)[triples]
-    return tuple(float(1.4826 * np.median(np.abs(values)) / np.sqrt(6)) for values in (turn, moved))
+    pose, transl = (float(1.4826 * np.median(np.abs(values)) / np.sqrt(6)) for values in (turn, moved))
+    return pose, transl
 
 
 def _left_jacobian_inverse(vectors: Float64[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3 3"]:

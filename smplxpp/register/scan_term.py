@@ -17,6 +17,7 @@ from smplxpp.register.gaps import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import NormalEquations
 from smplxpp.register.observations import ScanObservation
+from smplxpp.register.robust import geman_mcclure
 
 # Labels in groups: skin, unknown, and each thing that is worn.
 _UNKNOWN_GROUP, _GROUPS = 0, 16
@@ -59,9 +60,9 @@ class ScanSample:
 class ScanTerm:
     """Signed distances between scans and the body, along normals, metres.
 
-    For a scan's point p with the body's closest point c, normal n and distance d (negative inside): skin, and the body's
-    bare vertices to their nearest skin of the scan: d = 0. All else: d >= 0, and d = gap of its label and limb, as far
-    as that gap's spread allows.
+    For a scan's point p with the body's closest point c, normal n and distance d (negative inside): skin, and the
+    body's bare vertices to their nearest skin of the scan: d = 0. All else: d >= 0, and d = gap of its label and limb,
+    as far as that gap's spread allows.
 
     Args:
         body_points: all vertices of the body. bare: which of them are skin for sure.
@@ -139,16 +140,16 @@ class ScanTerm:
         # Moving the body's point outwards lowers the distance: d(d) = -n . dx.
         direction = -found.gradient
         sigma = config.scan_m
-        of_skin = facing * _robust(d, self.reach) / sigma**2
-        of_inside = _robust(d, 3 * self.reach) / sigma**2
+        of_skin = facing * geman_mcclure(d, self.reach) / sigma**2
+        of_inside = geman_mcclure(d, 3 * self.reach) / sigma**2
         wide = np.hypot(spread, sigma)
-        of_gap = np.where(np.isfinite(spread), config.cloth_share * _robust(d - gap, 2.5 * wide) / wide**2, 0.0)
+        of_gap = np.where(np.isfinite(spread), config.cloth_share * geman_mcclure(d - gap, 2.5 * wide) / wide**2, 0.0)
         inside = ~skin & (d < 0)
         residual = np.where(skin | inside, d, d - gap)
         weight = np.where(skin, of_skin, np.where(inside, of_inside, facing * of_gap))
         learned = ~skin & facing & (d > -0.02) & (d < _LARGEST_GAP)
         self._seen.append((place[learned], d[learned]))
-        rows = [(corners, bary, direction, residual, weight / self._crowding(sample))]
+        rows: list[tuple[np.ndarray, ...]] = [(corners, bary, direction, residual, weight / self._crowding(sample))]
         if sample.skin is not None and len(self.bare_index):
             rows.append(self._from_body(sample, mesh))
         corners, bary, direction, residual, weight = (np.concatenate(parts) for parts in zip(*rows, strict=True))
@@ -168,14 +169,7 @@ class ScanTerm:
         normal = sample.normals[nearest]
         facing = np.einsum("nx,nx->n", mesh.vertex_normals[index], normal) > _FACING
         residual = np.einsum("nx,nx->n", vertices - sample.points[nearest], normal)
-        weight = facing * _robust(residual, self.reach) / self.config.scan_m**2 / self._crowding(sample)
+        weight = facing * geman_mcclure(residual, self.reach) / self.config.scan_m**2 / self._crowding(sample)
         corners = np.repeat(index[:, None], 3, axis=1)
         bary = np.tile([1.0, 0.0, 0.0], (len(index), 1))
         return corners, bary, normal, residual, weight
-
-
-def _robust(residual: np.ndarray, cutoff: np.ndarray | float) -> np.ndarray:
-    """Weight of Geman and McClure."""
-    with np.errstate(invalid="ignore"):
-        ratio = np.where(np.isfinite(cutoff), residual / cutoff, 0.0)
-    return 1.0 / (1.0 + ratio**2) ** 2

@@ -18,6 +18,7 @@ from smplxpp.register.keypoint_term import projected
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import NormalEquations
 from smplxpp.register.outline import Outline
+from smplxpp.register.robust import geman_mcclure
 
 # A vertex is at the rim where its normal is this near to perpendicular to the ray: sine of the angle.
 _RIM = 0.13
@@ -62,8 +63,8 @@ class SilhouetteTerm:
     believed within a reach. Covered: s = -gap of this vertex, as far as its spread allows. Both: s > 0 is outside
     the person, which no part of a body is.
 
-    A rim within the body's own outline, or within that of what it is known to wear, has no contour of its own: the body,
-    grown by its gaps, is drawn, and rims beyond which there is still body are left out.
+    A rim within the body's own outline, or within that of what it is known to wear, has no contour of its own: the
+    body, grown by its gaps, is drawn, and rims beyond which there is still body are left out.
 
     Args:
         body: all vertices. faces: of the body. normals: of all vertices on the rest shape, unit.
@@ -111,15 +112,14 @@ class SilhouetteTerm:
 
     def residual_px(self, row: int, kinematics: Kinematics, posture: Posture) -> float:
         """Mean pixels by which rim vertices miss their contour where it is known; NaN without any."""
-        index, _, residual, weight = self._residuals(row, kinematics, posture, learn=False, in_pixels=True)
+        _, _, residual, weight = self._residuals(row, kinematics, posture, learn=False, in_pixels=True)
         use = weight > 0
         return float(np.mean(np.abs(residual[use]))) if use.any() else float("nan")
 
     def _residuals(
         self, row: int, kinematics: Kinematics, posture: Posture, *, learn: bool, in_pixels: bool = False
-    ) -> tuple[
-        Int64[np.ndarray, " M"], Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"], Float64[np.ndarray, " M"]
-    ]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Index (M,), direction (M, 3), residual (M,) and weight (M,) of rims, of all cameras."""
         points, normals = self.surface.posed(kinematics, posture)
         grown = points + normals * (np.where(self.bare, 0.0, self.gaps.median)[self._nearest])[:, None]
         drawn = TriangleMesh(grown, self.surface.faces)
@@ -168,12 +168,12 @@ class SilhouetteTerm:
         bare, gap, spread = self.bare[index], self.gaps.median[index], self.gaps.spread[index]
         residual = np.where(bare, length, length + gap)
         covered_spread = np.hypot(spread, sigma)
-        of_bare = _robust(length, np.maximum(self.reach, 3 * sigma)) / sigma**2
-        of_covered = self.config.cloth_share * _robust(residual, 2.5 * covered_spread) / covered_spread**2
+        of_bare = geman_mcclure(length, np.maximum(self.reach, 3 * sigma)) / sigma**2
+        of_covered = self.config.cloth_share * geman_mcclure(residual, 2.5 * covered_spread) / covered_spread**2
         weight = np.where(bare, of_bare, np.where(np.isfinite(spread), of_covered, 0.0))
         outside = length > 0
         # Outside the mask, whatever covers it: one-sided, and cut off late, for masks err too.
-        one_sided = _robust(length, np.maximum(2 * self.reach, 6 * sigma)) / (2 * sigma) ** 2
+        one_sided = geman_mcclure(length, np.maximum(2 * self.reach, 6 * sigma)) / (2 * sigma) ** 2
         stronger = outside & ~bare & (one_sided > weight)
         residual, weight = np.where(stronger, length, residual), np.where(stronger, one_sided, weight)
         if learn:
@@ -198,10 +198,3 @@ def _at(drawn: _Drawn, pixels: np.ndarray) -> np.ndarray:
     column, row = np.floor(pixels * drawn.scale).astype(np.int64).T
     inside = (column >= 0) & (column < covered.shape[1]) & (row >= 0) & (row < covered.shape[0])
     return inside & covered[np.where(inside, row, 0), np.where(inside, column, 0)]
-
-
-def _robust(residual: np.ndarray, cutoff: np.ndarray) -> np.ndarray:
-    """Weight of Geman and McClure, 0 for an infinite residual's worth of cutoff 0."""
-    with np.errstate(invalid="ignore"):
-        ratio = np.where(np.isfinite(cutoff), residual / cutoff, 0.0)
-    return 1.0 / (1.0 + ratio**2) ** 2

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.keypoint_term import KeypointTerm
+from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.normal_equations import Columns, NormalEquations
 from smplxpp.register.priors import Priors
 from smplxpp.register.scan_term import ScanTerm

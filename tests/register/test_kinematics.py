@@ -78,7 +78,7 @@ def test_derivatives_are_differences(scene):
 
 
 def test_points_between_corners_follow_them(scene):
-    kinematics, state, points, _ = scene
+    kinematics, state, _, _ = scene
     near = BODY.faces[:40]
     corners = BodyPoints.of_vertices(BODY, np.arange(BODY.vertex_count))
     weight = np.random.default_rng(2).dirichlet(np.ones(3), 40)

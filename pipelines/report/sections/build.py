@@ -20,12 +20,20 @@ from pipelines.figures import (
 from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.arrays import load_arrays
 from pipelines.runs.artefacts import load_cleaned_parts, load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
+from pipelines.runs.layout import (
+    BIND_STAGE,
+    BUILD_STAGES,
+    EVALUATE_STAGE,
+    REFINE_STAGE,
+    REGISTER_STAGE,
+    TEMPLATE_STAGES,
+)
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from pipelines.stages.motion import motion_of_build
@@ -50,6 +58,8 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
     template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
+    poses = standing_refinement(run, template_digest)
+    records = {**records, **({} if poses is None else {REFINE_STAGE: poses})}
     records = {**records, **({} if fit is None else {BIND_STAGE: fit})}
     trainings = standing_trainings(run, records.values())
     records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
@@ -70,6 +80,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
         _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
         _poses_section(run, template, reference, inputs),
+        *(() if poses is None else (refine_section(poses),)),
         *(() if fit is None else (fit_section(fit),)),
         *(training_section(record) for record in trainings.values()),
         *(() if evaluation is None else evaluation_sections(evaluation)),
@@ -90,6 +101,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
             f"{sum(seconds[name] for name in TEMPLATE_STAGES):.1f} s",
             "all stages of the template, validation included",
         ),
+        *refinement_key_numbers(poses),
         *(() if fit is None else fit_key_numbers(fit)),
         *training_key_numbers(trainings),
         *(() if evaluation is None else evaluation_key_numbers(evaluation)),
