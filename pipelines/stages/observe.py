@@ -93,11 +93,12 @@ def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
     files = find_scans(inputs.capture) if inputs.scan is None else {inputs.frame: inputs.scan}
     frames = _frames(capture, files, inputs)
     files = {frame: path for frame, path in files.items() if frame in frames}
-    keypoints = {} if not cameras else keypoints_of(capture, cameras)
+    keypoints, unread = _keypoints(capture, cameras)
     if not cameras and not files:
         _refuse_nothing(capture)
     masks, labels = (_maps(capture, cameras, kind) for kind in ("mask", "label"))
     scans, problems = observed_scans(files, inputs, capture, labels)
+    problems = [*unread, *problems]
     initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
     if initial is None and not keypoints:
         raise InputError(
@@ -155,10 +156,24 @@ def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
     return open_capture(inputs.capture, params=inputs.params if inputs.start else None, body=body, **protocol)
 
 
-def keypoints_of(capture: Capture, cameras: Sequence[str]) -> dict[str, Keypoints2D]:
-    """The keypoints of those cameras that have any."""
-    found = {name: capture.keypoints(name) for name in cameras}
-    return {name: points for name, points in found.items() if points is not None}
+def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keypoints2D], list[str]]:
+    """The keypoints of those cameras that have any, and what was wrong with the others.
+
+    Raises:
+        InputError: none of the files can be read.
+    """
+    found, errors = {}, {}
+    for name in cameras:
+        try:
+            points = capture.keypoints(name)
+        except InputError as error:
+            errors[name] = error
+            continue
+        if points is not None:
+            found[name] = points
+    if errors and not found:
+        raise next(iter(errors.values()))
+    return found, [f"camera {name}: keypoints left out: {error}" for name, error in errors.items()]
 
 
 def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ...]:

@@ -11,10 +11,9 @@ from jaxtyping import Float64
 
 from pipelines.runs.checks import Check
 from smplxpp.body import BodyModel
-from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.register.body_fit import BodyFit
+from smplxpp.register.landmarks import LandmarkModel
 from smplxpp.register.observations import Observations
 
 CONFIDENT = 0.5
@@ -58,34 +57,38 @@ def stacked_rows(frames: Sequence[int], params: BodyParams) -> dict[str, Any]:
     return arrays
 
 
-def reprojection_errors(
-    body: BodyModel, params: BodyParams, frames: Sequence[int], camera: Camera, keypoints: Keypoints2D
-) -> Float64[np.ndarray, " P"]:
-    """Pixels between the keypoints of a camera that are joints of the body and these joints, where they were seen."""
-    shared = [name for name in keypoints.names if name in body.joint_names]
-    seen = keypoints.select(shared, frames)
-    joints = body.forward(params).joints[:, [body.joint_names.index(name) for name in shared]]
-    pixels = camera.screen_from_world(joints.reshape(-1, 3))[:, :2].reshape(*joints.shape[:2], 2)
-    distance = np.linalg.norm(pixels - seen.points, axis=-1)
-    return distance[seen.confidence > 0]
-
-
 def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str, dict[str, Any]]:
-    """Number of keypoints, and median and 90th percentile of their distance in pixels, before and after, by camera."""
+    """Number of keypoints, and median and 90th percentile of their distance in pixels, before and after, by camera.
+
+    Every keypoint with a confidence counts, whether the solver believed it or not.
+    """
+    names = list(dict.fromkeys(name for found in observed.keypoints.values() for name in found.names))
+    landmarks = LandmarkModel.of(body, names)
     at = {frame: row for row, frame in enumerate(observed.frames)}
-    before = None if observed.initial is None else observed.initial.select([at[frame] for frame in fit.frames])
+    fits = {"after": _landmark_points(body, fit.params, landmarks)} if observed.keypoints else {}
+    if fits and observed.initial is not None:
+        start = observed.initial.select([at[frame] for frame in fit.frames])
+        fits = {"before": _landmark_points(body, start, landmarks), **fits}
     out: dict[str, dict[str, Any]] = {}
-    for name, points in observed.keypoints.items():
-        row: dict[str, Any] = {}
-        for when, params in (("before", before), ("after", fit.params)):
-            if params is None:
-                continue
-            errors = reprojection_errors(body, params, fit.frames, observed.cameras[name], points)
-            if len(errors):
-                row |= {"points": len(errors), when: _spread_of(errors)}
-        if row:
-            out[name] = row
+    for name, keypoints in observed.keypoints.items():
+        seen = keypoints.select(landmarks.names, fit.frames)
+        counted = seen.confidence > 0
+        if counted.any():
+            out[name] = {"points": int(counted.sum())}
+            for when, points in fits.items():
+                pixels = observed.cameras[name].screen_from_world(points.reshape(-1, 3))[:, :2]
+                distance = np.linalg.norm(pixels.reshape(seen.points.shape) - seen.points, axis=-1)
+                out[name][when] = _spread_of(distance[counted])
     return out
+
+
+def _landmark_points(body: BodyModel, params: BodyParams, landmarks: LandmarkModel) -> Float64[np.ndarray, "F K 3"]:
+    """Where the points that keypoints mark are on the body, world."""
+    points = np.zeros((len(params), len(landmarks.names), 3))
+    for row in range(len(params)):
+        posed = body.forward(params.frame(row)).frame(0)
+        points[row] = landmarks.points(posed.vertices, posed.joints)
+    return points
 
 
 def _spread_of(errors: np.ndarray) -> dict[str, float]:

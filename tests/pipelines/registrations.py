@@ -81,5 +81,5 @@ def use_keypoints(monkeypatch) -> list[str]:
         asked.append(camera)
         return joints_in(capture, camera)
 
-    monkeypatch.setattr(Capture, "keypoints", keypoints, raising=False)
+    monkeypatch.setattr(Capture, "keypoints", keypoints)
     return asked

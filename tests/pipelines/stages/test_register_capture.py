@@ -200,6 +200,23 @@ def test_a_damaged_mask_and_a_damaged_scan_are_named_and_the_rest_goes_on(tmp_pa
     assert set(solver.shown[0].scans) == {0} and solver.shown[0].mask("Cam003", 1) is None
 
 
+def test_damaged_keypoints_of_a_camera_are_named_and_the_rest_goes_on(tmp_path, plain, solver, monkeypatch):
+    def keypoints(capture, camera):
+        if camera in broken:
+            raise InputError(f"file {camera}.npz", expected="keypoints", received="nothing")
+        return joints_in(capture, camera)
+
+    monkeypatch.setattr(Capture, "keypoints", keypoints)
+    broken = {"Cam002"}
+    register_capture(tmp_path, inputs_of(plain))
+    assert "Cam002" not in solver.shown[0].keypoints and "Cam001" in solver.shown[0].keypoints
+    (words,) = json.loads((tmp_path / REGISTRATION).read_text())["problems"]
+    assert words.startswith("camera Cam002: keypoints left out: file Cam002.npz")
+    broken |= set(open_capture(plain).cameras)
+    with pytest.raises(InputError, match="file Cam001"):
+        register_capture(tmp_path, inputs_of(plain))
+
+
 def write_other_params() -> BodyParams:
     arrays = exact().as_dict()
     return BodyParams(**{**arrays, "betas": np.ones((16, 300)) * 0.1})
