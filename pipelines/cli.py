@@ -27,6 +27,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Build",
         "a scan, a body fit and labels in; an SMPLX++ template and a report out",
     ),
+    "register": (
+        "pipelines.commands.register",
+        "Register",
+        "the body fitted to all frames of a capture (keypoints, masks, label maps, scans), or to a scan",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",

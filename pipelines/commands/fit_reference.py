@@ -13,8 +13,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
-from pipelines.commands.progress import training_progress
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
+from pipelines.commands.progress import counted_progress, training_progress
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
 
@@ -34,6 +34,8 @@ class FitReference:
     """Folder of the capture: cameras, images, masks and body parameters of the frame."""
     frame: int = 0
     """Frame to fit."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -45,6 +47,8 @@ class FitReference:
     """Iterations, in the place of the preset's; each renders one view."""
     gaussians: OptionalInt = None
     """Number of Gaussians, in the place of the preset's."""
+    refine_poses: Literal["auto", "on", "off"] = "auto"
+    """Refine the poses of all training frames on the photographs first, as `smplxpp train` does."""
     hold_out: tuple[str, ...] = ()
     """Cameras to keep from training and to measure on; by default those that the capture holds out."""
     scale: float = 1.0
@@ -68,15 +72,20 @@ class FitReference:
         require_avatar("fitting Gaussians")
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import Distributed
+        from avatar.training.refinement.config import RefineConfig
         from pipelines.report.sections.build import rewrite_report
         from pipelines.runs.layout import BIND_STAGE, REPORT_FILE
         from pipelines.stages.bind import BindStage
         from pipelines.stages.models import Trainer, TrainOptions
+        from pipelines.stages.refine import refine, wants_refinement
         from pipelines.stages.scene import TrainInputs, open_frame
 
         require_positive("option max-minutes", self.max_minutes, finite=False)
         config = self.config()
-        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
+        if wants_refinement(self.run_folder, inputs, self.refine_poses):
+            with counted_progress("poses", enabled=not self.json) as told:
+                refine(self.run_folder, inputs, RefineConfig(seed=self.seed), told=told)
         scene = open_frame(self.run_folder, inputs, self.frame)
         device = choose_device(self.device)
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, require_avatar
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.layout import BIND_STAGE
 from pipelines.runs.stage import StageRecord, goes_on
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipelines.stages.train import TrainConfig
 
 log = logging.getLogger(__name__)
-STAGES = ("fit", "teacher", "bake", "compensate")
+STAGES = ("refine", "fit", "teacher", "bake", "compensate")
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,23 @@ class Train:
     """Options of `smplxpp train`. It trains what a run lacks; the same command goes on with what was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
-    """Folder that `smplxpp build` wrote; 70_bind, 80_teacher, 85_bake and 90_compensate go into it. Write --run-folder
-    with torchrun, which takes --run for an option of its own."""
+    """Folder that `smplxpp build` wrote; 66_refine, 70_bind, 80_teacher, 85_bake and 90_compensate go into it. Write
+    --run-folder with torchrun, which takes --run for an option of its own."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
     """paper: the numbers that the paper states (docs/training.md lists the others), for a GPU; gpu: smaller and some
     hours; cpu: two cores, half an hour; demo: minutes, to see whether all fits together."""
     stage: Annotated[
-        Literal["teacher", "bake", "compensate"] | None,
-        tyro.conf.arg(metavar="{teacher,bake,compensate}", help_behavior_hint="(optional)"),
+        Literal["refine", "teacher", "bake", "compensate"] | None,
+        tyro.conf.arg(metavar="{refine,teacher,bake,compensate}", help_behavior_hint="(optional)"),
     ] = None
     """Train this stage alone; those before it must stand."""
-    until: Literal["fit", "teacher", "bake", "compensate"] = "compensate"
+    until: Literal["refine", "fit", "teacher", "bake", "compensate"] = "compensate"
     """The last stage to train."""
+    refine_poses: Literal["auto", "on", "off"] = "auto"
+    """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where
+    the capture says that its parameters are tracked, or the run has registered or refined some."""
     max_minutes: float = math.inf
     """Stop after as many minutes and write what there is; the same command
     then goes on (without --force, which would begin anew)."""
@@ -77,6 +80,8 @@ class Train:
     installed; a name gives the term to any preset."""
     hold_out: tuple[str, ...] = ()
     """Cameras to keep from training and to measure on; by default those that the capture holds out."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
     params: OptionalPath = None
     """Body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -103,17 +108,22 @@ class Train:
             logging.disable(logging.WARNING)  # the first process says it
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
+        from avatar.training.refinement.config import RefineConfig
         from pipelines.stages.models import TrainOptions
+        from pipelines.stages.refine import wants_refinement
         from pipelines.stages.scene import TrainInputs, open_scene
         from pipelines.stages.train import train, with_batch
 
-        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         if not self.max_minutes > 0:
             raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
         config = self.config()
         with join_processes(choose_device(self.device)) as together:
             config = replace(config, preset=with_batch(config.preset, least=together.world_size))
-            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs))
+            first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
+            config = replace(config, refine=RefineConfig(seed=self.seed) if first else None)
+            again = first and "refine" in self.stages()
+            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not again))
             held_out = bool(scene.capture.splits.novel_view_cameras)
 
             def bar(name: str, total: int) -> AbstractContextManager:
@@ -151,7 +161,7 @@ class Train:
         from avatar.training.presets import training_preset
         from pipelines.stages.train import TrainConfig, with_batch, with_perceptual
 
-        given = {stage: getattr(self, f"{stage}_iterations") for stage in STAGES}
+        given = {stage: getattr(self, f"{stage}_iterations") for stage in STAGES[1:]}
         for name, value, least in (
             ("gaussians", self.gaussians, 1),
             ("batch", self.batch, 1),
@@ -190,7 +200,8 @@ class Train:
             name: {**record.manifest["numbers"], "ran": record.ran, "checks": record.manifest["checks"]}
             for name, record in records.items()
         }
-        finished = all(numbers["finished"] for numbers in stages.values()) and self.stages()[-1] in stages
+        last = self.stages()[-1]
+        finished = all(numbers["finished"] for numbers in stages.values()) and (last in stages or last == "refine")
         return {"run": str(self.run_folder), "finished": finished, "stages": stages}
 
 

@@ -47,5 +47,9 @@ LOST_BY_COMPRESSION = Gate("dB", 0.3, 2.0, higher_is_better=False)
 """PSNR of a student less that of its compact file."""
 AGAINST_SKINNING = Gate("x", 1.0, 1.5, higher_is_better=False)
 """P2S of a garment, as a share of that of the template that follows its joints."""
+REFINED = Gate("", 0.95, 0.5)
+"""Share of the frames whose refined poses fit their photographs better."""
+REFINED_LOSS = Gate("x", 1.0, 1.2, higher_is_better=False)
+"""Loss of the photographs with refined poses, as a share of that with the poses before."""
 ITERATIONS = Gate("", 1.0, 0.0)
 """Share of a training's iterations that were done."""

@@ -11,8 +11,12 @@ import numpy as np
 
 from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import TEMPLATE
+from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.places import lies_in
 from pipelines.stages.build_config import load_build
+from pipelines.stages.held_out import refuse_seen
+from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
+from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -29,6 +33,8 @@ CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
 """Training frames, and cameras of each, in whose images the template has to stand."""
 STANDS_IN_IMAGES = 0.3
 """Overlap of template and masks below which nothing can be learned."""
+REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
+REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
 OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
 """Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
 
@@ -39,9 +45,11 @@ class TrainInputs:
 
     Attributes:
         capture: folder of any known layout.
-        params: other parameters than the capture's own. body: what they are for, None for the open body.
+        params: other parameters than those that the run has made (`params_in_use`) or the capture's own. body: what
+            they are for, None for the open body.
         hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
         scale: of the images, 1 for all pixels.
+        protocol: of the capture; None: the run's.
     """
 
     capture: Path
@@ -49,6 +57,7 @@ class TrainInputs:
     body: Path | None = None
     hold_out: tuple[str, ...] = ()
     scale: float = 1.0
+    protocol: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +108,8 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             that does not stand in the images.
     """
     template = open_template(run)
+    inputs = of_protocol(run, inputs)
+    inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture, train, held_out = open_cameras(inputs)
     if frame not in capture.frames:
         raise InputError(
@@ -123,20 +134,33 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
-def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
+def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures: bool = False) -> TrainScene:
     """Open the template of a run and a capture, and look at both.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
 
+    Args:
+        refined: with the run's refined parameters, if it has any that began with these.
+        measures: nothing is trained; then another protocol than the run's is logged and not refused.
+
     Raises:
-        InputError: no template; no training camera, image, mask or parameters; images of another size than their
-            camera; nobody in the masks; a template that does not stand in the images, or parameters of another body.
+        InputError: no template; another protocol than the template's; no training camera, image, mask or parameters;
+            images of another size than their camera; nobody in the masks; a template that does not stand in the images,
+            or parameters of another body.
     """
     template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
+    inputs = of_protocol(run, inputs, measures=measures)
+    inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
     capture, params = _with_params(_opened(inputs))
     capture = _with_masks(capture)
+    made: dict[str, str] = {}
+    if inputs.params == run / REGISTERED_PARAMS:
+        refuse_seen(run, (REGISTER_STAGE,), capture.splits, anew=REGISTER_ANEW)
+    if inputs.params == run / REFINED_PARAMS:
+        refuse_seen(run, (REFINE_STAGE,), capture.splits, anew=REFINE_ANEW)
+        made = {REFINED_PARAMS: sha256_file(inputs.params)}
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)
@@ -147,7 +171,7 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     _compare_shapes(template, [params[f] for f in frames])
     overlap = _overlap(template, capture, params)
-    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **capture_digests(capture, params)}
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **made, **capture_digests(capture, params)}
     template_frame = _template_frame(run, inputs)
     if template_frame in capture.splits.novel_pose_frames:
         raise InputError(
@@ -160,10 +184,17 @@ def open_scene(run: Path, inputs: TrainInputs) -> TrainScene:
     return TrainScene(template, capture, frame, built_frame, template_frame, overlap, digests)
 
 
+def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainInputs:
+    """The inputs with the protocol that is read."""
+    own_params = inputs.params is not None
+    protocol = chosen_protocol(run, inputs.protocol, own_params=own_params, measures=measures)
+    return replace(inputs, protocol=protocol)
+
+
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
-    if built is None or inputs.capture.resolve() not in built[0].scan.resolve().parents:
+    if built is None or not lies_in(built[0].scan, inputs.capture):
         return None
     return built[0].frame
 
@@ -175,7 +206,7 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
         InputError: unknown cameras, none, or none to train on.
     """
     body = None if inputs.body is None else load_body(inputs.body)
-    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body, protocol=inputs.protocol)
     if not capture.cameras or not capture.presence().any():
         raise InputError(
             f"capture {capture.name}",
@@ -200,6 +231,14 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
     if not train:
         raise InputError("cameras", expected="at least one to train on", received="all held out")
     return capture, train, tuple(held_out)
+
+
+def normal_maps(capture: Capture) -> tuple[int, int]:
+    """Training views that have a normal map, and all training views."""
+    splits = capture.splits
+    rows = np.isin(list(capture.cameras), splits.train_cameras)
+    views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
+    return int((views & capture.presence("normal")).sum()), int(views.sum())
 
 
 def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,23 +12,27 @@ from typing import Any, Literal
 from avatar.losses.perceptual import load_metric
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset, with_local_shapes
-from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TEMPLATE
+from avatar.training.refinement.config import RefineConfig
+from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, REFINE_STAGE, TEACHER_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
-from pipelines.stages.scene import TrainInputs, TrainScene
+from pipelines.stages.refine import refine
+from pipelines.stages.scene import TrainInputs, TrainScene, normal_maps, open_scene
 from pipelines.stages.teacher import TeacherStage
+from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
 Shapes = Literal["full", "local", "pruned"]
-STEPS = ("fit", "teacher", "bake", "compensate")
+STEPS = ("refine", "fit", "teacher", "bake", "compensate")
 """The steps of a training in their order, as the command line calls them."""
 
 
@@ -37,6 +42,7 @@ class TrainConfig:
 
     Attributes:
         preset: configurations of all stages.
+        refine: how poses are refined first; None: they are not.
         teacher: bake from a teacher; False: from the photographs alone.
         perceptual: metric of the perceptual term: "lpips", "st-lpips" or "none".
         blend_shapes: "full": every Gaussian has its own columns (the paper); "local": 256 parts of the Gaussians have
@@ -45,6 +51,7 @@ class TrainConfig:
     """
 
     preset: TrainingPreset
+    refine: RefineConfig | None = None
     teacher: bool = True
     perceptual: str = "none"
     blend_shapes: Shapes = "full"
@@ -97,6 +104,7 @@ def train(
     A training that was interrupted, or that the limit of time ended, goes on where it was.
 
     Args:
+        scene: opened with the parameters that stand; opened anew where poses are refined first.
         steps: of `STEPS`, in this order; the stages of those before the first must stand.
 
     Returns:
@@ -113,13 +121,21 @@ def train(
             received="none",
             remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
         )
+    records: dict[str, StageRecord] = {}
+    how = config.refine
+    if "refine" in steps and how is not None:
+        begin = time.monotonic()
+        records["refine"] = together.run_on_rank0(lambda: _refined(run, inputs, how, options))
+        scene = together.run_on_rank0(lambda: open_scene(run, inputs))
+        left = options.max_seconds - (time.monotonic() - begin)
+        options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
+    _tell_of_normals(scene.capture, config, steps)
     metric = load_metric(config.perceptual, device=together.device)
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
     by_hand = together.run_on_rank0(lambda: _fit_by_hand(run, scene, stages["fit"]))
     if by_hand is not None:
         trainer.take(stages["fit"], by_hand)
-    records: dict[str, StageRecord] = {}
     for step in steps:
         if step not in stages:
             continue
@@ -129,6 +145,30 @@ def train(
         if not records[step].finished:
             break
     return records
+
+
+def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: TrainOptions) -> StageRecord:
+    """Refine the poses, with a bar of looks at frames."""
+    with options.bar(REFINE_STAGE, 0) as report:
+
+        def told(done: int, total: int) -> None:
+            report(Progress(done, total, 0.0, 0.0))
+
+        return refine(run, inputs, config, force=options.force, told=told)
+
+
+def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ...]) -> None:
+    """Say once what a loss with a normal term goes without."""
+    trainings = [getattr(config.preset, name) for name in ("teacher", "bake", "compensate") if name in steps]
+    there, views = normal_maps(capture)
+    if there == views or not any(training.weights.normal for training in trainings):
+        return
+    if there:
+        log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
+    elif config.teacher and config.preset.teacher.track is not None:
+        log.info("capture %s has no normal maps: those of the followed surface stand for them", capture.name)
+    else:
+        log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:

@@ -111,8 +111,10 @@ def write_estimated_labels(
     wrong = seen = 0
     for k, name in enumerate(capture.cameras):
         series = capture.recording.series("label", name)
-        maps = [] if series is None else [(frame, series.required(frame)) for frame in series.numbers.tolist()]
-        for frame, path in maps:
+        if series is None:
+            continue
+        for frame in series.numbers.tolist():
+            path = series.required(frame)
             exact = np.asarray(read_labels(path))
             estimated = estimated_labels(exact, seed=[seed, _LABEL_SEED, k, frame], background=background)
             write_gray_png(root / ESTIMATED_LABELS / name / f"{path.stem}.png", estimated)

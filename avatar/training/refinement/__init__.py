@@ -1,0 +1,1 @@
+"""Poses refined on photographs of training cameras, through the rasteriser."""
