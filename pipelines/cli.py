@@ -27,6 +27,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Build",
         "a scan, a body fit and labels in; an SMPLX++ template and a report out",
     ),
+    "register": (
+        "pipelines.commands.register",
+        "Register",
+        "the body fitted to all frames of a capture (keypoints, masks, label maps, scans), or to a scan",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",
@@ -64,6 +69,16 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "pipelines.commands.capture",
         "CaptureConvertCommand",
         "any capture that can be opened, to our layout or ActorsHQ's",
+    ),
+    "capture degrade": (
+        "pipelines.commands.degrade",
+        "CaptureDegradeCommand",
+        "a capture with exact inputs to one with a tracker's: noisy parameters, keypoints, estimated labels",
+    ),
+    "keypoints convert": (
+        "pipelines.commands.keypoints",
+        "KeypointsConvert",
+        "keypoints of OpenPose, EasyMocap, mmpose, COCO or MediaPipe to ours",
     ),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }

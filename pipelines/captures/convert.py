@@ -20,6 +20,7 @@ from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv, write_plain_cameras_json
 from smplxpp.capture.writers.description import write_description
+from smplxpp.capture.writers.keypoints import write_keypoints
 from smplxpp.core.atomic import atomic_path, atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh_io import write_ply
@@ -110,6 +111,7 @@ def convert_capture(
     left_out += _write_params(capture, out, frames, config)
     if config.layout == "simple":
         _write_geometry(capture, out, frames)
+        left_out += _write_keypoints(source, out, cameras, frames)
         write_plain_cameras_json(out / "cameras.json", {n: c for n, c in source.cameras.items() if n in cameras})
         splits = source.splits.restricted(cameras, frames)
         write_description(out / "capture.json", source.recording, splits, frames)
@@ -181,6 +183,21 @@ def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: Co
     else:  # a row for each number would leave gaps
         for frame, p in params.items():
             p.save(out / "params" / f"{frame:06d}.npz")
+    return left_out
+
+
+def _write_keypoints(capture: Capture, out: Path, cameras: Sequence[str], frames: Sequence[int]) -> list[str]:
+    """Write the keypoints of the frames where a detector has looked; return words about files that cannot be read."""
+    left_out = []
+    for name in cameras:
+        try:
+            found = capture.keypoints(name)
+        except InputError as error:
+            left_out.append(str(error))
+            continue
+        if found is not None:
+            kept = [frame for frame in found.frames.tolist() if frame in set(frames)]
+            write_keypoints(out / "keypoints" / f"{name}.npz", found.select(found.names, kept))
     return left_out
 
 

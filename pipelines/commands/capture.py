@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ class CaptureCheckCommand:
     """Folder of mattes to check instead of the capture's own masks."""
     params: OptionalPath = None
     """Body parameters to check instead of the capture's own."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are checked."""
     body: OptionalPath = None
     """Body model file that the parameters are for; the open body by default."""
     out: OptionalPath = None
@@ -56,7 +58,12 @@ class CaptureCheckCommand:
 
         body = load_body(self.body)
         capture = open_capture(
-            self.capture, format=_reader(self.format), masks=self.masks, params=self.params, body=body
+            self.capture,
+            format=_reader(self.format),
+            masks=self.masks,
+            params=self.params,
+            body=body,
+            protocol=self.protocol,
         )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
         with counted_progress("images", enabled=not self.json) as progress:
@@ -90,6 +97,10 @@ class CaptureConvertCommand:
     """Names of the cameras to keep, with commas between; by default all."""
     masks: OptionalPath = None
     """Folder of mattes to take instead of the capture's own masks."""
+    keypoints: OptionalPath = None
+    """Folder of keypoints of any detector (docs/captures.md) to take instead of the capture's own."""
+    person: OptionalInt = None
+    """Whose keypoints, where there are several people; by default the surest of each frame."""
     matting: OptionalPath = None
     """ONNX model of your own that makes the mattes; they go into the folder of --masks, those there are left alone."""
     params: OptionalPath = None
@@ -117,6 +128,8 @@ class CaptureConvertCommand:
             format=_reader(self.format),
             masks=self.masks,
             params=self.params,
+            keypoints=self.keypoints,
+            person=self.person,
             body=body,
             cache_bytes=0,
         )

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REFINE_STAGE, TRAIN_STAGES
+from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, REFINE_STAGE, TEMPLATE_STAGES, TRAIN_STAGES
 from pipelines.runs.stage import is_finished, read_manifest
 from smplxpp.core.errors import InputError
 
@@ -57,8 +57,10 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         InputError: the folder holds no run.
     """
     run = Path(run)
-    others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(BUILD_STAGES))
-    stages = [_stage(run, name) for name in sorted([*BUILD_STAGES, *others])]
+    others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(TEMPLATE_STAGES))
+    order = {name: number for number, name in enumerate(ALL_STAGES)}
+    names = sorted({*TEMPLATE_STAGES, *others}, key=lambda name: (order.get(name, len(order)), name))
+    stages = [_stage(run, name) for name in names]
     _mark_outdated(stages)
     metrics = _read_json(run / "metrics.json")
     if not metrics and all(stage["state"] == "missing" for stage in stages):

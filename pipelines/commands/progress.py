@@ -89,3 +89,16 @@ def training_progress(
         yield show
     finally:
         bar.stop()
+
+
+@contextmanager
+def shared_progress(*, enabled: bool = True) -> Iterator[Callable[[str, float], None]]:
+    """Show a bar that fills with each piece of work; yields `show(what, share done)`."""
+    columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
+        task = progress.add_task("start", total=1.0)
+
+        def show(what: str, share: float) -> None:
+            progress.update(task, description=what, completed=share)
+
+        yield show

@@ -8,10 +8,19 @@ from typing import Any
 import numpy as np
 
 from pipelines.runs.arrays import load_arrays
-from pipelines.runs.layout import PARAMS, PARTS, PARTS_WITHOUT_WEBS, POSED_BODY, SCAN, SCAN_LABELS, WEIGHTS
+from pipelines.runs.layout import (
+    PARAMS,
+    PARTS,
+    PARTS_WITHOUT_WEBS,
+    POSED_BODY,
+    SCAN,
+    SCAN_LABELS,
+    WEIGHTS,
+)
 from smplxpp.body import BodyModel, load_params
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core.safe_pickle import safe_npz
 from smplxpp.core.skin_weights import SkinWeights
 
 
@@ -24,6 +33,14 @@ def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
 def load_params_of_run(run: Path) -> BodyParams:
     """Read the parameters of the reference frame."""
     return load_params(run / PARAMS)
+
+
+def load_stacked_params(path: Path) -> tuple[tuple[int, ...], BodyParams]:
+    """Read the frames of a file whose row is the frame's number, NaN where there is none, and a row for each."""
+    arrays = safe_npz(path)
+    good = np.isfinite(arrays["global_orient"]).all(axis=1)
+    kept = {name: array[good] if name in ARRAY_NAMES else array for name, array in arrays.items()}
+    return tuple(np.flatnonzero(good).tolist()), BodyParams.from_mapping(kept, source=f"file {path}")
 
 
 def load_scan_labels(run: Path) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+REGISTER_STAGE = "05_register"
 CAPTURE_STAGE = "00_capture"
-REGISTER_STAGE = "10_register"
+POSE_BODY_STAGE = "10_body"
 SEGMENT_STAGE = "20_segment"
 CLEAN_STAGE = "30_clean"
 TRANSFER_STAGE = "40_transfer"
@@ -18,9 +19,9 @@ COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
 ABLATION = "ablation"
 
-BUILD_STAGES = (
+TEMPLATE_STAGES = (
     CAPTURE_STAGE,
-    REGISTER_STAGE,
+    POSE_BODY_STAGE,
     SEGMENT_STAGE,
     CLEAN_STAGE,
     TRANSFER_STAGE,
@@ -28,15 +29,19 @@ BUILD_STAGES = (
     ASSEMBLE_STAGE,
     VALIDATE_STAGE,
 )
-"""The stages of `smplxpp build`."""
+"""The stages of every build."""
+BUILD_STAGES = (REGISTER_STAGE, *TEMPLATE_STAGES)
+"""The stages of `smplxpp build` in their order: a registration, where there is one, gives the parameters."""
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
 ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
 
+REGISTERED_PARAMS = f"{REGISTER_STAGE}/params.npz"
+REGISTRATION = f"{REGISTER_STAGE}/registration.json"
 SCAN = f"{CAPTURE_STAGE}/scan.npz"
 PARAMS = f"{CAPTURE_STAGE}/params.npz"
-POSED_BODY = f"{REGISTER_STAGE}/body.npz"
+POSED_BODY = f"{POSE_BODY_STAGE}/body.npz"
 SCAN_LABELS = f"{SEGMENT_STAGE}/labels.npz"
 PARTS = f"{CLEAN_STAGE}/parts.npz"
 WEIGHTS = f"{TRANSFER_STAGE}/weights.npz"
@@ -52,12 +57,13 @@ TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
 BAKED = f"{BAKE_STAGE}/student.safetensors"
 STUDENT = f"{COMPENSATE_STAGE}/student.safetensors"
 COMPACT_STUDENT = f"{COMPENSATE_STAGE}/student_compact.safetensors"
-REGISTERED_PARAMS = "05_register/params.npz"
 REFINED_PARAMS = f"{REFINE_STAGE}/params.npz"
 REFINED_HELD_OUT_PARAMS = f"{REFINE_STAGE}/params_held_out.npz"
 EVALUATION = f"{EVALUATE_STAGE}/metrics.json"
 
 BUILD_FILE = "build.json"
 """What a run was built from, so that later stages can write its report anew."""
+REGISTER_FILE = "register.json"
+"""What a run's registration was made from."""
 METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"

@@ -57,7 +57,25 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             0,
             explanation="after the repair",
         ),
-        Check("largest push of the repair", report.max_push * MM, "mm", 15.0, 60.0),
+        Check(
+            "depth of what the repair leaves inside",
+            report.left_depth * MM,
+            "mm",
+            0.0,
+            5.0,
+            explanation=f"the body does not fit the scan here: register first. {report.left_where}"
+            if report.left_where
+            else "nothing needs a push beyond what its part stands off the body",
+        ),
+        Check(
+            "largest push of the repair",
+            report.max_push * MM,
+            "mm",
+            15.0,
+            60.0,
+            explanation=f"{report.max_push_where or 'none'}; no part is pushed farther than it stands off the body "
+            "(10 to 30 mm) and the clearance",
+        ),
     ]
     return StageOutput(checks, report.as_dict())
 

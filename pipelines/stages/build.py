@@ -18,6 +18,7 @@ from pipelines.runs.layout import (
     CAPTURE_STAGE,
     CLEAN_STAGE,
     METRICS_FILE,
+    POSE_BODY_STAGE,
     REGISTER_STAGE,
     SEGMENT_STAGE,
     TRANSFER_STAGE,
@@ -26,8 +27,10 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
-from pipelines.stages import assemble, capture, clean, register, segment, transfer, unpose, validate
+from pipelines.stages import assemble, capture, clean, pose_body, segment, transfer, unpose, validate
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
+from pipelines.stages.register_capture import register_capture
+from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import load_body, load_params
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
@@ -44,7 +47,7 @@ class _Part:
 
     Attributes:
         module: its `run(folder, build)` does the work; its imports are the stage's code.
-        needs: stages that it reads.
+        needs: stages that it reads, where the build has them.
         settings: fields of the configuration or the inputs that it depends on. files: inputs that it reads.
     """
 
@@ -56,26 +59,26 @@ class _Part:
 
 PARTS: dict[str, _Part] = {
     CAPTURE_STAGE: _Part(
-        capture, (), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
+        capture, (REGISTER_STAGE,), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
     ),
-    REGISTER_STAGE: _Part(register, (CAPTURE_STAGE,), files=("body",)),
+    POSE_BODY_STAGE: _Part(pose_body, (CAPTURE_STAGE,), files=("body",)),
     SEGMENT_STAGE: _Part(
         segment, (CAPTURE_STAGE,), settings=("label_set",), files=("labels", "label_maps", "cameras", "scan")
     ),
     CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
     TRANSFER_STAGE: _Part(
-        transfer, (REGISTER_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
+        transfer, (POSE_BODY_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
     ),
-    UNPOSE_STAGE: _Part(unpose, (REGISTER_STAGE, TRANSFER_STAGE), files=("body",)),
+    UNPOSE_STAGE: _Part(unpose, (POSE_BODY_STAGE, TRANSFER_STAGE), files=("body",)),
     ASSEMBLE_STAGE: _Part(
         assemble,
-        (CAPTURE_STAGE, REGISTER_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+        (CAPTURE_STAGE, POSE_BODY_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
         settings=("clearance_mm",),
         files=("body",),
     ),
     VALIDATE_STAGE: _Part(
         validate,
-        (CAPTURE_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, ASSEMBLE_STAGE),
+        (REGISTER_STAGE, CAPTURE_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, ASSEMBLE_STAGE),
         settings=("samples", "seed"),
         files=("body", "motion"),
     ),
@@ -87,6 +90,7 @@ def build(
     inputs: BuildInputs,
     config: BuildConfig,
     *,
+    registration: RegisterInputs | None = None,
     first: str = BUILD_STAGES[0],
     last: str = BUILD_STAGES[-1],
     progress: Callable[[str, bool], None] = lambda name, done: None,
@@ -97,6 +101,7 @@ def build(
     code and libraries have not changed is not run again.
 
     Args:
+        registration: what the body is registered to, where the inputs have no parameters.
         progress: called with a stage's name before (False) and after (True) it.
 
     Returns:
@@ -109,25 +114,38 @@ def build(
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
+    assert (inputs.params is None) == (registration is not None), (
+        "a registration gives the parameters that are not given"
+    )
     _check_inputs(inputs)
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)
-        records = _run_stages(BuildContext(run, inputs, config), first, last, progress)
+        records = _run_stages(BuildContext(run, inputs, config), registration, first, last, progress)
         write_metrics(run, inputs, records)
     return records
 
 
 def _run_stages(
-    context: BuildContext, first: str, last: str, progress: Callable[[str, bool], None]
+    context: BuildContext,
+    registration: RegisterInputs | None,
+    first: str,
+    last: str,
+    progress: Callable[[str, bool], None],
 ) -> dict[str, StageRecord]:
     records: dict[str, StageRecord] = {}
     for name in BUILD_STAGES[: BUILD_STAGES.index(last) + 1]:
+        if name not in context.inputs.stages:
+            continue
         if BUILD_STAGES.index(name) < BUILD_STAGES.index(first):
             records[name] = require_stage(context.run, name)
             continue
         progress(name, False)
-        stage, module = _stage(name, context, records), PARTS[name].module
-        records[name] = run_stage(context.run, stage, partial(module.run, build=context))
+        if name == REGISTER_STAGE:
+            assert registration is not None  # the build has checked it
+            records[name] = register_capture(context.run, registration)
+        else:
+            stage, module = _stage(name, context, records), PARTS[name].module
+            records[name] = run_stage(context.run, stage, partial(module.run, build=context))
         progress(name, True)
     return records
 
@@ -138,7 +156,7 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
     digests: dict[str, str] = {}
     for key in part.files:
         digests |= _file_digests(key, getattr(inputs, key))
-    for other in part.needs:
+    for other in (name for name in part.needs if name in records):
         digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
     return Stage(
         name=name,

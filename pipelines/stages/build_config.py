@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import BUILD_FILE
+from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE_STAGES
 from smplxpp.clean import WebConfig
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.labels import LABELS
@@ -24,7 +24,8 @@ class BuildInputs:
     Attributes:
         subject: name used in the report.
         scan: clothed scan of the reference frame.
-        params: body parameters. params_row: the frame's row in a file that stacks several.
+        params: body parameters; None: those that the run's registration gives. params_row: the frame's row in a file
+            that stacks several.
         frame: number of the frame in its capture: what trainings take its photographs by.
         labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them or
             views do.
@@ -32,11 +33,12 @@ class BuildInputs:
         label_set: name of the label set that labels and label maps use, or a JSON mapping file.
         motion: parameters of the capture's own frames, for validation and the report; may be None.
         body: SMPL-X-layout body file, None for the open body.
+        protocol: of the capture, by which these files were found; None: without one.
     """
 
     subject: str
     scan: Path
-    params: Path
+    params: Path | None
     frame: int = 0
     params_row: int = 0
     labels: Path | None = None
@@ -45,6 +47,12 @@ class BuildInputs:
     label_set: str = "4ddress"
     motion: Path | None = None
     body: Path | None = None
+    protocol: str | None = None
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of the build, in order: with a registration where the parameters are to come from one."""
+        return BUILD_STAGES if self.params is None else TEMPLATE_STAGES
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,7 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
         content = json.loads((run / BUILD_FILE).read_text())
         choices = content["config"]
         config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
-        values = content["inputs"]
+        values = {"protocol": None, **content["inputs"]}  # builds from before there were protocols had none
         found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
         found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         for name in ("labels", "cameras", "motion"):

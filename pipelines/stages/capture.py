@@ -7,30 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.runs.arrays import save_arrays
+from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.layout import REGISTERED_PARAMS
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
+from pipelines.stages.scan_files import read_scan
 from smplxpp.body import load_body, load_params
-from smplxpp.clean import check_human_scale, convert_points, sanitize
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh_io import read_raw_mesh
+from smplxpp.core.params import BodyParams
 
 GREY = 180
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
-    raw = read_raw_mesh(build.inputs.scan)
-    vertices = convert_points(raw.vertices, units=build.config.units, up=build.config.up)
-    try:
-        clean = sanitize(vertices, raw.faces)
-    except InputError as error:
-        raise InputError(
-            f"scan {build.inputs.scan.name}: {error.subject}",
-            expected=error.expected,
-            received=error.received,
-            remedy=error.remedy,
-        ) from None
-    check_human_scale(clean.mesh.vertices, subject=f"scan {build.inputs.scan.name}")
+    scan = read_scan(build.inputs.scan, units=build.config.units, up=build.config.up)
+    raw, clean = scan.raw, scan.clean
     colors = np.full((len(raw.vertices), 3), GREY, np.uint8) if raw.vertex_colors is None else raw.vertex_colors
     save_arrays(
         folder / "scan.npz",
@@ -44,7 +36,27 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             }
         },
     )
-    params = load_params(build.inputs.params, body=load_body(build.inputs.body))
-    params.frame(build.inputs.params_row if len(params) > 1 else 0).save(folder / "params.npz")
+    _params_of_frame(build).save(folder / "params.npz")
     numbers = {"vertices": clean.mesh.vertex_count, "faces": clean.mesh.face_count, "repairs": str(clean.report)}
     return StageOutput(numbers=numbers)
+
+
+def _params_of_frame(build: BuildContext) -> BodyParams:
+    """The reference frame's parameters: given ones, or those of the run's registration.
+
+    Raises:
+        InputError: the frame could not be registered.
+    """
+    inputs = build.inputs
+    if inputs.params is not None:
+        params = load_params(inputs.params, body=load_body(inputs.body))
+        return params.frame(inputs.params_row if len(params) > 1 else 0)
+    frames, fitted = load_stacked_params(build.run / REGISTERED_PARAMS)
+    if inputs.frame not in frames:
+        raise InputError(
+            f"reference frame {inputs.frame}",
+            expected="a frame that was registered",
+            received=f"none of the {len(frames)} that were, {frames[0]} to {frames[-1]}",
+            remedy="choose another with --frame, or give its parameters with --params and --register off",
+        )
+    return fitted.frame(frames.index(inputs.frame))

@@ -13,7 +13,7 @@ from pipelines.runs.checks import Check
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
-from smplxpp.body import load_body, load_params
+from pipelines.stages.motion import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.clean import loop_lengths
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
@@ -49,8 +49,8 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     flips = _flips(template, posed, build.run)
     checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
     poses = {"hard poses": stress_poses(reference)}
-    if build.inputs.motion is not None:
-        motion = load_params(build.inputs.motion, body=load_body(build.inputs.body))
+    motion = motion_of_build(build.run, build.inputs)
+    if motion is not None:
         poses["motion"] = motion.select(spread(range(len(motion)), MOTION_FRAMES))
     for title, params in poses.items():
         names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]

@@ -14,13 +14,17 @@ from jaxtyping import Bool, UInt8
 
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
-from pipelines.synth.motion import Performance, tracker_noise
+from pipelines.synth.motion import Performance
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
 from pipelines.synth.person_file import load_person
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
 from pipelines.synth.soft_light import LightConfig, vertex_light
+from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
+from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import LitFrame, RenderedView, hidden_faces, normal_map, render_view
+from smplxpp.body import load_body
+from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
@@ -126,9 +130,32 @@ def make_capture(
                 checks |= _write_scan(root / "scans", person, take, config)
                 progress("scan", 1.0)
             atomic_write_text(root / "manifest.json", json.dumps(_manifest(out, rig, config), indent=1) + "\n")
-            atomic_write_text(root / "checks.json", json.dumps(checks, indent=1) + "\n")
         _write_views(images, _lit_frames(person, take, hidden, config.light), person, rig, config, progress)
+        if config.layout == "simple":
+            checks |= add_tracked_inputs(root, seed=config.seed, progress=progress)
+            atomic_write_text(root / "checks.json", json.dumps(checks, indent=1) + "\n")
     return checks
+
+
+def add_tracked_inputs(root: Path, *, seed: int, progress: Progress = lambda what, share: None) -> dict[str, float]:
+    """Write a tracker's keypoints and a parser's label maps into a synthetic capture, from its own files.
+
+    Args:
+        root: of a capture that `make_capture` wrote in our layout; its manifest gets the protocols.
+        seed: of the errors.
+        progress: as `make_capture`'s.
+
+    Returns:
+        Figures about them.
+    """
+    capture, body = open_capture(root, cache_bytes=0), load_body()
+    params = {frame: found for frame in capture.frames if (found := capture.params(frame)) is not None}
+    write_tracked_keypoints(root, capture, body, params, seed=seed, progress=lambda share: progress("keypoints", share))
+    wrong = write_estimated_labels(root, capture, seed=seed, progress=lambda share: progress("labels", share))
+    path = root / "manifest.json"
+    manifest = json.loads(path.read_text()) | {"protocols": protocols()}
+    atomic_write_text(path, json.dumps(manifest, indent=1) + "\n")
+    return {"labels_estimated_wrong_percent": 100 * wrong}
 
 
 def split_frames(frames: int) -> tuple[int, int]:
@@ -241,11 +268,7 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:
         "seed": config.seed,
         "background": [0, 0, 0],
         "label_set": "capture",
-        "inputs": {
-            "parameters": {"params.npz": "exact", "params_noisy.npz": "tracked"},
-            "labels": "true",
-            "normals": "true",
-        },
+        "inputs": INPUTS,
         **splits,
         "train_views": [item.camera.name for item in rig if not item.novel],
         "novel_views": [item.camera.name for item in rig if item.novel],

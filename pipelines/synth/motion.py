@@ -6,7 +6,7 @@ step than the frames'. It starts from a relaxed A-pose with a neutral face, at r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,6 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 
 # Degrees a joint, axis-angle in the T-pose's world axes (x to the subject's left, y up, z to the front). What a pose
 # does not name stays relaxed.
@@ -227,32 +226,6 @@ def _wander(t: Float[np.ndarray, " T"], rng: np.random.Generator, *, hertz: floa
     frequency = hertz * rng.uniform(0.4, 1.6, size=(4, 3))
     phase = rng.uniform(0, 2 * np.pi, size=(4, 3))
     return np.sin(2 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) / np.sqrt(2.0)
-
-
-def tracker_noise(
-    params: BodyParams,
-    *,
-    seed: int,
-    degrees: float = 1.5,
-    transl: float = 0.008,
-    expression: float = 0.04,
-    betas: float = 0.12,
-) -> BodyParams:
-    """Return parameters as a tracker would give them; standard deviations of each joint's turn about each axis, of each
-    coordinate in metres (half white, half slow), of expression weights, and of one constant offset of betas."""
-    rng = np.random.default_rng(seed)
-    count = len(params)
-    turns = matrix_from_rotvec(rng.normal(0, np.radians(degrees), (count, len(SMPLX_JOINTS), 3)))
-    pose = rotvec_from_matrix(turns @ matrix_from_rotvec(params.full_pose))
-    phase = rng.uniform(0, 2 * np.pi, 3) + 2 * np.pi * np.arange(count)[:, None] / max(count, 2)
-    slow, white = np.sin(phase) * np.sqrt(2), rng.normal(size=(count, 3))
-    tracked = BodyParams.from_full_pose(
-        pose,
-        betas=params.betas + rng.normal(0, betas, params.betas.shape[1]),
-        expression=np.clip(params.expression + rng.normal(0, expression, params.expression.shape), 0, 1),
-        transl=params.transl + transl * np.sqrt(0.5) * (slow + white),
-    )
-    return replace(tracked, fps=params.fps, flat_hand_mean=params.flat_hand_mean)
 
 
 def _pose(degrees: _Angles, fingers: tuple[float, float]) -> Float[np.ndarray, "55 3"]:

@@ -3,7 +3,8 @@
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
 from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
-from smplxpp.assemble.penetration import PushConfig, push_out, turned_faces
+from smplxpp.assemble.left_inside import LeftInside
+from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
 
 __all__ = [
     "LAYER_ORDER",
@@ -11,6 +12,7 @@ __all__ = [
     "AssemblyReport",
     "CanonicalPart",
     "LayerReport",
+    "LeftInside",
     "Obstacle",
     "Penetration",
     "PushConfig",
@@ -18,5 +20,6 @@ __all__ = [
     "body_colors_from_scan",
     "measure_penetration",
     "push_out",
+    "stand_off",
     "turned_faces",
 ]

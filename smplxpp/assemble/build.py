@@ -12,7 +12,8 @@ from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
 from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
-from smplxpp.assemble.penetration import PushConfig, push_out, turned_faces
+from smplxpp.assemble.left_inside import LeftInside, find_left_inside, joints_near
+from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import SKIN
@@ -66,6 +67,9 @@ class LayerReport:
         before, after: penetration into each inner layer.
         moved: vertices moved at all. max_push, mean_push: metres, the mean over those moved.
         turned_faces: faces turned over by the repair.
+        max_push_near: the joint that the longest push is nearest to; empty where nothing moved.
+        push_limit: metres that no vertex was pushed beyond: the part's stand-off and the clearance.
+        left: what would have needed more.
     """
 
     before: tuple[Penetration, ...]
@@ -74,6 +78,9 @@ class LayerReport:
     max_push: float
     mean_push: float
     turned_faces: int
+    max_push_near: str
+    push_limit: float
+    left: LeftInside
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,22 @@ class AssemblyReport:
         """The longest way a vertex was pushed, metres."""
         return max((part.max_push for part in self.parts.values()), default=0.0)
 
+    @property
+    def max_push_where(self) -> str:
+        """The part that was pushed the longest way, and near which joint; empty where nothing moved."""
+        name, part = max(self.parts.items(), key=lambda item: item[1].max_push, default=("", None))
+        return f"{name}, near {part.max_push_near.replace('_', ' ')}" if part and part.max_push_near else ""
+
+    @property
+    def left_depth(self) -> float:
+        """How deep inside an inner layer the repair has left a vertex, metres; 0 for none."""
+        return max((part.left.depth for part in self.parts.values()), default=0.0)
+
+    @property
+    def left_where(self) -> str:
+        """What was left, part by part, in words; empty for nothing."""
+        return "; ".join(f"{name}: {part.left.words}" for name, part in self.parts.items() if part.left.vertices)
+
     def as_dict(self) -> dict:
         """Plain numbers, for JSON; lengths in metres."""
         totals = ("penetrating_before", "penetrating_after", "max_push")
@@ -114,7 +137,8 @@ def assemble_template(
 
     Parts are taken from the skin outwards (`config.layer_order`); each is pushed out of the body and of every part
     further in, as that one lies after its own repair. Vertices that already keep the clearance stay where they are,
-    but for those around a push.
+    but for those around a push. No part is pushed farther than it stands off the body (`stand_off`): where that is not
+    enough the body does not fit the scan, and the report says where.
 
     Args:
         body: the model; its betas are baked in, its bases stay.
@@ -140,7 +164,7 @@ def assemble_template(
     # Without the mean hand: its pose correctives are none of the T-pose's.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
     body_mesh = body.mesh(rest)
-    meshes, report = _separate(body_mesh, parts, config)
+    meshes, report = _separate(body, body_mesh, parts, config)
     template = _template(body, params.betas[0], [body_mesh, *(meshes[name] for name in parts)], parts, config)
     return template, report
 
@@ -162,7 +186,7 @@ def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: Assembl
 
 
 def _separate(
-    body_mesh: TriangleMesh, parts: Mapping[str, CanonicalPart], config: AssemblyConfig
+    body: BodyModel, body_mesh: TriangleMesh, parts: Mapping[str, CanonicalPart], config: AssemblyConfig
 ) -> tuple[dict[str, TriangleMesh], AssemblyReport]:
     push = replace(config.push, clearance=config.clearance)
     obstacles = [Obstacle(BODY_PART, body_mesh, solid=True, max_depth=push.max_depth)]
@@ -172,16 +196,18 @@ def _separate(
         layer = [name for name, part in parts.items() if part.label == label]
         for name in layer:
             mesh = parts[name].mesh
-            meshes[name], reports[name] = _separate_part(name, mesh, obstacles, push)
+            meshes[name], reports[name] = _separate_part(mesh, obstacles, push, (body, body_mesh))
+            _warn_of_rest(name, reports[name])
         obstacles += [Obstacle(name, meshes[name], solid=False, max_depth=push.max_depth) for name in layer]
     return meshes, AssemblyReport(reports)
 
 
 def _separate_part(
-    name: str, mesh: TriangleMesh, obstacles: list[Obstacle], push: PushConfig
+    mesh: TriangleMesh, obstacles: list[Obstacle], push: PushConfig, shaped: tuple[BodyModel, TriangleMesh]
 ) -> tuple[TriangleMesh, LayerReport]:
     before = tuple(measure_penetration(mesh, obstacle) for obstacle in obstacles)
-    moved = mesh.with_vertices(push_out(mesh, obstacles, push))
+    limit = stand_off(mesh, obstacles[0], push) + push.clearance
+    moved = mesh.with_vertices(push_out(mesh, obstacles, push, limit=limit))
     after = tuple(measure_penetration(moved, obstacle) for obstacle in obstacles)
     way = np.linalg.norm(moved.vertices - mesh.vertices, axis=1)
     # A smoothed displacement never ends: less than a micrometre is none.
@@ -193,16 +219,22 @@ def _separate_part(
         max_push=float(way.max(initial=0.0)),
         mean_push=float(edited.mean()) if len(edited) else 0.0,
         turned_faces=int(turned_faces(mesh, moved.vertices).sum()),
+        max_push_near=next(iter(joints_near(moved.vertices[[way.argmax()]], *shaped))) if len(edited) else "",
+        push_limit=limit,
+        left=find_left_inside(moved, obstacles, *shaped),
     )
-    left = sum(p.vertices for p in after)
-    if left or report.turned_faces:
+    return moved, report
+
+
+def _warn_of_rest(name: str, report: LayerReport) -> None:
+    if report.left.vertices or report.turned_faces:
+        where = f" ({report.left.words})" if report.left.vertices else ""
         warnings.warn(
-            f"part {name!r}: {left} vertices stay inside an inner layer, {report.turned_faces} faces turned over; "
-            "the fit or the skin weights are far off there",
+            f"part {name!r}: {report.left.vertices} vertices stay inside an inner layer{where}, {report.turned_faces} "
+            "faces turned over; the fit or the skin weights are far off there",
             GeometryWarning,
             stacklevel=4,
         )
-    return moved, report
 
 
 def _template(

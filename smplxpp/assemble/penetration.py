@@ -24,18 +24,21 @@ class PushConfig:
             gentler the bulge.
         iterations: smoothing steps.
         max_depth: see `Obstacle`.
+        reach: metres, the least and the most that a part's stand-off may let it be pushed.
     """
 
     clearance: float = 1e-3
     damping: float = 0.25
     iterations: int = 20
     max_depth: float = 0.015
+    reach: tuple[float, float] = (0.010, 0.030)
 
     def __post_init__(self) -> None:
         require_at_least("push configuration: max_depth in metres", self.max_depth, 1e-4)
         require_between("push configuration: clearance in metres", self.clearance, 1e-4, self.max_depth)
         require_between("push configuration: damping", self.damping, 0.0, 1.0)
         require_at_least("push configuration: iterations", self.iterations, 0)
+        require_between("push configuration: least reach in metres", self.reach[0], self.clearance, self.reach[1])
 
 
 # Projections alone, after the smoothing, until nothing is left inside.
@@ -46,12 +49,14 @@ _UNFLIP_ROUNDS, _UNFLIP_STEPS = 8, 4
 _FACING_COSINE = -0.2
 # Centres of faces keep this share of the clearance: a chord runs below its arc.
 _CENTER_SHARE = 0.5
+# Of the distances of a part's vertices to the body: what it stands off.
+STAND_OFF_PERCENTILE = 95.0
 # Metres nearer than the clearance that need no push.
 _TOLERANCE = 1e-5
 
 
 def push_out(
-    mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None
+    mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig | None = None, *, limit: float = np.inf
 ) -> Float64[np.ndarray, "N 3"]:
     """New vertex positions of an outer layer, out of all obstacles.
 
@@ -64,6 +69,8 @@ def push_out(
         mesh: N vertices, metres.
         obstacles: the inner layers.
         config: clearance and smoothness.
+        limit: metres that no vertex is moved beyond (see `stand_off`). One that would need more goes as far and stays
+            inside, so that the surface has no cliff between it and its neighbours.
 
     Returns:
         (N, 3) float64; the input where nothing is too near.
@@ -71,14 +78,27 @@ def push_out(
     config = config or PushConfig()
     walls = [_Wall(obstacle, mesh, config.clearance) for obstacle in obstacles]
     mean = _neighbour_mean(mesh)
-    d = _project(mesh, np.zeros_like(mesh.vertices), walls)
+    d = _project(mesh, np.zeros_like(mesh.vertices), walls, limit)
     for _ in range(config.iterations):
-        d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls)
-    d = _clear(mesh, d, walls)
-    return mesh.vertices + _turn_back(mesh, d, walls, mean)
+        d = _project(mesh, (1.0 - config.damping) * (mean @ d), walls, limit)
+    d = _clear(mesh, d, walls, limit)
+    return mesh.vertices + _turn_back(mesh, d, walls, mean, limit)
 
 
-def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_matrix) -> np.ndarray:
+def stand_off(mesh: TriangleMesh, body: Obstacle, config: PushConfig | None = None) -> float:
+    """How far a part stands off the body, metres: what a push of it may be, and not more.
+
+    A vertex inside the body is off by what a fit is off there. A garment that hangs 15 mm off the body came to be
+    inside it through an error of some 15 mm; where a repair would need three times that, the body is not where the scan
+    shows it, and a push would shape the garment after a wrong body. The 95th percentile of the vertices' signed
+    distances, within `config.reach`.
+    """
+    low, high = (config or PushConfig()).reach
+    distance = body.distance(mesh.vertices, mesh.vertex_normals)[0]
+    return float(np.clip(np.percentile(np.minimum(distance, high), STAND_OFF_PERCENTILE), low, high))
+
+
+def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_matrix, limit: float) -> np.ndarray:
     """Share the displacement in a growing neighbourhood of faces that turned over; the best of all rounds."""
     near = np.zeros(mesh.vertex_count, dtype=bool)
     turned = turned_faces(mesh, mesh.vertices + d)
@@ -90,10 +110,31 @@ def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_
         near |= (mean @ near) > 0
         for _ in range(_UNFLIP_STEPS):
             d = np.where(near[:, None], mean @ d, d)
-        d = _clear(mesh, d, walls)
+        d = _clear(mesh, d, walls, limit)
         turned = turned_faces(mesh, mesh.vertices + d)
         if turned.sum() < fewest:
             best, fewest = d, int(turned.sum())
+    return _carry_whole(mesh, best, walls, limit) if fewest else best
+
+
+def _carry_whole(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit: float) -> np.ndarray:
+    """Carry faces that are still turned over as a whole, by the longest way of their corners; the best of all rounds.
+
+    A sliver turns when one of its corners goes further than it is high, however gently the others follow.
+    """
+    turned = turned_faces(mesh, mesh.vertices + d)
+    best, fewest = d, int(turned.sum())
+    for _ in range(_UNFLIP_ROUNDS):
+        corners = mesh.faces[turned]
+        longest = np.linalg.norm(d[corners], axis=-1).argmax(axis=1)
+        d = d.copy()
+        d[corners] = d[corners[np.arange(len(corners)), longest]][:, None]
+        d = _clear(mesh, d, walls, limit)
+        turned = turned_faces(mesh, mesh.vertices + d)
+        if turned.sum() < fewest:
+            best, fewest = d, int(turned.sum())
+        if not fewest:
+            break
     return best
 
 
@@ -135,9 +176,9 @@ class _Wall:
 
 
 def _project(
-    mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], *, facing: TriangleMesh | None = None
+    mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit: float, *, facing: TriangleMesh | None = None
 ) -> np.ndarray:
-    """One round of pushes; without `facing` only those that do not lead to the far side of a limb."""
+    """One round of pushes up to `limit`; without `facing` only those that do not lead to the far side of a limb."""
     d = d.copy()
     for wall in walls:
         vertices, push = wall.vertex_push(d, facing)
@@ -148,13 +189,16 @@ def _project(
         for axis in range(3):
             total = np.bincount(corners, np.repeat(push[:, axis], 3), minlength=len(d))
             d[:, axis] += total / np.maximum(count, 1)
+    way = np.sqrt(np.einsum("ij,ij->i", d, d))
+    far = way > limit
+    d[far] *= (limit / way[far])[:, None]
     return d
 
 
-def _clear(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall]) -> np.ndarray:
+def _clear(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit: float) -> np.ndarray:
     for _ in range(_FINAL_PROJECTIONS):
         # The normals decide what counts as behind a garment: take those of the surface as it lies now.
-        moved = _project(mesh, d, walls, facing=mesh.with_vertices(mesh.vertices + d))
+        moved = _project(mesh, d, walls, limit, facing=mesh.with_vertices(mesh.vertices + d))
         if np.array_equal(moved, d):
             break
         d = moved

@@ -26,12 +26,20 @@ _OPTIONAL = (
     "vertex_labels",
     "vertex_label_names",
     "expr_names",
+    "coco_regressor",
+    "coco_names",
+    "lmk_faces_idx",
+    "lmk_bary_coords",
 )
 # SMPL-X's own files: from this many directions on, the first 300 are shape and the rest expression; shorter ones
 # hold 10 and 10.
 _LONG_BASIS, _LONG_SHAPE, _SHORT_SHAPE, _SHORT_EXPRESSION = 400, 300, 10, 10
 # Weights come as float16 or float32: rows within this of 1 are rounding, beyond it another file.
 _WEIGHT_SUM_TOLERANCE = 1e-3
+# COCO's points near joints of the body are not these joints.
+_COCO, _COCO_JOINTS = "coco_", ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+# dlib's 68 points without the contour.
+_FACE_LANDMARKS, _FIRST_FACE_LANDMARK = 51, 17
 
 
 def load_body(
@@ -93,11 +101,12 @@ class _Builder:
         names = self._names("joint_names", joint_count) or JOINT_NAMES[joint_count]
         weights = self._normalised(weights)
         labels, label_names = self._part_labels(weights, names)
+        faces = self._faces(vertex_count)
         kept_expressions = self._first(exprdirs, num_expressions, "expressions")
         model = BodyModel(
             name=self.path.stem,
             v_template=self._array("v_template", (vertex_count, 3)),
-            faces=self._faces(vertex_count),
+            faces=faces,
             shapedirs=self._first(shapedirs, num_betas, "betas"),
             exprdirs=kept_expressions,
             posedirs=self._posedirs(vertex_count, joint_count),
@@ -111,9 +120,10 @@ class _Builder:
             right_hand_mean=self._optional("hands_meanr", (HAND_WIDTH,)),
             part_labels=labels,
             part_label_names=label_names,
+            landmarks=self._landmarks(faces, vertex_count),
             expression_names=(self._names("expr_names", exprdirs.shape[2]) or ())[: kept_expressions.shape[2]],
         )
-        for value in vars(model).values():
+        for value in (*vars(model).values(), *(array for pair in model.landmarks.values() for array in pair)):
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
         return model
@@ -185,6 +195,23 @@ class _Builder:
         if not (parents[0] == -1 and (parents[1:] >= 0).all() and (parents[1:] < np.arange(1, joint_count)).all()):
             raise self._error("kintree_table", "one root first, every parent before its children", str(parents))
         return parents
+
+    def _landmarks(self, faces: np.ndarray, vertex_count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """What the file says of detectors' points: COCO's (the open body), dlib's from 17 on (it and SMPL-X)."""
+        found = {}
+        if "coco_regressor" in self.raw and "coco_names" in self.raw:
+            regressor = self._array("coco_regressor", (None, vertex_count))
+            for name, row in zip(self._names("coco_names", len(regressor)) or (), regressor, strict=True):
+                used = np.flatnonzero(row)
+                prefix = _COCO if name.partition("_")[2] in _COCO_JOINTS else ""
+                found[prefix + name] = (used, row[used] / row.sum())
+        if "lmk_faces_idx" in self.raw and "lmk_bary_coords" in self.raw:
+            corners = self._array("lmk_faces_idx", (None,)).astype(np.int64)
+            weights = self._array("lmk_bary_coords", (len(corners), 3))
+            if len(corners) == _FACE_LANDMARKS and corners.min() >= 0 and corners.max() < len(faces):
+                for k, (corner, weight) in enumerate(zip(corners, weights, strict=True)):
+                    found[f"face_{_FIRST_FACE_LANDMARK + k}"] = (faces[corner], weight / weight.sum())
+        return found
 
     def _normalised(self, weights: np.ndarray) -> np.ndarray:
         """Rows that sum to 1 in float64, so that a translation within the transforms is exact."""

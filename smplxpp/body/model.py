@@ -73,6 +73,8 @@ class BodyModel:
         part_labels: indices into `part_label_names`: the file's own labels, else the joint of most weight.
         part_label_names: names of the parts.
         expression_names: E names; numbered where the file gives none.
+        landmarks: points that detectors mark, by the names of `Keypoints2D`, as weighted means of vertices: indices and
+            weights that sum to 1. Those that the file has: COCO's of the open body, faces of SMPL-X; else none.
     """
 
     name: str
@@ -92,6 +94,7 @@ class BodyModel:
     part_labels: Int64[np.ndarray, " V"]
     part_label_names: tuple[str, ...]
     expression_names: tuple[str, ...] = ()
+    landmarks: Mapping[str, tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]] = field(default_factory=dict)
     # Tensors of the arrays above, by (name, dtype, device).
     _tensors: dict = field(default_factory=dict, init=False, repr=False)
 
@@ -131,6 +134,9 @@ class BodyModel:
         labels, names = self.part_labels, len(self.part_label_names)
         if labels.size and (labels.min() < 0 or labels.max() >= names):
             raise self._unfit("part_labels", f"indices in [0, {names})", "others")
+        for name, (index, _) in self.landmarks.items():
+            if index.size and (index.min() < 0 or index.max() >= V):
+                raise self._unfit(f"landmark {name}", f"vertices in [0, {V})", "others")
 
     def _unfit(self, name: str, expected: str, received: str) -> InputError:
         return InputError(f"body model {self.name!r}: {name}", expected=expected, received=received)

@@ -5,7 +5,7 @@ from smplxpp.capture.capture import Capture
 from smplxpp.capture.matting import MattingConfig, MattingModel, write_mattes
 from smplxpp.capture.problems import find_problems
 from smplxpp.capture.recording import Problem
-from smplxpp.capture.reference import ReferenceFrame, find_reference
+from smplxpp.capture.reference import ReferenceFrame, find_reference, find_scans
 from smplxpp.capture.registry import FORMATS, detect_format, open_capture
 from smplxpp.capture.splits import Splits
 
@@ -20,6 +20,7 @@ __all__ = [
     "detect_format",
     "find_problems",
     "find_reference",
+    "find_scans",
     "open_capture",
     "read_cameras",
     "write_mattes",

@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from smplxpp.capture.cache import ArrayCache
+from smplxpp.capture.keypoints import shown_keypoints
 from smplxpp.capture.recording import KINDS, Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_choice
@@ -57,6 +59,11 @@ class Capture:
     def format(self) -> str:
         """Name of the layout that it was read as."""
         return self.recording.format
+
+    @property
+    def protocol(self) -> str | None:
+        """Name of the protocol whose files are read, None without one."""
+        return self.recording.protocol
 
     @property
     def label_set(self) -> str:
@@ -218,6 +225,25 @@ class Capture:
         if source is None or (None, frame) in self.excluded or frame not in source.frames():
             return None
         return source.read(frame)
+
+    def keypoints(self, camera: str) -> Keypoints2D | None:
+        """What a detector saw in the images of a camera, in the pixels of `cameras[camera]`; None: nothing.
+
+        Points follow the images: undistorted, resized, cropped (those outside the window stay, with coordinates outside
+        of it), without the frames that are left out. Read anew at each call.
+
+        Raises:
+            InputError: no such camera, a damaged file.
+        """
+        full, source = self._full_camera(camera), self.recording.keypoints
+        found = None if source is None else source.read(camera)
+        if found is None:
+            return None
+        dropped = {frame for name, frame in self.excluded if name in (camera, None)}
+        kept = [frame for frame in found.frames.tolist() if frame not in dropped]
+        if len(kept) < len(found.frames):
+            found = found.select(found.names, kept)
+        return shown_keypoints(found, full, self.windows[camera], self.recording.distortions.get(camera))
 
     def truth_mesh(self, frame: int) -> TriangleMesh | None:
         """The true surface of a frame as the images show it, where the set has one; else None."""

@@ -12,6 +12,8 @@ from jaxtyping import Float, Float64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.native import native_library
 
+_NEWTON_STEPS = 12
+
 
 @dataclass(frozen=True)
 class Distortion:
@@ -59,6 +61,24 @@ class Distortion:
         return np.stack(
             [x * q + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * q + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=1
         )
+
+    def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Where the pinhole would have put points that the lens has put at `xy`: the inverse of `distort`, by Newton.
+
+        Far outside of the picture, where a lens's polynomial folds back, there is no inverse and the result means
+        nothing.
+        """
+        target = np.asarray(xy, dtype=np.float64)
+        found, step = target.copy(), 1e-6
+        for _ in range(_NEWTON_STEPS):
+            value = self.distort(found)
+            columns = [(self.distort(found + shift) - value) / step for shift in step * np.eye(2)]
+            (a, c), (b, d) = (column.T for column in columns)
+            determinant = a * d - b * c
+            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            u, v = (target - value).T
+            found = found + np.stack([d * u - b * v, a * v - c * u], axis=1) / determinant[:, None]
+        return found
 
 
 def undistort(

@@ -17,10 +17,10 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
     """Everything that would stop a view or a frame from being used, each with its file.
 
     Missing: cameras without images, frames that not every camera has, images without a mask where others have one,
-    frames without parameters. Unusable: parameters that cannot be read or hold NaN; with `decode` (which reads
-    every file) damaged images, masks, label and normal maps, ones of another size than the calibration's, and images
-    that are not on the declared background. `capture.without(problems)` leaves out what is named, and
-    then has no problems but those of the whole capture.
+    frames without parameters. Unusable: parameters and keypoints that cannot be read or hold NaN; with `decode` (which
+    reads every file) damaged images, masks, label and normal maps, ones of another size than the calibration's, and
+    images that are not on the declared background. `capture.without(problems)` leaves out what is named, and then has
+    no problems but those of the whole capture.
 
     Args:
         capture: as opened; its own `problems` come first.
@@ -29,7 +29,7 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
     found = list(capture.problems)
     told = {(problem.camera, problem.frame) for problem in found}
     found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in told]
-    found += [*_missing_masks(capture), *_parameters(capture)]
+    found += [*_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
     if decode:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):
@@ -39,8 +39,10 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
 
 def _missing_images(capture: Capture) -> Iterator[Problem]:
     names, table = list(capture.cameras), capture.presence()
+    source = capture.recording.keypoints
+    tracked = () if source is None or table.any() else source.cameras()  # cameras for keypoints alone
     for name, has in zip(names, table, strict=True):
-        if len(capture.frames) and not has.any():
+        if len(capture.frames) and not has.any() and name not in tracked:
             yield Problem(f"camera {name}: calibrated, but without any image", name)
     used = table.any(axis=1)
     for column, frame in enumerate(capture.frames):
@@ -82,6 +84,15 @@ def _parameters(capture: Capture) -> Iterator[Problem]:
             source.read(frame)
         except InputError as error:
             yield Problem(str(error), None, frame)
+
+
+def _keypoints(capture: Capture) -> Iterator[Problem]:
+    """Files of keypoints that cannot be read; their cameras' images are good."""
+    for name in capture.cameras:
+        try:
+            capture.keypoints(name)
+        except InputError as error:
+            yield Problem(str(error))
 
 
 def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:

@@ -14,6 +14,7 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
+from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 
@@ -51,6 +52,16 @@ class MeshSource(Protocol):
         """The frame's mesh, None where there is none."""
 
 
+class KeypointSource(Protocol):
+    """Keypoints by camera."""
+
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that have keypoints."""
+
+    def read(self, camera: str) -> Keypoints2D | None:
+        """Read a camera's keypoints, in pixels of the images on disk; None where there are none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A data set's folder, found by its reader.
@@ -65,9 +76,11 @@ class Recording:
         background: (3,) sRGB in [0, 1] that the images are already composited on; None: photographs.
         splits: as the set states them, or None.
         label_set: numbers of the label maps, a name known to `smplxpp.segment.map_labels`.
-        params, meshes: or None.
+        params, meshes, keypoints: or None.
         fps: frames a second, or None where the set does not say.
         problems: what the reader had to leave out.
+        protocol: name of the protocol whose files these are, None without one. protocols: names of those that the
+            capture has.
     """
 
     name: str
@@ -81,8 +94,11 @@ class Recording:
     label_set: str = "capture"
     params: ParamSource | None = None
     meshes: MeshSource | None = None
+    keypoints: KeypointSource | None = None
     fps: float | None = None
     problems: tuple[Problem, ...] = field(default=())
+    protocol: str | None = None
+    protocols: tuple[str, ...] = ()
 
     def series(self, kind: str, camera: str) -> FileSeries | None:
         """The files of a kind for a camera."""

@@ -7,6 +7,8 @@ from pathlib import Path
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
+from smplxpp.capture.keypoint_files import KeypointOptions
+from smplxpp.capture.keypoints import with_keypoints
 from smplxpp.capture.masks import with_masks
 from smplxpp.capture.readers import (
     actorshq,
@@ -36,8 +38,11 @@ def open_capture(
     format: str | None = None,
     masks: str | Path | None = None,
     params: str | Path | None = None,
+    keypoints: str | Path | None = None,
+    person: int | None = None,
     body: BodyModel | None = None,
     hold_out_every: int | None = None,
+    protocol: str | None = None,
     cache_bytes: int = 1 << 30,
 ) -> Capture:
     """Open a capture of any known layout; nothing but calibration and lists of files is read.
@@ -47,12 +52,18 @@ def open_capture(
         format: name of the layout; None: told by the files that are there.
         masks: a folder of mattes to take instead of the capture's own masks, matched to the images by their names.
         params: body parameters to take instead of the capture's own (a tracker's, say).
+        keypoints: a folder of keypoints of any tool to take instead of the capture's own: a file or a folder for each
+            camera, in a layout of docs/captures.md.
+        person: whose keypoints, where there are several people; None: in each frame the surest.
         body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
         hold_out_every: hold out every n-th training camera as a novel view.
+        protocol: name of the protocol whose files are read, of those that the capture has; `params` goes before its
+            parameters.
         cache_bytes: bound of the decoded images kept, in each process that reads.
 
     Raises:
-        InputError: no such folder, no layout that fits or several, or what the reader refuses.
+        InputError: no such folder, no layout that fits or several, a protocol that the capture has not or whose files
+            are missing, or what the reader refuses.
     """
     # Absolute: a loader's worker may have another working directory.
     root = Path(path).absolute()
@@ -61,10 +72,21 @@ def open_capture(
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
     reader = READERS[format or detect_format(root)]
-    options = ReaderOptions(params=None if params is None else Path(params), body=body)
+    options = ReaderOptions(
+        params=None if params is None else Path(params), protocol=protocol, body=body, person=person
+    )
     recording = reader.read(root, options)
+    if recording.protocol != protocol:
+        raise InputError(
+            f"protocol {protocol} of capture {root.name}",
+            expected=f"a capture of our own layout ({simple.NAME}), which can have protocols",
+            received=f"one of the layout {recording.format}",
+            remedy="name its parameters with --params, or convert it with `smplxpp capture convert`",
+        )
     if masks is not None:
         recording = with_masks(recording, Path(masks))
+    if keypoints is not None:
+        recording = with_keypoints(recording, Path(keypoints), KeypointOptions(person=person))
     splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
     if hold_out_every is not None:
         splits = splits.hold_out_cameras(hold_out_every)

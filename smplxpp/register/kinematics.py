@@ -5,9 +5,9 @@ hangs on it about the posed joint p_j:
 
     dx_i = sum_{k in descendants(j)} w_ik (P_j d) x (G_k x_i - p_j) = -[A_ij - W_ij p_j]_x P_j d
 
-with P_j the parent's posed rotation, `A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j, itself
-among them. Shape moves the rest points and the joints; the change of pose correctives with the pose is left out of the
-derivative (they are millimetres), not of the points.
+with P_j the parent's posed rotation, `A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j,
+itself among them. Shape moves the rest points and the joints; the change of pose correctives with the pose is left out
+of the derivative (they are millimetres), not of the points.
 """
 
 from __future__ import annotations
@@ -43,9 +43,7 @@ class BodyState:
 
     def select(self, rows: slice | Integer[np.ndarray, " n"]) -> BodyState:
         """Some of the frames."""
-        return replace(
-            self, rotations=self.rotations[rows], transl=self.transl[rows], expression=self.expression[rows]
-        )
+        return replace(self, rotations=self.rotations[rows], transl=self.transl[rows], expression=self.expression[rows])
 
     @staticmethod
     def of_params(body: BodyModel, params: BodyParams) -> BodyState:
@@ -125,10 +123,10 @@ class BodyPoints:
         width = have[0].shape[2] if have else 0
         dirs = [np.zeros((len(p), 3, width)) if p.pose_dirs is None else p.pose_dirs for p in parts]
         return BodyPoints(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("rest", "shape_dirs", "expression_dirs", "weights")
-            ),
+            np.concatenate([part.rest for part in parts]),
+            np.concatenate([part.shape_dirs for part in parts]),
+            np.concatenate([part.expression_dirs for part in parts]),
+            np.concatenate([part.weights for part in parts]),
             np.concatenate(dirs) if have else None,
         )
 
@@ -213,9 +211,7 @@ class Kinematics:
     def posture(self, state: BodyState, row: int) -> Posture:
         """Pose the skeleton of one frame."""
         rest = self.rest_joints + self.joint_dirs @ state.betas
-        transforms, joints = forward_kinematics(
-            rest, self.parents, state.rotations[row], transl=state.transl[row]
-        )
+        transforms, joints = forward_kinematics(rest, self.parents, state.rotations[row], transl=state.transl[row])
         turned = transforms[:, :3, :3]
         parent = np.where((self.parents < 0)[:, None, None], np.eye(3), turned[np.maximum(self.parents, 0)])
         feature = (state.rotations[row, 1:] - np.eye(3)).ravel()
@@ -238,15 +234,19 @@ class Kinematics:
         hanging = self.hangs_on.astype(np.float64)
         arm = np.einsum("nkx,kj->njx", moved, hanging, optimize=True)
         arm -= (points.weights @ hanging)[..., None] * posture.joints
-        # -[a]_x P, column by column: P_c x a, with a sign.
-        axes = posture.parent_turned.transpose(0, 2, 1)  # (J, axis, 3)
-        pose = np.cross(axes[None], arm[:, :, None, :])  # (N, J, axis, 3)
+        # -[a]_x P, column by column: P_c x a.
+        px, py, pz = posture.parent_turned.transpose(1, 0, 2)[:, None]  # each (1, J, axis)
+        ax, ay, az = (arm[..., k, None] for k in range(3))
+        pose = np.empty((len(arm), 3, count, 3))
+        np.subtract(py * az, pz * ay, out=pose[:, 0])
+        np.subtract(pz * ax, px * az, out=pose[:, 1])
+        np.subtract(px * ay, py * ax, out=pose[:, 2])
         blended = (points.weights @ posture.turned.reshape(count, 9)).reshape(-1, 3, 3)
         shape = blended @ points.shape_dirs
         shape += np.einsum("nk,kxb->nxb", points.weights, self._joint_shape(posture), optimize=True)
         return PointsMotion(
             points=moved.sum(axis=1),
-            pose=np.ascontiguousarray(pose.transpose(0, 3, 1, 2)),
+            pose=pose,
             shape=shape,
             expression=blended @ points.expression_dirs,
         )

@@ -42,7 +42,8 @@ class Observations:
             in the cameras' pixels; None: nothing of the kind.
         scans: by frame.
         initial: a fit to start from, a row a frame.
-        shape_frames: the frames that the shape is solved on; None: all. Held-out frames are not among them.
+        shape_frames: those that the shape, and whatever else all frames share, is solved on; None: all. Frames held out
+            are none of them: they get their poses alone.
         fps: frames a second, None where not known.
     """
 

@@ -106,6 +106,7 @@ def completed_body(
         left_hand_mean=_optional(body.left_hand_mean),
         right_hand_mean=_optional(body.right_hand_mean),
         part_labels=read_only(body.part_labels, np.int64),
+        landmarks={},
     )
 
 

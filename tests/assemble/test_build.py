@@ -10,7 +10,7 @@ import pytest
 
 from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -58,6 +58,24 @@ def test_a_part_within_the_body_comes_out(body):
     assert report.as_dict()["parts"]["tunic"]["after"][0]["vertices"] == 0
     assert report.parts["tunic"].turned_faces == 0
     assert np.array_equal(template.vertices[: body.vertex_count], body.forward(params()).rest_vertices[0])
+
+
+def test_a_body_that_does_not_fit_is_named_and_not_pushed_through(body):
+    """A tracker's body was 60 mm off: the repair pushed the garment through it, and nobody was told where."""
+    parts = worn_parts(body)
+    tunic = parts["tunic"].mesh
+    parts["tunic"] = replace(parts["tunic"], mesh=tunic.with_vertices(tunic.vertices + [0.0, 0.0, 0.06]))
+    with pytest.warns(GeometryWarning, match=r"'tunic': \d+ vertices stay inside.*mm deep, near "):
+        _, report = assemble_template(body, params(), parts)
+    tunic = report.parts["tunic"]
+    assert 0.010 <= tunic.push_limit <= 0.031 and tunic.max_push == pytest.approx(tunic.push_limit, rel=1e-6)
+    assert tunic.left.vertices == tunic.after[0].vertices > 50
+    assert tunic.left.depth == tunic.after[0].depth_max > 0.005
+    assert sum(tunic.left.where.values()) == tunic.left.vertices
+    assert set(tunic.left.where) <= {"pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip", "neck"}
+    assert report.left_where.startswith("tunic: ") and "cap" not in report.left_where
+    assert report.max_push_where.startswith("tunic, near ")
+    assert report.parts["cap"].left.vertices == 0 and report.parts["cap"].left.where == {}
 
 
 def test_the_mean_hand_leaves_no_correctives_in_the_t_pose(body):

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from smplxpp.assemble import Obstacle, PushConfig, measure_penetration, push_out, turned_faces
+from smplxpp.assemble import Obstacle, PushConfig, measure_penetration, push_out, stand_off, turned_faces
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
@@ -88,7 +88,10 @@ def test_garments_are_open_surfaces():
     assert measure_penetration(moved, inner).vertices == 0
 
 
-@pytest.mark.parametrize("change", [{"clearance": 0.0}, {"damping": 1.5}, {"iterations": -1}, {"max_depth": 0.0}])
+@pytest.mark.parametrize(
+    "change",
+    [{"clearance": 0.0}, {"damping": 1.5}, {"iterations": -1}, {"max_depth": 0.0}, {"reach": (0.03, 0.01)}],
+)
 def test_bad_configuration(change):
     with pytest.raises(InputError, match="push configuration"):
         PushConfig(**change)
@@ -102,3 +105,32 @@ def test_a_shared_seam_stays_closed():
     obstacle = Obstacle("trousers", inner, solid=False, max_depth=0.03)
     assert measure_penetration(outer, obstacle).vertices == 0
     assert np.abs(push_out(outer, [obstacle]) - outer.vertices).max() < 1e-9
+
+
+def test_nothing_is_pushed_beyond_the_limit_and_the_surface_stays_smooth():
+    inner, outer = ball(0.1), dented(depth=0.035)
+    far = push_out(outer, [solid(inner)]) - outer.vertices
+    assert np.linalg.norm(far, axis=1).max() > 0.028
+    moved = outer.with_vertices(push_out(outer, [solid(inner)], limit=0.012))
+    way = np.linalg.norm(moved.vertices - outer.vertices, axis=1)
+    assert way.max() == pytest.approx(0.012, rel=1e-9)
+    left = measure_penetration(moved, solid(inner))
+    # What needs 31 mm is 19 mm short, but for the clearance; what needs less than the limit is out.
+    assert left.depth_max == pytest.approx(0.030 - 0.012, abs=5e-4)
+    start = np.linalg.norm(outer.vertices, axis=1)
+    assert np.linalg.norm(moved.vertices, axis=1)[start > 0.1 - 0.010].min() > 0.1
+    # No cliff where the limit begins to hold, and nothing turns over.
+    steps = [np.abs(np.diff(lengths[moved.edges], axis=1)).max() for lengths in (way, np.linalg.norm(far, axis=1))]
+    assert steps[0] <= steps[1]
+    assert not turned_faces(outer, moved.vertices).any()
+
+
+def test_a_limit_that_nothing_reaches_changes_no_bit():
+    inner, outer = ball(0.1), dented()
+    assert np.array_equal(push_out(outer, [solid(inner)], limit=0.01), push_out(outer, [solid(inner)]))
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(0.002, 0.010), (0.02, 0.02), (0.05, 0.030), (-0.02, 0.010)])
+def test_the_stand_off_is_the_parts_own_within_its_reach(gap, expected):
+    # Chords run below the arcs: a ball of triangles is flatter by a fifth of a millimetre.
+    assert stand_off(ball(0.1 + gap), solid(ball(0.1))) == pytest.approx(expected, abs=3e-4)

@@ -15,7 +15,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
-from pipelines.runs.layout import BUILD_STAGES
+from pipelines.runs.layout import TEMPLATE_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
@@ -118,11 +118,11 @@ def test_webs_stay_where_the_user_wants_them(small):
 def test_metrics_json_and_manifests_state_what_was_done(person_run):
     metrics = json.loads((person_run / "metrics.json").read_text())
     assert metrics["schema"] == 1 and metrics["subject"] == "person"
-    assert list(metrics["stages"]) == list(metrics["seconds"]) == list(BUILD_STAGES)
+    assert list(metrics["stages"]) == list(metrics["seconds"]) == list(TEMPLATE_STAGES)
     for check in metrics["checks"]:
         assert set(check) >= {"stage", "name", "value", "unit", "status", "gate"}
-        assert check["stage"] in BUILD_STAGES and check["status"] in ("pass", "warn", "fail")
-    for name in BUILD_STAGES:
+        assert check["stage"] in TEMPLATE_STAGES and check["status"] in ("pass", "warn", "fail")
+    for name in TEMPLATE_STAGES:
         manifest = json.loads((person_run / name / "manifest.json").read_text())
         assert manifest["stage"] == name and manifest["files"] and "numpy" in manifest["versions"]
         assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in manifest["inputs"].values())
@@ -184,13 +184,13 @@ def test_only_what_is_damaged_or_changed_runs_again(small):
     assert ran(clearance_mm=2.0) == ["60_assemble"]
     assert ran(last="30_clean", budgets=BUDGETS | {"upper": 1000}) == ["30_clean"]
     states = {stage["stage"]: stage["state"] for stage in summarise_run(run)[0]["stages"]}
-    assert [states[name] for name in BUILD_STAGES] == ["done"] * 4 + ["outdated"] * 3 + ["missing"]
+    assert [states[name] for name in TEMPLATE_STAGES] == ["done"] * 4 + ["outdated"] * 3 + ["missing"]
 
 
 def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
     run = small.folder / "run"
-    (run / ".10_register.abc").mkdir(parents=True)
-    (run / ".10_register.abc" / "body.npz").write_bytes(b"half")
+    (run / ".10_body.abc").mkdir(parents=True)
+    (run / ".10_body.abc" / "body.npz").write_bytes(b"half")
     (run / ".metrics.abc.json").write_text("{")
     (run / ".notes").write_text("mine")
     small.build("run", small.inputs(), last="00_capture")

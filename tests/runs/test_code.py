@@ -11,7 +11,7 @@ from pipelines.runs import code
 from pipelines.runs.code import code_of
 
 ROOT = Path(__file__).resolve().parents[2]
-REGISTER = "pipelines.stages.register"
+POSE_BODY = "pipelines.stages.pose_body"
 
 
 @pytest.fixture
@@ -38,8 +38,8 @@ def _edit(path: Path, old: str, new: str) -> None:
 
 
 def test_a_stage_has_the_modules_that_it_imports_and_no_others():
-    found = code_of(REGISTER)
-    assert {REGISTER, "smplxpp.body.model", "smplxpp.skinning.linear_blend", "smplxpp.core.errors"} <= set(found)
+    found = code_of(POSE_BODY)
+    assert {POSE_BODY, "smplxpp.body.model", "smplxpp.skinning.linear_blend", "smplxpp.core.errors"} <= set(found)
     assert not any(name.startswith(("avatar", "smplxpp.transfer", "smplxpp.export")) for name in found)
     assert "smplxpp" in found and "smplxpp.body" in found, "packages are run on the way to their modules"
 
@@ -66,9 +66,9 @@ def test_kernels_belong_to_what_calls_them():
     ],
 )
 def test_what_does_nothing_or_is_elsewhere_changes_nothing(copy, path, old, new):
-    before = code_of("smplxpp.raster.visibility", REGISTER)
+    before = code_of("smplxpp.raster.visibility", POSE_BODY)
     copy(path, old, new)
-    assert code_of("smplxpp.raster.visibility", REGISTER) == before
+    assert code_of("smplxpp.raster.visibility", POSE_BODY) == before
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth
-from pipelines.synth.motion import Performance, tracker_noise
+from pipelines.synth.motion import Performance
 from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
 from pipelines.synth.textures import band
+from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import load_body
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec

@@ -21,14 +21,22 @@ from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture
 from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
+from pipelines.report.sections.register import register_section
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.arrays import load_arrays
 from pipelines.runs.artefacts import load_cleaned_parts, load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, EVALUATE_STAGE, REFINE_STAGE
+from pipelines.runs.layout import (
+    BIND_STAGE,
+    BUILD_STAGES,
+    EVALUATE_STAGE,
+    REFINE_STAGE,
+    REGISTER_STAGE,
+    TEMPLATE_STAGES,
+)
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
-from smplxpp.body import load_body, load_params
+from pipelines.stages.motion import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.json_values import jsonable
@@ -62,14 +70,16 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     scan, colors, _ = load_scan(run)
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
-    early = tuple(c for c in checks if c.stage in ("00_capture", "10_register", "20_segment"))
+    early = tuple(c for c in checks if c.stage in ("00_capture", "10_body", "20_segment"))
+    registration = records.get(REGISTER_STAGE)
     sections = (
+        *(() if registration is None else (register_section(run, registration),)),
         _scan_section(run, scan, colors, cameras, early),
         _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
         _weights_section(run, records["40_transfer"], cameras, by_stage["40_transfer"]),
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
         _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
-        _poses_section(template, reference, inputs),
+        _poses_section(run, template, reference, inputs),
         *(() if poses is None else (refine_section(poses),)),
         *(() if fit is None else (fit_section(fit),)),
         *(training_section(record) for record in trainings.values()),
@@ -88,8 +98,8 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber(
             "scan to template",
-            f"{sum(seconds[name] for name in BUILD_STAGES):.1f} s",
-            "all stages, validation included",
+            f"{sum(seconds[name] for name in TEMPLATE_STAGES):.1f} s",
+            "all stages of the template, validation included",
         ),
         *refinement_key_numbers(poses),
         *(() if fit is None else fit_key_numbers(fit)),
@@ -133,7 +143,7 @@ def rewrite_report(run: Path) -> Path | None:
     build = load_build(run)
     if build is None:
         return None
-    return write_build_report(run, *build, {name: require_stage(run, name) for name in BUILD_STAGES})
+    return write_build_report(run, *build, {name: require_stage(run, name) for name in build[0].stages})
 
 
 def _sheet(
@@ -299,12 +309,12 @@ def _fidelity_section(
     )
 
 
-def _poses_section(template: Template, reference: BodyParams, inputs: BuildInputs) -> Section:
+def _poses_section(run: Path, template: Template, reference: BodyParams, inputs: BuildInputs) -> Section:
     pictures = []
     for name, vertices in zip(STRESS_POSES, template.pose(stress_poses(reference)), strict=True):
         pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
-    if inputs.motion is not None:
-        motion = load_params(inputs.motion, body=load_body(inputs.body))
+    motion = motion_of_build(run, inputs)
+    if motion is not None:
         chosen = np.array(spread(range(len(motion)), MOTION_PICTURES))
         for k, vertices in zip(chosen, template.pose(motion.select(chosen)), strict=True):
             pictures.append(_pose_picture(template, vertices, f"motion, frame {k}"))

@@ -1,4 +1,4 @@
-"""EasyMocap: `intri.yml`, `extri.yml`, `images/CAM/000000.jpg`."""
+"""EasyMocap: `intri.yml`, `extri.yml`, `images/CAM/000000.jpg`, `annots/CAM/000000.json`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
+from smplxpp.capture.keypoints import found_keypoints
 from smplxpp.capture.params import ParamFiles
 from smplxpp.capture.readers.common import (
     chosen_params,
@@ -36,7 +37,8 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a recording: distorted photographs, undistorted on reading; masks in `masks/` or `mask/`.
+    """Find a recording: distorted photographs, undistorted on reading; masks in `masks/` or `mask/`; keypoints in
+    `annots/`.
 
     OpenCV's calibration, with pixel centres at whole numbers. The images' size is `H_CAM`, `W_CAM`, or that of the
     camera's first image.
@@ -74,6 +76,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             "mask": {} if masks is None else numbered_images({name: masks / name for name in names}),
         },
         params=_params(root, options),
+        keypoints=found_keypoints(root / "annots", cameras, format="easymocap", person=options.person),
     )
 
 

@@ -1,0 +1,184 @@
+"""`smplxpp register`: a capture (or a scan) in; body parameters of all its frames, residuals and a report out."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipelines.commands.options import OptionalPath, OptionalText
+from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least
+
+if TYPE_CHECKING:
+    from pipelines.runs.stage import StageRecord
+    from pipelines.stages.register_config import RegisterInputs
+
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Register:
+    """Options of `smplxpp register`. Give --capture, or --scan with --params."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder of the run; the registration goes into it as 05_register, and `smplxpp build` there takes it up."""
+    capture: OptionalPath = None
+    """Folder of a capture in any layout of docs/captures.md: cameras with keypoints, masks, label maps; scans."""
+    scan: OptionalPath = None
+    """Scan of the frame --frame, in the place of the capture's, or alone with --params."""
+    params: OptionalPath = None
+    """Body parameters to start from, in the place of the capture's own."""
+    initial: Literal["params", "none"] = "params"
+    """none: no parameters are looked at, and the fit starts from keypoints alone."""
+    protocol: OptionalText = None
+    """Protocol of the capture, which names the files that are read."""
+    frames: OptionalText = None
+    """Frames to register: numbers and ranges START:STOP:STEP with commas; by default all that the split names."""
+    frame: int = 0
+    """Reference frame: the one of --scan and --labels."""
+    labels: OptionalPath = None
+    """Labels of the reference frame's scan; without them its label maps vote."""
+    label_set: str = "capture"
+    """Label set of --labels, or a JSON file that maps ids to names."""
+    hold_out: tuple[str, ...] = ()
+    """Cameras that are not looked at; by default those that the capture holds out."""
+    body: OptionalPath = None
+    """SMPL-X-layout body file; the open body by default."""
+    units: Literal["m", "cm", "mm", "inch"] = "m"
+    """Units of scan files."""
+    up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
+    """Upward axis of scan files."""
+    seed: int = 0
+    """Seed of the points that are sampled."""
+    force: bool = False
+    """Register anew even if the registration stands."""
+    no_report: bool = False
+    """Leave out the page register.html, or the section of a run's report."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Register, write the report, print residuals before and after."""
+        from pipelines.commands.progress import shared_progress
+        from pipelines.runs.layout import REGISTER_STAGE
+        from pipelines.runs.lock import own_run_folder
+        from pipelines.stages.register_capture import register_capture
+
+        require_at_least("option seed", self.seed, 0)
+        require_at_least("option frame", self.frame, 0)
+        inputs = self.inputs()
+        with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
+            record = register_capture(self.out, inputs, force=self.force, progress=progress)
+            report = None if self.no_report else self._report(record)
+        content = jsonlib.loads((record.folder / "registration.json").read_text())
+        if not self.json:
+            _print(record, content, report)
+        numbers = record.manifest["numbers"]
+        return {
+            **numbers,
+            "run": str(self.out),
+            "ran": record.ran,
+            "params": str(record.folder / "params.npz"),
+            "by_camera": content["by_camera"],
+            "problems": content["problems"],
+            "checks": record.manifest["checks"],
+            "report": None if report is None else str(report),
+        }
+
+    def inputs(self) -> RegisterInputs:
+        """What the body is registered to.
+
+        Raises:
+            InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
+        """
+        from pipelines.commands.capture import selected_frames
+        from pipelines.stages.register_config import RegisterInputs, named_params
+        from smplxpp.capture import open_capture
+
+        if self.capture is None and self.scan is None:
+            raise InputError("input", expected="--capture, or --scan with --params", received="neither")
+        for name in ("scan", "labels", "body"):
+            path = getattr(self, name)
+            if path is not None and not path.exists():
+                raise InputError(f"option {name}", expected="an existing file", received=str(path))
+        if self.initial == "none" and self.params is not None:
+            raise InputError("option initial", expected="none without --params", received="both")
+        if self.frames is not None and self.capture is None:
+            raise InputError("--frames", expected="a --capture that has them", received="a scan alone: see --frame")
+        frames = None
+        if self.frames is not None and self.capture is not None:
+            frames = selected_frames(self.frames, open_capture(self.capture))
+        return RegisterInputs(
+            capture=self.capture,
+            params=named_params(self.capture, self.params),
+            start=self.initial == "params",
+            protocol=self.protocol,
+            frames=frames,
+            hold_out=self.hold_out,
+            body=self.body,
+            scan=self.scan,
+            frame=self.frame,
+            labels=self.labels,
+            label_set=self.label_set,
+            units=self.units,
+            up=self.up,
+            seed=self.seed,
+        )
+
+    def _report(self, record: StageRecord) -> Path:
+        """Write the registration's own page, unless it is newer than the registration."""
+        from pipelines.report.sections.register import write_register_report
+
+        page = self.out / "register.html"
+        made = (record.folder / "manifest.json").stat().st_mtime_ns
+        if record.ran or not page.is_file() or page.stat().st_mtime_ns < made:
+            write_register_report(page, self.out, record)
+        return page
+
+
+def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None) -> None:
+    from pipelines.stages.registration import RESIDUALS
+
+    console, numbers = Console(), record.manifest["numbers"]
+    medians = numbers["residuals"]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("median over frames")
+    for when in ("before", "after"):
+        table.add_column(when, justify="right")
+    for name, after in medians["after"].items():
+        shown = RESIDUALS.get(name)
+        words, unit = (name, "") if shown is None else (shown.words, shown.unit)
+        before = medians["before"].get(name)
+        table.add_row(words, "-" if before is None else f"{before:.2f} {unit}", f"{after:.2f} {unit}")
+    console.print(table)
+    for name, found in content["by_camera"].items():
+        before = f"{found['before']['median_px']:.2f} to " if "before" in found else ""
+        after = f"{found['after']['median_px']:.2f}" if "after" in found else "-"
+        console.print(
+            f"[dim]{escape(name)}[/]  {found['points']} keypoints, median {before}{after} px", highlight=False
+        )
+    for check in record.manifest["checks"]:
+        if check["status"] != "pass":
+            style = "red" if check["status"] == "fail" else "yellow"
+            console.print(
+                f"[{style}]{check['status']}[/]  {check['name']}: {check['value']:.3g}, {check['explanation']}"
+            )
+    problems = content["problems"]
+    for words in problems[:_SHOWN]:
+        console.print(f"[yellow]problem[/]  {escape(words)}", soft_wrap=True, highlight=False)
+    if len(problems) > _SHOWN:
+        console.print(f"[dim]and {len(problems) - _SHOWN} more (--json lists all)[/]")
+    absent = f", {len(content['absent'])} could not be" if content["absent"] else ""
+    how = "" if record.ran else "; stands, not run again"
+    console.print(f"{numbers['frames']} frames registered{absent}{how}", highlight=False)
+    for name, path in (("params", record.folder / "params.npz"), ("report", report)):
+        if path is not None:
+            console.print(f"{name}  {path}", soft_wrap=True, highlight=False)

@@ -1,0 +1,318 @@
+"""What a registration may see of a capture, and nothing else: held-out cameras are never looked at."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipelines.runs.digests import sha256_file
+from pipelines.stages.observed_scans import observed_scans
+from pipelines.stages.register_config import RegisterInputs
+from smplxpp.body import BodyModel, load_params
+from smplxpp.capture import Capture, find_scans, open_capture
+from smplxpp.core.errors import InputError
+from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core.labels import BACKGROUND
+from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.register.observations import Observations
+from smplxpp.segment import map_labels
+
+ELSEWHERE = 255
+"""Value of a label map where there is no label of the person."""
+_NAMED = 6
+
+
+@dataclass(eq=False)
+class ViewMaps:
+    """Masks or label maps of the cameras that may be used; one that cannot be read is named once and is none.
+
+    Attributes:
+        kind: "mask" or "label".
+        problems: of the files that were asked for so far.
+    """
+
+    capture: Capture
+    cameras: tuple[str, ...]
+    kind: str
+    problems: dict[tuple[str, int], str] = field(default_factory=dict)
+
+    def __call__(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
+        """The map of a camera and a frame; None where there is none."""
+        if camera not in self.cameras or (camera, frame) in self.problems:
+            return None
+        try:
+            if self.kind == "mask":
+                return self.capture.mask(camera, frame)
+            labels = self.capture.labels(camera, frame)
+            if labels is None:
+                return None
+            ours = map_labels(labels, self.capture.label_set)
+        except InputError as error:
+            self.problems[camera, frame] = f"camera {camera}, frame {frame}: {self.kind} left out: {error}"
+            return None
+        return np.where(ours == BACKGROUND, ELSEWHERE, ours).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Observations, and what they are made of.
+
+    Attributes:
+        digests: SHA-256 by name of everything that a registration reads.
+        problems: what was left out on opening, in words. maps: that say more when they are read.
+    """
+
+    capture: Capture | None
+    observations: Observations
+    digests: dict[str, str]
+    problems: tuple[str, ...]
+    maps: tuple[ViewMaps, ...] = ()
+
+    def all_problems(self) -> tuple[str, ...]:
+        """Everything that was wrong with the inputs, as far as they were read."""
+        return (*self.problems, *(words for one in self.maps for words in one.problems.values()))
+
+
+def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
+    """Collect what a registration of these inputs sees.
+
+    Raises:
+        InputError: neither cameras nor scans, keypoints without cameras, nothing to start from, parameters of another
+            body, unknown cameras or frames.
+    """
+    if inputs.capture is None:
+        return _observe_scan(inputs, body)
+    capture = open_inputs(inputs, body)
+    cameras = _training_cameras(capture, inputs)
+    files = find_scans(inputs.capture) if inputs.scan is None else {inputs.frame: inputs.scan}
+    frames = _frames(capture, files, inputs)
+    # A held-out frame's scan shows what held-out cameras saw.
+    held_out = set(capture.splits.novel_pose_frames)
+    files = {frame: path for frame, path in files.items() if frame in frames and frame not in held_out}
+    keypoints, unread = _keypoints(capture, cameras)
+    if not cameras and not files:
+        _refuse_nothing(capture)
+    masks, labels = (_maps(capture, cameras, kind) for kind in ("mask", "label"))
+    scans, problems = observed_scans(files, inputs, capture, labels)
+    problems = [*unread, *problems]
+    initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
+    if initial is None and not keypoints:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="keypoints of its training cameras, or a fit to start from",
+            received="neither",
+            remedy="detect keypoints (docs/captures.md says which files are read), or name a fit with --params",
+        )
+    shape = tuple(frame for frame in frames if frame not in held_out)
+    if not shape:
+        raise InputError(
+            "frames", expected="one that is trained on: the shape is found on these alone", received="held-out frames"
+        )
+    observations = Observations(
+        frames=frames,
+        cameras={name: capture.cameras[name] for name in cameras},
+        keypoints=keypoints,
+        mask=masks,
+        labels=labels,
+        scans=scans,
+        initial=initial,
+        fps=capture.fps,
+        shape_frames=shape,
+    )
+    maps = tuple(one for one in (masks, labels) if one is not None)
+    digests = _digests(observations, capture, files, inputs)
+    return Observed(capture, observations, digests, (*problems, *more), maps)
+
+
+def _observe_scan(inputs: RegisterInputs, body: BodyModel) -> Observed:
+    """One scan with a fit to start from."""
+    if inputs.scan is None:
+        raise InputError("input", expected="--capture, or --scan with --params", received="neither")
+    if inputs.params is None or not inputs.start:
+        raise InputError(
+            f"scan {inputs.scan.name}",
+            expected="a fit to start from: a scan alone does not say where its limbs are",
+            received="none",
+            remedy="name one with --params",
+        )
+    params = load_params(inputs.params, body=body)
+    initial = params.frame(inputs.frame if len(params) > 1 else 0)
+    _check_body(initial, body, str(inputs.params))
+    files = {inputs.frame: inputs.scan}
+    scans, _ = observed_scans(files, inputs, None, None)
+    observations = Observations((inputs.frame,), scans=scans, initial=initial, shape_frames=(inputs.frame,))
+    return Observed(None, observations, _digests(observations, None, files, inputs), ())
+
+
+def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
+    """Open the capture of a registration with the parameters that it starts from."""
+    assert inputs.capture is not None
+    protocol: dict[str, Any] = {} if inputs.protocol is None else {"protocol": inputs.protocol}
+    return open_capture(inputs.capture, params=inputs.params if inputs.start else None, body=body, **protocol)
+
+
+def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keypoints2D], list[str]]:
+    """The keypoints of those cameras that have any, and what was wrong with the others.
+
+    Raises:
+        InputError: none of the files can be read.
+    """
+    found, errors = {}, {}
+    for name in cameras:
+        try:
+            points = capture.keypoints(name)
+        except InputError as error:
+            errors[name] = error
+            continue
+        if points is not None:
+            found[name] = points
+    if errors and not found:
+        raise next(iter(errors.values()))
+    return found, [f"camera {name}: keypoints left out: {error}" for name, error in errors.items()]
+
+
+def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ...]:
+    splits = capture.splits
+    unknown = sorted(set(inputs.hold_out) - set(capture.cameras))
+    if unknown:
+        have = ", ".join(capture.cameras) or "none"
+        raise InputError("option hold-out", expected=f"cameras among {have}", received=", ".join(unknown))
+    held_out = inputs.hold_out or splits.novel_view_cameras
+    known = {*splits.train_cameras, *splits.novel_view_cameras}
+    cameras = tuple(name for name in capture.cameras if name in known and name not in held_out)
+    if capture.cameras and not cameras:
+        raise InputError("cameras", expected="at least one that is not held out", received="all held out")
+    return cameras
+
+
+def _frames(capture: Capture, scans: dict[int, Path], inputs: RegisterInputs) -> tuple[int, ...]:
+    """The frames to register: those asked for, or all that are trained on or held out."""
+    splits = capture.splits
+    have = set(capture.frames) | set(scans)
+    if inputs.frames is not None:
+        outside = sorted(set(inputs.frames) - have)
+        if outside:
+            raise InputError(
+                "--frames",
+                expected=f"frames that capture {capture.name} has",
+                received=", ".join(map(str, outside[:_NAMED])),
+            )
+        return tuple(sorted(inputs.frames))
+    split = {*splits.train_frames, *splits.novel_pose_frames}
+    frames = tuple(sorted(frame for frame in have if frame in split or frame in scans))
+    if not frames:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="frames with images, or scans",
+            received="none",
+            remedy="see docs/captures.md for where they are looked for",
+        )
+    return frames
+
+
+def _refuse_nothing(capture: Capture) -> None:
+    """Say that there is nothing to register to."""
+    alone = [name for name in ("keypoints", "annots") if (capture.root / name).is_dir()]
+    if alone:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="cameras for its keypoints",
+            received=f"a folder {alone[0]} and no calibration",
+            remedy="give cameras.json or calibration.csv: points in images say nothing without their cameras",
+        )
+    raise InputError(
+        f"capture {capture.name}",
+        expected="cameras with keypoints, masks or label maps, or a scan",
+        received="neither cameras nor scans",
+        remedy="see docs/registration.md for what goes in",
+    )
+
+
+def _maps(capture: Capture, cameras: tuple[str, ...], kind: str) -> ViewMaps | None:
+    rows = [name in cameras for name in capture.cameras]
+    return ViewMaps(capture, cameras, kind) if capture.presence(kind)[rows].any() else None
+
+
+def _initial(capture: Capture, frames: tuple[int, ...], body: BodyModel) -> tuple[BodyParams | None, list[str]]:
+    """The fit to start from, a row a frame; a frame without one starts from its nearest neighbour's.
+
+    Raises:
+        InputError: no frame's fit can be read, or one of another body.
+    """
+    if capture.recording.params is None:
+        return None, []
+    known: dict[int, BodyParams] = {}
+    errors: dict[int, InputError] = {}
+    for frame in frames:
+        try:
+            params = capture.params(frame)
+        except InputError as error:
+            errors[frame] = error
+            continue
+        if params is not None:
+            known[frame] = params
+    if not known:
+        if errors:
+            raise next(iter(errors.values()))
+        return None, [f"none of the {len(frames)} frames has a fit to start from"]
+    _check_body(next(iter(known.values())), body, f"capture {capture.name}")
+    have = np.array(sorted(known))
+    nearest = [int(have[np.abs(have - frame).argmin()]) for frame in frames]
+    problems = [
+        f"frame {frame}: no fit to start from, that of frame {other} is taken"
+        + (f": {errors[frame]}" if frame in errors else "")
+        for frame, other in zip(frames, nearest, strict=True)
+        if frame != other
+    ]
+    return BodyParams.concatenate([known[frame] for frame in nearest]), problems
+
+
+def _check_body(params: BodyParams, body: BodyModel, source: str) -> None:
+    """Refuse parameters that another body file was fitted with, by its name."""
+    try:
+        body.forward(params)
+    except InputError as error:
+        raise InputError(
+            f"{source}: {error.subject}",
+            expected=error.expected,
+            received=error.received,
+            remedy=f"name the body file that the fit is for with --body ({error.remedy})",
+        ) from None
+
+
+def _digests(
+    observations: Observations, capture: Capture | None, scans: dict[int, Path], inputs: RegisterInputs
+) -> dict[str, str]:
+    """SHA-256 of what is read; of masks and label maps names and sizes alone, a sequence has gigabytes of them."""
+    cameras, points, start, files = (hashlib.sha256() for _ in range(4))
+    for name, camera in observations.cameras.items():
+        cameras.update(f"{name} {camera.width} {camera.height}".encode())
+        cameras.update(camera.K.tobytes() + camera.cam_from_world.tobytes())
+    for name, found in observations.keypoints.items():
+        points.update(f"{name} {found.names}".encode())
+        for array in (found.frames, found.points, found.confidence):
+            points.update(np.ascontiguousarray(array).tobytes())
+    if observations.initial is not None:
+        for key in ARRAY_NAMES:
+            start.update(np.ascontiguousarray(getattr(observations.initial, key)).tobytes())
+    if capture is not None:
+        for name in observations.cameras:
+            for frame in observations.frames:
+                for kind in ("mask", "label"):
+                    path = capture.file(name, frame, kind)
+                    if path is not None:
+                        files.update(f"{kind} {name} {frame} {path.name} {path.stat().st_size}\n".encode())
+    digests = {
+        "capture/cameras": cameras.hexdigest(),
+        "capture/keypoints": points.hexdigest(),
+        "capture/fit to start from": start.hexdigest(),
+        "capture/names and sizes of masks and label maps": files.hexdigest(),
+    }
+    digests |= {f"scan of frame {frame}": sha256_file(path) for frame, path in scans.items()}
+    return digests if inputs.labels is None else {**digests, "labels": sha256_file(inputs.labels)}

@@ -1,0 +1,107 @@
+"""Stage 05: the body registered to all frames of a capture, or to a scan."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.layout import REGISTER_STAGE
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
+from pipelines.stages.observe import Observed, observe
+from pipelines.stages.register_config import RegisterInputs, save_register
+from pipelines.stages.registration import registration_checks, stacked_rows, summary
+from smplxpp.body import BodyModel, load_body
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_values import jsonable
+from smplxpp.register.config import RegisterConfig
+from smplxpp.register.fit import register
+
+Report = Callable[[str, float], None]
+"""Told what is being done, and the share of it that is done."""
+
+
+def _silent(what: str, share: float) -> None:
+    """Report nothing."""
+
+
+def register_capture(
+    run: Path,
+    inputs: RegisterInputs,
+    *,
+    force: bool = False,
+    progress: Report = _silent,
+) -> StageRecord:
+    """Register the body, unless the stage stands, and keep the stage in a run that the caller owns.
+
+    Raises:
+        InputError: inputs that nothing can be registered to, or not a single frame that was.
+    """
+    config = RegisterConfig(seed=inputs.seed)
+    body = load_body(inputs.body)
+    observed = observe(inputs, body)
+    digests = dict(observed.digests)
+    if inputs.body is not None:
+        digests["body"] = sha256_file(inputs.body)
+    observations = observed.observations
+    choices = {
+        "register": config,
+        "frames": observations.frames,
+        "shape_frames": observations.shape_frames,
+        "reference": inputs.frame,
+        "start": observations.initial is not None,
+        "scans": {"units": inputs.units, "up": inputs.up, "label_set": inputs.label_set},
+    }
+    stage = Stage(name=REGISTER_STAGE, config=choices, inputs=digests, code=(__name__,))
+    save_register(run, inputs)
+    work = partial(_work, observed=observed, body=body, config=config, progress=progress)
+    return run_stage(run, stage, work, force=force)
+
+
+def _work(
+    folder: Path, *, observed: Observed, body: BodyModel, config: RegisterConfig, progress: Report
+) -> StageOutput:
+    """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
+    observations = observed.observations
+    fit = register(body, observations, config, progress=progress)
+    if not fit.frames:
+        raise InputError(
+            "registration",
+            expected="a body in at least one frame",
+            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.problems) or 'nobody was seen'}",
+            remedy="look at the inputs with `smplxpp capture check`",
+        )
+    _save(folder / "params.npz", stacked_rows(fit.frames, fit.params))
+    if observations.initial is not None:
+        _save(folder / "initial.npz", stacked_rows(observations.frames, observations.initial))
+    np.savez(
+        folder / "confidence.npz",
+        frames=np.array(fit.frames),
+        joint_names=np.array(body.joint_names),
+        confidence=fit.confidence,
+    )
+    problems = (*observed.all_problems(), *fit.problems)
+    content = summary(body, observations, fit, problems)
+    (folder / "registration.json").write_text(json.dumps(jsonable(content), indent=1) + "\n")
+    medians = {
+        when: {name: float(np.nanmedian(values)) for name, values in found.items() if np.isfinite(values).any()}
+        for when, found in content["residuals"].items()
+    }
+    shape_frames = observations.shape_frames or observations.frames
+    numbers = {
+        "frames": len(fit.frames),
+        "absent": content["absent"],
+        "residuals": medians,
+        "problems": len(problems),
+        "seen": {"cameras": list(observations.cameras), "frames": list(shape_frames)},
+    }
+    return StageOutput(registration_checks(observations, fit), numbers)
+
+
+def _save(path: Path, arrays: dict[str, Any]) -> None:
+    np.savez_compressed(path, **arrays)

@@ -1,0 +1,73 @@
+"""What a registration takes, and its record in the run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.runs.layout import REGISTER_FILE
+from pipelines.runs.places import absolute
+from smplxpp.capture.readers.simple import stacked_params
+from smplxpp.core.atomic import atomic_write_text
+
+
+@dataclass(frozen=True)
+class RegisterInputs:
+    """Where a registration takes its observations from: a capture, or one scan.
+
+    Attributes:
+        capture: folder of any known layout.
+        params: the fit to start from, in the place of the capture's own.
+        start: False: no fit is looked at, keypoints are where it begins.
+        protocol: name of the capture's files that are read, None without one.
+        frames: numbers, None for all that are trained on or held out.
+        hold_out: cameras that are not looked at, in the place of those that the capture holds out.
+        body: SMPL-X-layout body file, None for the open body.
+        scan: the reference frame's scan, in the place of the capture's. frame: its number.
+        labels: of that scan's vertices or faces; None: votes of the frame's label maps.
+        label_set: of the scan's labels. units, up: how scans are written.
+        seed: of the points that are sampled.
+    """
+
+    capture: Path | None = None
+    params: Path | None = None
+    start: bool = True
+    protocol: str | None = None
+    frames: tuple[int, ...] | None = None
+    hold_out: tuple[str, ...] = ()
+    body: Path | None = None
+    scan: Path | None = None
+    frame: int = 0
+    labels: Path | None = None
+    label_set: str = "capture"
+    units: str = "m"
+    up: str = "y"
+    seed: int = 0
+
+
+def named_params(capture: Path | None, params: Path | None) -> Path | None:
+    """The file or folder that a user means by parameters: by path, or by its name in the capture's `params/`."""
+    return stacked_params(capture, params) if params is not None and capture is not None else params
+
+
+_PATHS = ("capture", "params", "body", "scan", "labels")
+
+
+def save_register(run: Path, inputs: RegisterInputs) -> None:
+    """Write `register.json` into a run."""
+    values = {key: str(absolute(value)) if isinstance(value, Path) else value for key, value in asdict(inputs).items()}
+    atomic_write_text(run / REGISTER_FILE, json.dumps(values, indent=1) + "\n")
+
+
+def load_register(run: Path) -> RegisterInputs | None:
+    """What `save_register` wrote; None where there is none of this version."""
+    try:
+        values: dict[str, Any] = json.loads((run / REGISTER_FILE).read_text())
+        values |= {key: Path(values[key]) for key in _PATHS if values[key] is not None}
+        frames = values["frames"]
+        values |= {"frames": None if frames is None else tuple(frames), "hold_out": tuple(values["hold_out"])}
+        return RegisterInputs(**values)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

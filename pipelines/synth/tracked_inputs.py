@@ -1,0 +1,150 @@
+"""A tracker's keypoints and a parser's label maps for a capture whose inputs are exact; protocols that name both.
+
+What is written follows from the capture's files and the seed alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimated_labels
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture
+from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.images import read_labels
+from smplxpp.capture.writers.images import write_gray_png
+from smplxpp.capture.writers.keypoints import write_keypoints
+from smplxpp.core.camera import Camera
+from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core.labels import BACKGROUND
+from smplxpp.core.params import BodyParams
+from smplxpp.raster import rasterize_mesh
+from smplxpp.segment.labels import find_label_set
+
+KEYPOINTS, ESTIMATED_LABELS = "keypoints", "labels_estimated"
+EXACT_PARAMETERS, TRACKED_PARAMETERS = "params.npz", "params_noisy.npz"
+# What is said of the files of a capture that has exact inputs and a tracker's.
+INPUTS = {
+    "parameters": {EXACT_PARAMETERS: "exact", TRACKED_PARAMETERS: "tracked"},
+    "labels": "true",
+    "normals": "true",
+}
+# A joint lies inside of the body: what is nearer to the camera by more than this, metres, hides it.
+_BEHIND = 0.15
+_KEYPOINT_SEED, _LABEL_SEED = 11, 12
+
+
+def protocols(*, labels: bool = True, normals: bool = True, keypoints: bool = True) -> dict[str, dict[str, object]]:
+    """The entry "protocols" of a capture's description, by which kinds of files it has."""
+    return {
+        "exact": {
+            "parameters": EXACT_PARAMETERS,
+            "labels": "labels" if labels else None,
+            "scan_labels": True,
+            "normals": "normals" if normals else None,
+            "keypoints": None,
+        },
+        "tracked": {
+            "parameters": TRACKED_PARAMETERS,
+            "labels": ESTIMATED_LABELS if labels else None,
+            "scan_labels": False,
+            "normals": None,
+            "keypoints": KEYPOINTS if keypoints else None,
+        },
+    }
+
+
+def write_tracked_keypoints(
+    root: Path,
+    capture: Capture,
+    body: BodyModel,
+    params: dict[int, BodyParams],
+    *,
+    seed: int,
+    config: DetectorConfig | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> None:
+    """Write `keypoints/CAM.npz` of every camera: all joints of the body, as a detector would find them.
+
+    Joints that the body itself hides are found with more noise and less confidence; clothes hide nothing.
+
+    Args:
+        root: folder that is written into.
+        capture: gives the cameras, at full size.
+        body: of the parameters.
+        params: exact, by frame.
+        seed: of the detector's errors.
+        config: how it errs.
+        progress: called with the share of the cameras done.
+    """
+    frames = sorted(params)
+    posed = body.forward(BodyParams.concatenate([params[frame] for frame in frames]))
+    for k, (name, camera) in enumerate(capture.cameras.items()):
+        found = detector_keypoints(
+            posed.joints,
+            camera,
+            names=body.joint_names,
+            frames=frames,
+            seed=[seed, _KEYPOINT_SEED, k],
+            visible=_visible(body, posed.vertices, posed.joints, camera),
+            config=config,
+        )
+        lens = capture.recording.distortions.get(name)
+        write_keypoints(root / KEYPOINTS / f"{name}.npz", found if lens is None else _through(found, camera, lens))
+        progress((k + 1) / len(capture.cameras))
+
+
+def write_estimated_labels(
+    root: Path, capture: Capture, *, seed: int, progress: Callable[[float], None] = lambda share: None
+) -> float:
+    """Write `labels_estimated/CAM/CAM_labelFFFFFF.png` for every label map of a capture in our layout.
+
+    Returns:
+        The share of foreground pixels whose label is wrong, over all maps; 0 without any.
+    """
+    of_set = find_label_set(capture.label_set).ours
+    background = [number for number, ours in of_set.items() if ours == BACKGROUND]
+    wrong = seen = 0
+    for k, name in enumerate(capture.cameras):
+        series = capture.recording.series("label", name)
+        if series is None:
+            continue
+        for frame in series.numbers.tolist():
+            path = series.required(frame)
+            exact = np.asarray(read_labels(path))
+            estimated = estimated_labels(exact, seed=[seed, _LABEL_SEED, k, frame], background=background)
+            write_gray_png(root / ESTIMATED_LABELS / name / f"{path.stem}.png", estimated)
+            foreground = ~np.isin(exact, background)
+            wrong, seen = wrong + int((estimated != exact)[foreground].sum()), seen + int(foreground.sum())
+        progress((k + 1) / len(capture.cameras))
+    return wrong / seen if seen else 0.0
+
+
+def _visible(
+    body: BodyModel, vertices: Float[np.ndarray, "F V 3"], joints: Float[np.ndarray, "F J 3"], camera: Camera
+) -> Bool[np.ndarray, "F J"]:
+    """Joints that the body's own surface does not hide; those outside the image count as seen."""
+    out = np.ones(joints.shape[:2], dtype=bool)
+    for row, (surface, points) in enumerate(zip(vertices, joints, strict=True)):
+        depth = rasterize_mesh(body.mesh(surface), camera).depth
+        screen = camera.screen_from_world(points)
+        with np.errstate(invalid="ignore"):
+            inside = (screen[:, 2] > 0) & (screen[:, :2] >= 0).all(axis=1)
+            inside &= (screen[:, 0] < camera.width) & (screen[:, 1] < camera.height)
+        x, y = screen[inside, :2].astype(np.int64).T
+        out[row, inside] = depth[y, x] > screen[inside, 2] - _BEHIND
+    return out
+
+
+def _through(found: Keypoints2D, camera: Camera, lens: Distortion) -> Keypoints2D:
+    """Keypoints of the undistorted image where the image on disk has them."""
+    K = camera.K
+    there = found.confidence > 0
+    points = found.points.copy()
+    plane = (points[there] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+    points[there] = lens.distort(plane) @ K[:2, :2].T + K[:2, 2]
+    return Keypoints2D(found.names, found.frames, points, found.confidence)

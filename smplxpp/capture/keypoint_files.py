@@ -1,0 +1,285 @@
+"""Keypoints of detectors from their files: OpenPose, EasyMocap, mmpose, COCO, MediaPipe, and our own npz.
+
+One file of all frames or a folder with a file a frame; docs/captures.md says what is in them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from smplxpp.capture.files import subfolders
+from smplxpp.capture.keypoint_people import (
+    Person,
+    chosen_person,
+    coco_person,
+    easymocap_people,
+    mediapipe_person,
+    mmpose_people,
+    openpose_people,
+)
+from smplxpp.core.errors import InputError
+from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core.safe_pickle import safe_npz
+from smplxpp.core.validation import require_choice
+
+KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
+_HOLISTIC = ("pose", "face", "left_hand", "right_hand")
+_SUFFIXES = (".npz", ".json")
+
+
+@dataclass(frozen=True)
+class KeypointOptions:
+    """How files of keypoints are read.
+
+    Attributes:
+        format: None or "auto": told by the content. OpenPose's BODY_25B has as many points as BODY_25 and must be named
+            `openpose-25b`.
+        person: the one to take, by the file's id or else the place in its list; None: in each frame the one with the
+            greatest sum of confidences.
+        size: width and height of the images, for MediaPipe's shares of them.
+        first_frame: number of the first frame that is found; the others follow at their distances. None: as in the
+            files (mmpose counts a video's frames from 1).
+    """
+
+    format: KeypointFormat = "auto"
+    person: int | None = None
+    size: tuple[int, int] | None = None
+    first_frame: int | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("format of the keypoints", self.format, get_args(KeypointFormat))
+
+
+def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> Keypoints2D:
+    """Read the keypoints of one camera; pixels as they lie on disk (distorted where the images are), centres at +0.5.
+
+    Args:
+        path: one file of all frames, or a folder with a JSON file a frame, whose last number is the frame.
+        options: how.
+
+    Raises:
+        InputError: nothing there, a damaged file, an unknown layout, other numbers of points than the layout has.
+    """
+    path, options = Path(path), options or KeypointOptions()
+    try:
+        return _read(path, options)
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"keypoints {path}",
+            expected="one of the layouts of docs/captures.md",
+            received=f"{type(error).__name__}: {error}",
+        ) from None
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointFiles:
+    """Keypoints by camera; one place, a file or a folder, for each camera that has them.
+
+    Attributes:
+        places: by camera. options: how they are read. sizes: of the images on disk.
+    """
+
+    places: Mapping[str, Path]
+    options: KeypointOptions = field(default_factory=KeypointOptions)
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that have keypoints."""
+        return tuple(self.places)
+
+    def read(self, camera: str) -> Keypoints2D | None:
+        """Read a camera's keypoints, None where there are none.
+
+        Raises:
+            InputError: as `read_keypoints`.
+        """
+        if camera not in self.places:
+            return None
+        o = self.options
+        size = self.sizes.get(camera, o.size)
+        return read_keypoints(self.places[camera], KeypointOptions(o.format, o.person, size, o.first_frame))
+
+
+def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str, Path]:
+    """Find what belongs to each camera: the folder of its name, or the file (`CAM.npz`, `CAM.json`, `CAM_more.json`,
+    `results_CAM.json`).
+
+    Args:
+        folder: holds a file or a folder for each camera.
+        cameras: their names; None: every folder with files in it, and every file, is a camera.
+    """
+    inside = set(subfolders(folder))
+    files = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
+    if cameras is None:
+        return {name: folder / name for name in sorted(inside)} | {_camera_of(path): path for path in files}
+    found: dict[str, Path] = {}
+    for camera in cameras:
+        if camera in inside:
+            found[camera] = folder / camera
+            continue
+        own = [path for path in files if re.match(rf"(results_)?{re.escape(camera)}(?!\d)", path.stem)]
+        own.sort(key=lambda path: (_camera_of(path) != camera, len(path.stem)))
+        if own:
+            found[camera] = own[0]
+    return found
+
+
+def _camera_of(path: Path) -> str:
+    return path.stem.removeprefix("results_").removesuffix("_keypoints")
+
+
+def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
+    if path.suffix.lower() == ".npz" and path.is_file():
+        arrays = safe_npz(path)
+        if "joint_names" in arrays and options.format in ("auto", "simple"):
+            return _ours(arrays, path)
+        frames = dict(_mediapipe_arrays(arrays, path, options))
+    elif path.is_dir():
+        frames = {}
+        files = {_last_number(p): p for p in sorted(path.iterdir()) if p.suffix.lower() == ".json"}
+        for number in sorted(files):
+            frames.update(_frames(_json(files[number]), number, options, source=f"file {files[number]}"))
+    elif path.is_file():
+        frames = dict(_frames(_json(path), 0, options, source=f"file {path}"))
+    else:
+        frames = {}
+    if not frames:
+        raise InputError(
+            f"keypoints {path}",
+            expected="an npz or JSON file, or a folder of JSON files with a number each",
+            received="nothing of the kind" if path.exists() else "no such file",
+        )
+    return _joined(frames, options)
+
+
+def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Keypoints2D:
+    """The chosen person of each frame, in one table; frames without are all 0."""
+    chosen = {number: chosen_person(people, options.person) for number, people in frames.items()}
+    if options.person is not None and not any(chosen.values()):
+        ids = sorted({-1 if one.id is None else one.id for people in frames.values() for one in people})
+        raise InputError("--person", expected=f"one of the ids {ids[:12]}, or a place", received=str(options.person))
+    names = tuple(dict.fromkeys(name for one in chosen.values() if one is not None for name in one.points))
+    numbers, column = sorted(chosen), {name: k for k, name in enumerate(names)}
+    table = np.zeros((len(numbers), len(names), 3))
+    for row, number in enumerate(numbers):
+        one = chosen[number]
+        for name, point in one.points.items() if one is not None else ():
+            table[row, column[name]] = point
+    shift = 0 if options.first_frame is None else options.first_frame - numbers[0]
+    return Keypoints2D(names, np.array(numbers, dtype=np.int64) + shift, table[..., :2], table[..., 2])
+
+
+def _ours(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
+    values = np.asarray(arrays.get("keypoints"), dtype=np.float64)
+    names = tuple(str(name) for name in np.ravel(arrays["joint_names"]))
+    if values.ndim != 3 or values.shape[1:] != (len(names), 3):
+        raise InputError(
+            f"file {path}: keypoints", expected=f"shape (frames, {len(names)}, 3)", received=f"shape {values.shape}"
+        )
+    frames = np.ravel(arrays.get("frames", np.arange(len(values)))).astype(np.int64)
+    try:
+        return Keypoints2D(names, frames, values[..., :2], values[..., 2])
+    except InputError as error:
+        raise InputError(f"file {path}: keypoints", expected=error.expected, received=error.received) from None
+
+
+def _frames(content: Any, number: int, options: KeypointOptions, *, source: str) -> Iterator[tuple[int, list[Person]]]:
+    """The people of each frame of a JSON file; `number` is the frame of a file that does not say one."""
+    kind = _kind(content) if options.format == "auto" else options.format
+    if kind in ("openpose", "openpose-25b"):
+        yield number, openpose_people(content, body_25b=kind == "openpose-25b", source=source)
+    elif kind == "easymocap":
+        yield number, easymocap_people(content, body_25b=False, source=source)
+    elif kind == "mmpose":
+        entries = content["instance_info"] if isinstance(content, Mapping) else content
+        if all("instances" in entry for entry in entries) and entries:
+            for place, entry in enumerate(entries):
+                frame = int(entry.get("frame_id", number + place))
+                yield frame, mmpose_people(entry["instances"], source=source)
+        else:
+            yield number, mmpose_people(entries, source=source)
+    elif kind == "coco":
+        by_image: dict[int, list[Person]] = {}
+        for entry in content["annotations"] if isinstance(content, Mapping) else content:
+            image = entry["image_id"]
+            frame = image if isinstance(image, int) else _last_number(Path(image))
+            by_image.setdefault(frame, []).append(coco_person(entry, source=source))
+        yield from by_image.items()
+    elif kind == "mediapipe":
+        entries = content.get("frames", [content]) if isinstance(content, Mapping) else content
+        normalised = content.get("normalized") if isinstance(content, Mapping) else None
+        for place, entry in enumerate(entries):
+            parts = {name: entry.get(f"{name}_landmarks", entry.get(name)) for name in _HOLISTIC}
+            frame = int(entry.get("frame", number + place))
+            yield frame, [mediapipe_person(parts, size=options.size, normalised=normalised, source=source)]
+    else:
+        raise InputError(source, expected="keypoints in a layout of docs/captures.md", received="JSON of another kind")
+
+
+def _kind(content: Any) -> str:
+    """Tell the format by the keys of a JSON file; "" where none fits."""
+    if isinstance(content, Mapping):
+        for key, kind in (("people", "openpose"), ("annots", "easymocap"), ("instance_info", "mmpose")):
+            if key in content:
+                return kind
+        if "annotations" in content:
+            return "coco"
+        first = next(iter(content.get("frames", [])), content)
+    else:
+        first = content[0] if content else {}
+    if "image_id" in first:
+        return "coco"
+    if "instances" in first or "keypoint_scores" in first or content == []:
+        return "mmpose"
+    if "handl2d" in first or "personID" in first:
+        return "easymocap"
+    return "mediapipe" if any(f"{name}{tail}" in first for name in _HOLISTIC for tail in ("_landmarks", "")) else ""
+
+
+def _mediapipe_arrays(
+    arrays: Mapping[str, Any], path: Path, options: KeypointOptions
+) -> Iterator[tuple[int, list[Person]]]:
+    parts = {name: arrays.get(f"{name}_landmarks", arrays.get(name)) for name in _HOLISTIC}
+    have = {name: np.asarray(values, dtype=np.float64) for name, values in parts.items() if values is not None}
+    counts = {len(values) for values in have.values()}
+    if len(counts) != 1:
+        raise InputError(
+            f"file {path}",
+            expected="arrays `keypoints` and `joint_names`, or MediaPipe's `pose`, `face`, `left_hand`, `right_hand` "
+            "with a row a frame each",
+            received=", ".join(f"{name} {np.shape(value)}" for name, value in arrays.items()) or "nothing",
+        )
+    count = counts.pop()
+    normalised = bool(arrays["normalized"]) if "normalized" in arrays else None
+    for row, number in enumerate(np.ravel(arrays.get("frames", np.arange(count))).tolist()):
+        own = {name: values[row] for name, values in have.items()}
+        person = mediapipe_person(own, size=options.size, normalised=normalised, source=f"file {path}")
+        yield int(number), [person]
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"file {path}", expected="JSON", received=str(error)) from None
+
+
+def _last_number(path: Path) -> int:
+    """The last number of a file's name.
+
+    Raises:
+        InputError: it has none.
+    """
+    numbers = re.findall(r"\d+", path.stem)
+    if not numbers:
+        raise InputError(f"file {path}", expected="a name with the frame's number", received=path.name)
+    return int(numbers[-1])

@@ -1,0 +1,199 @@
+"""What one file of a detector says of one image: its people, with their points in the names of `Keypoints2D`.
+
+Pixel centres of OpenPose, EasyMocap, COCO and mmpose are at whole numbers, ours at +0.5: half a pixel is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.capture.keypoint_names import (
+    BODY_25B,
+    BY_COUNT,
+    FACE,
+    FACE_68,
+    FACE_70,
+    LEFT_HAND,
+    MEDIAPIPE_FACE,
+    MEDIAPIPE_POSE,
+    RIGHT_HAND,
+    Order,
+)
+from smplxpp.core.errors import InputError
+
+_HALF = 0.5
+# Lists of one person in OpenPose's and in EasyMocap's files, with the orders by their lengths.
+_FACES = {len(order): order for order in (FACE_68, FACE_70)} | {len(FACE): FACE}
+_OPENPOSE = {
+    "hand_left_keypoints_2d": {21: LEFT_HAND},
+    "hand_right_keypoints_2d": {21: RIGHT_HAND},
+    "face_keypoints_2d": _FACES,
+}
+_EASYMOCAP = {"handl2d": {21: LEFT_HAND}, "handr2d": {21: RIGHT_HAND}, "face2d": _FACES}
+_HOLISTIC = ("pose", "face", "left_hand", "right_hand")
+_VISIBILITY = 3
+# Coordinates of MediaPipe beyond this share of the image's size are pixels.
+_NORMALISED_BOUND = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Points of one person in one image: u, v in our pixels and confidence, 0 where there is none."""
+
+    points: Mapping[str, Float64[np.ndarray, " 3"]]
+    id: int | None = None
+
+    @property
+    def confidence(self) -> float:
+        """The sum over all points."""
+        return float(sum(point[2] for point in self.points.values()))
+
+
+def chosen_person(people: Sequence[Person], person: int | None) -> Person | None:
+    """The one with the id `person`, or at that place in the list where the file has no ids; None: the surest one."""
+    if person is None:
+        return max(people, key=lambda one: one.confidence, default=None)
+    ids = [one.id if one.id is not None else place for place, one in enumerate(people)]
+    return people[ids.index(person)] if person in ids else None
+
+
+def openpose_people(content: Any, *, body_25b: bool, source: str) -> list[Person]:
+    """Read `people` of OpenPose's JSON: BODY_25, or BODY_25B, or BODY_135 as one list; hands and face beside it."""
+    people = []
+    for one in content["people"]:
+        points = _named(one["pose_keypoints_2d"], _with_25b(body_25b), source=source, shift=_HALF)
+        for key, orders in _OPENPOSE.items():
+            if one.get(key):
+                points |= _named(one[key], orders, source=f"{source}: {key}", shift=_HALF)
+        number = int(np.ravel(one.get("person_id", -1))[0])
+        people.append(Person(points, number if number >= 0 else None))
+    return people
+
+
+def easymocap_people(content: Any, *, body_25b: bool, source: str) -> list[Person]:
+    """Read the annotations of EasyMocap's JSON: `keypoints`, `handl2d`, `handr2d`, `face2d` and `personID`."""
+    people = []
+    for one in content["annots"] if isinstance(content, Mapping) else content:
+        body = one.get("keypoints", one.get("keypoints2d", []))
+        points = _named(body, _with_25b(body_25b), source=source, shift=_HALF) if len(body) else {}
+        for key, orders in _EASYMOCAP.items():
+            if one.get(key):
+                points |= _named(one[key], orders, source=f"{source}: {key}", shift=_HALF)
+        number = one.get("personID", one.get("id"))
+        people.append(Person(points, None if number is None else int(number)))
+    return people
+
+
+def mmpose_people(instances: Any, *, source: str) -> list[Person]:
+    """Read `instances` of mmpose: `keypoints` [[u, v], ...] and `keypoint_scores`."""
+    people = []
+    for one in instances:
+        uv = np.asarray(one["keypoints"], dtype=np.float64).reshape(-1, 2)
+        scores = np.asarray(one["keypoint_scores"], dtype=np.float64).reshape(-1, 1)
+        track = one.get("track_id")
+        rows = np.concatenate([uv, scores], axis=1)
+        people.append(Person(_named(rows, BY_COUNT, source=source, shift=_HALF), None if track is None else int(track)))
+    return people
+
+
+def coco_person(entry: Any, *, source: str) -> Person:
+    """Read one entry of COCO's list of results: `keypoints` [u, v, score, ...]; COCO-WholeBody's four further lists."""
+    points = _named(entry["keypoints"], BY_COUNT, source=source, shift=_HALF)
+    parts = {
+        "foot_kpts": {6: BY_COUNT[133][17:23]},
+        "face_kpts": {68: FACE_68},
+        "lefthand_kpts": {21: LEFT_HAND},
+        "righthand_kpts": {21: RIGHT_HAND},
+    }
+    for key, orders in parts.items():
+        if entry.get(key):
+            points |= _named(entry[key], orders, source=f"{source}: {key}", shift=_HALF)
+    return Person(points)
+
+
+def mediapipe_person(
+    parts: Mapping[str, Any], *, size: tuple[int, int] | None, normalised: bool | None, source: str
+) -> Person:
+    """Read MediaPipe's landmarks of one image.
+
+    Args:
+        parts: `pose` (33), `face` (468, or 478 with irises), `left_hand`, `right_hand` (21): each rows of x, y and
+            perhaps z, visibility, or objects with these names; None or NaN where nothing was found.
+        size: width and height of the image, for shares of it.
+        normalised: x and y are shares of the image's size; None: told by their range.
+        source: for messages.
+    """
+    orders = {"pose": MEDIAPIPE_POSE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
+    points: dict[str, np.ndarray] = {}
+    for name in _HOLISTIC:
+        rows = landmark_rows(parts.get(name), source=f"{source}: {name}")
+        if rows is None:
+            continue
+        if normalised is None:
+            seen = rows[rows[:, 2] > 0, :2]
+            shares = bool(len(seen)) and float(np.abs(seen).max()) < _NORMALISED_BOUND
+        else:
+            shares = normalised
+        if shares:
+            if size is None:
+                raise InputError(
+                    source,
+                    expected="the images' size, for coordinates that are shares of it",
+                    received="none",
+                    remedy="give --size WIDTHxHEIGHT, or the capture",
+                )
+            rows[:, :2] *= size
+        if name == "face":
+            if len(rows) not in (468, 478):
+                raise InputError(f"{source}: face", expected="468 or 478 points", received=f"{len(rows)}")
+            rows = np.stack([rows[list(own)].mean(axis=0) for own in MEDIAPIPE_FACE])
+            points |= _named(rows, {len(FACE): FACE}, source=source)
+        else:
+            points |= _named(rows, {len(orders[name]): orders[name]}, source=f"{source}: {name}")
+    return Person(points)
+
+
+def landmark_rows(value: Any, *, source: str) -> Float64[np.ndarray, "N 3"] | None:
+    """Rows of x, y, confidence of MediaPipe's landmarks; confidence is the visibility where there is one, else 1."""
+    if isinstance(value, Mapping):
+        value = value.get("landmark", value.get("landmarks"))
+    if value is None or not len(value):
+        return None
+    if isinstance(value[0], Mapping):
+        value = [[one["x"], one["y"], 0.0, one.get("visibility") or 1.0] for one in value]
+    rows = np.asarray(value, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] < 2:
+        raise InputError(source, expected="rows of x, y[, z[, visibility]]", received=f"shape {rows.shape}")
+    visibility = rows[:, _VISIBILITY] if rows.shape[1] > _VISIBILITY else np.ones(len(rows))
+    there = np.isfinite(rows[:, :2]).all(axis=1) & np.isfinite(visibility)
+    out = np.concatenate([rows[:, :2], visibility[:, None]], axis=1)
+    out[~there] = 0.0
+    return out
+
+
+def _with_25b(body_25b: bool) -> dict[int, Order]:
+    return {**BY_COUNT, 25: BODY_25B} if body_25b else BY_COUNT
+
+
+def _named(rows: Any, orders: Mapping[int, Order], *, source: str, shift: float = 0.0) -> dict[str, np.ndarray]:
+    """Points by name; confidences are cut to [0, 1] (detectors' scores are a little above 1 at times)."""
+    values = np.asarray(rows, dtype=np.float64).reshape(-1, 3)
+    if len(values) not in orders:
+        counts = " or ".join(str(count) for count in orders)
+        raise InputError(
+            source,
+            expected=f"{counts} points of u, v, confidence",
+            received=f"{len(values)} points",
+            remedy="name the format, or convert the points to keypoints/CAM.npz by hand (docs/captures.md)",
+        )
+    values = values.copy()
+    there = np.isfinite(values).all(axis=1) & (values[:, 2] > 0)
+    values[:, :2] += shift
+    values[:, 2] = np.clip(values[:, 2], 0.0, 1.0)
+    values[~there] = 0.0
+    return {name: row for name, row in zip(orders[len(values)], values, strict=True) if name is not None}

@@ -1,0 +1,63 @@
+"""Keypoints of a capture: where they lie, and where its images show them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.keypoint_files import KeypointFiles, KeypointFormat, KeypointOptions, find_places
+from smplxpp.capture.recording import Recording
+from smplxpp.capture.window import Window
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.keypoints import Keypoints2D
+
+
+def with_keypoints(recording: Recording, folder: Path, options: KeypointOptions | None = None) -> Recording:
+    """The recording with its keypoints taken from `folder` alone: a file or a folder for each camera, any layout.
+
+    Raises:
+        InputError: no such folder, or nothing in it of any camera.
+    """
+    if not folder.is_dir():
+        raise InputError("folder of keypoints", expected="an existing folder", received=str(folder))
+    files = _files(folder, recording.cameras, options or KeypointOptions())
+    if not files.places:
+        example = next(iter(recording.cameras), "CAM")
+        raise InputError(
+            f"folder of keypoints {folder}",
+            expected=f"a file or a folder for each camera, such as {example}.npz or {example}/",
+            received=", ".join(sorted(path.name for path in folder.iterdir())[:6]) or "nothing",
+        )
+    return replace(recording, keypoints=files)
+
+
+def found_keypoints(
+    folder: Path, cameras: Mapping[str, Camera], *, format: KeypointFormat, person: int | None
+) -> KeypointFiles | None:
+    """A layout's own keypoints, where its folder of them is there."""
+    if not folder.is_dir():
+        return None
+    files = _files(folder, cameras, KeypointOptions(format=format, person=person))
+    return files if files.places else None
+
+
+def shown_keypoints(found: Keypoints2D, full: Camera, window: Window, distortion: Distortion | None) -> Keypoints2D:
+    """Where a window of the undistorted image shows points of the image on disk."""
+    points = found.points.copy()
+    if distortion is not None:
+        there = found.confidence > 0
+        K = full.K[:2, :2]
+        plane = distortion.undistort((points[there] - full.K[:2, 2]) @ np.linalg.inv(K).T)
+        points[there] = plane @ K.T + full.K[:2, 2]
+    x0, y0 = window.box[:2]
+    return replace(found, points=(points - (x0, y0)) * window.scale)
+
+
+def _files(folder: Path, cameras: Mapping[str, Camera], options: KeypointOptions) -> KeypointFiles:
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    return KeypointFiles(find_places(folder, cameras), options, sizes)

@@ -1,0 +1,131 @@
+"""`smplxpp register` and `smplxpp build --register`: options to inputs, what is printed, when a build registers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipelines.cli import main
+from pipelines.commands.build import Build
+from pipelines.commands.register import Register
+from pipelines.stages.register_config import RegisterInputs
+from smplxpp.core.errors import InputError
+from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
+
+TRACKED = FIXTURE / "params" / "params_noisy.npz"
+ASKED = ["--capture", str(FIXTURE), "--params", "params_noisy.npz", "--frames", "0,13"]
+
+
+@pytest.fixture
+def solver(monkeypatch):
+    use_keypoints(monkeypatch)
+    return use_solver(monkeypatch)
+
+
+def test_the_command_prints_its_numbers_and_a_table(tmp_path, solver, capsys):
+    assert main(["register", *ASKED, "--out", str(tmp_path), "--json", "--no-report"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["frames"] == 2 and printed["ran"] and Path(printed["params"]).is_file()
+    assert (
+        printed["residuals"]["before"]["keypoints_px"] == 8.0 and printed["residuals"]["after"]["keypoints_px"] == 1.5
+    )
+    assert printed["report"] is None and set(printed["by_camera"]) == set(solver.shown[0].cameras)
+    assert main(["register", *ASKED, "--out", str(tmp_path), "--no-report"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "keypoints to the body 8.00 px 1.50 px" in shown and "2 frames registered; stands, not run again" in shown
+    assert len(solver.shown) == 1
+
+
+def test_the_page_stands_alone(tmp_path, solver, capsys):
+    assert main(["register", *ASKED, "--out", str(tmp_path), "--json"]) == 0
+    page = Path(json.loads(capsys.readouterr().out)["report"])
+    text = page.read_text()
+    for words in (
+        "Registration",
+        "reference frame",
+        "largest residual",
+        "confidence of each joint",
+        "after, median px",
+    ):
+        assert words in text
+    made = page.stat().st_mtime_ns
+    assert main(["register", *ASKED, "--out", str(tmp_path), "--json"]) == 0
+    assert page.stat().st_mtime_ns == made
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "--capture, or --scan with --params"),
+        (["--scan", "nothing.ply"], "option scan"),
+        (["--capture", str(FIXTURE), "--frames", "0,99"], "frames that the capture has"),
+        (["--capture", str(FIXTURE), "--frames", "x"], "numbers and ranges"),
+        (["--capture", str(FIXTURE), "--initial", "none", "--params", str(TRACKED)], "none without --params"),
+        (["--capture", str(FIXTURE), "--params", "nowhere.npz"], "does not exist"),
+        (["--scan", str(FIXTURE / "scans/scan_000000.ply"), "--params", str(TRACKED), "--frames", "0"], "see --frame"),
+    ],
+)
+def test_bad_options_are_refused_in_words(tmp_path, solver, capsys, options, words):
+    assert main(["register", *options, "--out", str(tmp_path / "run"), "--json"]) == 2
+    assert words in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert not solver.shown
+
+
+# --- builds ---------------------------------------------------------------------------------------------------------
+
+
+def registration_of(out, **options) -> RegisterInputs | None:
+    command = Build(out=out, capture=options.pop("capture", FIXTURE), **options)
+    return command.registration(command.inputs())
+
+
+def test_a_build_registers_where_the_capture_says_that_its_parameters_are_tracked(tmp_path):
+    assert registration_of(tmp_path) is None  # params.npz: exact
+    tracked = registration_of(tmp_path, params=Path("params_noisy.npz"))
+    assert tracked == RegisterInputs(
+        capture=FIXTURE, params=TRACKED, labels=FIXTURE / "scans" / "scan_000000_labels.npz", label_set="capture"
+    )
+    assert registration_of(tmp_path, params=Path("params_noisy.npz"), register="off") is None
+    asked = registration_of(tmp_path, register="on", label_source="views")
+    assert asked.params is None and asked.labels is None
+
+
+def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
+    unused = shutil.ignore_patterns("geometry", "normals", "rgbs", "masks", "params")
+    capture = shutil.copytree(FIXTURE, tmp_path / "capture", ignore=unused)
+    with pytest.raises(InputError, match=r"params/000000\.npz"):
+        registration_of(tmp_path, capture=capture)
+    (capture / "keypoints").mkdir()
+    found = Build(out=tmp_path / "run", capture=capture).inputs()
+    assert found.params is None and found.motion is None and found.stages[0] == "05_register"
+    assert registration_of(tmp_path, capture=capture).start
+
+
+def test_a_build_takes_up_what_register_has_made(tmp_path, solver, capsys):
+    assert main(["register", *ASKED, "--out", str(tmp_path), "--seed", "3", "--json", "--no-report"]) == 0
+    options = ["--capture", str(FIXTURE), "--out", str(tmp_path), "--until-stage", "10_body", "--json"]
+    assert main(["build", *options]) == 0
+    assert len(solver.shown) == 1
+    assert registration_of(tmp_path).seed == 3
+    capsys.readouterr()
+    assert main(["build", *options, "--register", "off"]) == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert "05_register" not in stages and "00_capture" in stages
+    assert registration_of(tmp_path, params=FIXTURE / "params" / "params.npz") is None
+
+
+def test_a_scan_is_registered_when_asked(tmp_path):
+    scan = FIXTURE / "scans" / "scan_000000.ply"
+    options = {"capture": None, "scan": scan, "params": TRACKED, "label_set": "capture"}
+    assert registration_of(tmp_path, **options) is None
+    found = registration_of(tmp_path, **options, register="on")
+    assert (found.scan, found.params, found.capture) == (scan, TRACKED, None)
+
+
+def test_options_reach_the_inputs(tmp_path):
+    command = Register(out=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2)
+    inputs = command.inputs()
+    assert (inputs.start, inputs.frames, inputs.hold_out, inputs.frame) == (False, (0, 2), ("Cam001",), 2)

@@ -1,0 +1,147 @@
+"""Registrations of small scenes: what is found, from where, and what clothes may not do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import SKIN, UPPER
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.register.config import RegisterConfig
+from smplxpp.register.fit import register
+from smplxpp.register.observations import Observations, ScanObservation
+from tests.register.people import disturbed, keypoints, masks, moving, ring, vertex_error_mm
+
+BODY = load_body()
+FRAMES = 6
+SMALL = RegisterConfig(scan_samples=1500, rim_samples=1500, surface_steps=6)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return moving(BODY, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return ring(6)
+
+
+def test_exact_keypoints_give_the_pose(person, cameras):
+    observed = Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras), fps=20.0)
+    fit = register(BODY, observed, SMALL)
+    true, found = BODY.forward(person).joints, BODY.forward(fit.params).joints
+    assert 1e3 * np.linalg.norm(true - found, axis=2).mean() < 4.0
+    assert (fit.params.betas == fit.params.betas[0]).all()  # one shape
+    assert fit.residuals["keypoints_px"].max() < 1.0
+    assert not fit.start and not fit.problems
+
+
+def test_noisy_keypoints_and_masks(person, cameras):
+    seen = keypoints(BODY, person, cameras, px=2.0)
+    mask = masks(BODY, person, cameras)
+    start = disturbed(person, degrees=2.0, metres=0.01, betas=0.3)
+    frames = tuple(range(FRAMES))
+    alone = register(BODY, Observations(frames, cameras, keypoints=seen, fps=20.0), SMALL)
+    both = register(
+        BODY,
+        Observations(frames, cameras, keypoints=seen, mask=lambda c, f: mask[c, f], initial=start, fps=20.0),
+        SMALL,
+    )
+    assert vertex_error_mm(BODY, both.params, person) < vertex_error_mm(BODY, alone.params, person) < 15.0
+    assert np.nanmean(both.residuals["silhouette_px"]) < np.nanmean(both.start["silhouette_px"])
+    assert both.confidence.shape == (FRAMES, BODY.joint_count)
+    assert (both.confidence[:, :22] > 0.5).all()
+
+
+def test_windows_join(person, cameras):
+    """A take longer than the window is solved piece by piece and comes to the same."""
+    observed = Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras), fps=20.0)
+    whole = register(BODY, observed, SMALL)
+    pieces = register(BODY, observed, RegisterConfig(window=2, shape_frames=4))
+    assert vertex_error_mm(BODY, pieces.params, whole.params) < 2.0
+
+
+def test_same_bits_twice(person, cameras):
+    observed = Observations((0, 1), cameras, keypoints=keypoints(BODY, person.select([0, 1]), cameras, px=1.0))
+    first, second = (register(BODY, observed, SMALL).params for _ in range(2))
+    assert all((a == b).all() for a, b in zip(first.as_dict().values(), second.as_dict().values(), strict=True))
+
+
+def dressed(person: BodyParams, standoff: float) -> ScanObservation:
+    """A scan of the first frame: skin where it is bare, a wide shirt that stands off the trunk."""
+    body_mesh = BODY.mesh(BODY.forward(person).vertices[0])
+    names = np.array(BODY.joint_names)
+    trunk = np.isin(np.argmax(BODY.weights, axis=1), np.flatnonzero([_of_trunk(n) for n in names]))
+    vertices = body_mesh.vertices + standoff * trunk[:, None] * body_mesh.vertex_normals
+    outer = BODY.part_labels == BODY.part_label_names.index("body")
+    faces = BODY.faces[outer[BODY.faces].all(axis=1)]
+    return ScanObservation(TriangleMesh(vertices, faces), np.where(trunk, UPPER.id, SKIN.id))
+
+
+def _of_trunk(name: str) -> bool:
+    return name == "pelvis" or name.startswith("spine") or name.endswith(("collar", "hip"))
+
+
+def test_clothes_do_not_fatten_the_body(person):
+    """Attracted both ways, a wide shirt pulls the body onto itself (ETCH, Li et al. 2025); kept off, it does not."""
+    one = person.select([0])
+    scan = dressed(one, 0.035)
+    start = disturbed(one, degrees=1.0, metres=0.005, betas=0.2)
+    shape = (0,)
+    ours = register(BODY, Observations((0,), scans={0: scan}, initial=start, shape_frames=shape), SMALL)
+    as_skin = ScanObservation(scan.mesh, np.full(scan.mesh.vertex_count, SKIN.id))
+    both_ways = register(
+        BODY,
+        Observations((0,), scans={0: as_skin}, initial=start, shape_frames=shape),
+        RegisterConfig(scan_reach_m=0.2),
+    )
+    kept, pulled = (vertex_error_mm(BODY, fit.params, one) for fit in (ours, both_ways))
+    assert kept < vertex_error_mm(BODY, start, one)
+    assert kept < 0.5 * pulled
+    assert ours.residuals["skin_mm"][0] < 2.0
+
+
+def test_a_body_does_not_stand_out_of_its_clothes(person):
+    one = person.select([0])
+    scan = dressed(one, 0.01)
+    fat = BodyParams.from_full_pose(
+        one.full_pose,
+        betas=one.betas + np.array([[0.0, 2.0] + [0.0] * (one.betas.shape[1] - 2)]),
+        expression=one.expression,
+        transl=one.transl,
+    )
+    fit = register(BODY, Observations((0,), scans={0: scan}, initial=fat), SMALL)
+    assert fit.residuals["inside_mm"][0] < 0.3
+    assert fit.residuals["inside_mm"][0] <= fit.start["inside_mm"][0]
+
+
+def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
+    mask = masks(BODY, person.select([0, 1]), cameras)
+    observed = Observations(
+        (0, 1),
+        cameras,
+        keypoints=keypoints(BODY, person.select([0, 1]), cameras),
+        mask=lambda c, f: None if (c, f) == ("C2", 1) else mask[c, f],
+    )
+    fit = register(BODY, observed, SMALL)
+    assert any("camera C2" in problem and "frame 1" in problem for problem in fit.problems)
+    assert np.isfinite(fit.residuals["silhouette_px"]).all()
+
+
+@pytest.mark.parametrize(
+    ("observed", "words"),
+    [
+        (Observations(()), "at least one frame"),
+        (Observations((0,)), "keypoints, masks, scans or a fit"),
+        (Observations((0,), mask=lambda c, f: None), "a fit to start from"),
+        (Observations((0, 1), initial=BodyParams.rest(betas=20, expressions=52)), "2 frames"),
+        (Observations((0,), initial=BodyParams.rest(betas=np.ones(100), expressions=52)), "at most 20 numbers"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(observed, words):
+    with pytest.raises(InputError, match=words):
+        register(BODY, observed)
