@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from avatar.data.sequence import AvatarSequence
 from avatar.data.views import read_view
 from avatar.metrics.view_quality import eight_bit
 from avatar.models.student import Student, StudentConfig
 from avatar.render.avatar_view import render_view
+from avatar.rig.posed import at_rest
 from avatar.training.refinement.refine import Refinement
 from pipelines.figures.evaluation import write_tiles
 
@@ -31,10 +31,10 @@ def write_pictures(folder: Path, sequence: AvatarSequence, found: Refinement) ->
         frame = found.frames[row]
         names = [name for name in sequence.train_cameras if sequence.capture.file(name, frame) is not None]
         views = [read_view(sequence.capture, name, frame) for name in names]
-        view = max(views, key=lambda one: int(torch.count_nonzero(one.alpha)))
+        view = max(views, key=lambda one: np.count_nonzero(one.alpha.numpy()))
         rendered = []
         for params in (found.start, found.params):
-            with torch.no_grad():
+            with at_rest(avatar):
                 posed = avatar(sequence.rig.motion(params.frame(int(row))), view.position[None])
                 rendered.append(eight_bit(render_view(posed, 0, view, sequence.background).image).numpy())
         file = f"pictures/{view.name}_{frame:06d}.png"

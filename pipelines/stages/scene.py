@@ -20,6 +20,7 @@ from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
+from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
@@ -58,6 +59,10 @@ class TrainInputs:
     hold_out: tuple[str, ...] = ()
     scale: float = 1.0
     protocol: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.params is not None:  # a file by its name in the capture is the same as by its path
+            object.__setattr__(self, "params", stacked_params(self.capture, self.params))
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ class RefineConfig:
         default_factory=lambda: SamplingConfig(count=30_000, head_share=0.15, sh_degree=0, opacity=0.95)
     )
     reference_levels: tuple[Level, ...] = (Level(1, 3),)
-    levels: tuple[Level, ...] = (Level(2, 2), Level(1, 4), Level(0, 1))
+    levels: tuple[Level, ...] = (Level(2, 2), Level(1, 3), Level(0, 2))
     jaw: bool = True
     expression: bool = True
     hands: bool = False
@@ -59,7 +59,7 @@ class RefineConfig:
     robust: float = 0.5
     alpha: float = 0.5
     pixel_sigma: float = 0.05
-    pixels_per_error: float = 6000.0
+    pixels_per_error: float = 4000.0
     rotation_sigma: float = 1.0
     translation_sigma: float = 0.008
     expression_sigma: float = 0.1

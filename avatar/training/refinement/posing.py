@@ -83,8 +83,8 @@ class Placed:
 class PosedTemplate:
     """Poses a template of one person, with gradients to small steps.
 
-    Pose correctives and joints that expression moves are in the vertices, not in the derivatives: fractions of a
-    millimetre a degree. The identity is the template's own.
+    Pose correctives are in the vertices, not in the derivatives: fractions of a millimetre a degree. The identity is
+    the template's own.
 
     Args:
         firmness: of its vertices, see `firmness`.
@@ -102,6 +102,11 @@ class PosedTemplate:
         """Metres a unit of expression, of the body's vertices."""
         return torch.tensor(self.body.exprdirs, dtype=torch.float32)
 
+    @cached_property
+    def expression_joints(self) -> Float64[Tensor, "J 3 E"]:
+        """Metres a unit of expression, of the joints."""
+        return torch.tensor(np.einsum("jv,vxe->jxe", self.body.joint_regressor, self.body.exprdirs))
+
     def place(self, state: BodyState, row: int) -> Placed:
         """Pose one frame of a state; its betas are not looked at."""
         body, count = self.body, self.body.vertex_count
@@ -118,7 +123,7 @@ class PosedTemplate:
         moved = (self.expression_dirs @ expression.float()).view(count, 3)
         rest = rest + torch.nn.functional.pad(moved, (0, 0, 0, len(rest) - count))
         transforms, joints = forward_kinematics(
-            torch.tensor(rest_joints),
+            torch.tensor(rest_joints) + self.expression_joints @ expression,
             self.kinematics.parents,
             matrix_from_rotvec(turns) @ rotations,
             transl=torch.tensor(state.transl[row]) + transl,

@@ -99,7 +99,7 @@ def solve(normal: Normal, smooth: Smoothness, damping: Float64[np.ndarray, " F"]
         damping: Levenberg and Marquardt's, by frame.
     """
     F, P = normal.gradient.shape
-    band = 3 * P if F > 2 else P
+    band = P * min(F, 3)
     matrix = np.zeros((band, F * P))  # lower form: matrix[i - j, j]
     gradient = normal.gradient.copy()
     blocks = normal.curvature.copy()

@@ -1,0 +1,131 @@
+"""`66_refine` in a run: made, skipped, made anew, taken by what comes after, shown in the report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.cli import main
+from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
+from pipelines.stages.refine import wants_refinement
+from pipelines.stages.scene import TrainInputs, open_scene
+from smplxpp.body import load_params
+from smplxpp.core.errors import InputError
+from tests.dolls.gesturing import FRAMES, NOVEL_POSES, disturbed, doll, gestures, write_gestures
+from tests.training.refinement.test_refine import QUICK
+
+
+@pytest.fixture(autouse=True)
+def few_gaussians(monkeypatch):
+    monkeypatch.setattr("avatar.training.refinement.config.RefineConfig", lambda seed=0: replace(QUICK, seed=seed))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    root = write_gestures(tmp_path_factory.mktemp("captures") / "gestures")
+    disturbed(gestures()).save(root / "params" / "params_noisy.npz")
+    gestures().save(root / "params" / "params.npz")
+    about = json.loads((root / "capture.json").read_text())
+    about["inputs"] = {"parameters": {"params.npz": "exact", "params_noisy.npz": "tracked"}}
+    (root / "capture.json").write_text(json.dumps(about))
+    return root
+
+
+def refine(run: Path, capture: Path, *options: str) -> int:
+    noisy = str(capture / "params" / "params_noisy.npz")
+    command = ["train", "--run", str(run), "--capture", str(capture), "--params", noisy, "--until", "refine"]
+    return main([*command, "--device", "cpu", "--json", "--no-report", *options])
+
+
+@pytest.fixture(scope="module")
+def refined(capture, tmp_path_factory):
+    run = doll().write_run(tmp_path_factory.mktemp("runs") / "gestures")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("avatar.training.refinement.config.RefineConfig", lambda seed=0: replace(QUICK, seed=seed))
+        assert refine(run, capture) == 0  # the capture says that these are tracked
+    return run
+
+
+def test_every_frame_has_a_row_and_held_out_frames_keep_theirs(refined):
+    params, apart = load_params(refined / REFINED_PARAMS), load_params(refined / REFINED_HELD_OUT_PARAMS)
+    start, held_out = disturbed(gestures()), NOVEL_POSES[0]
+    assert len(params) == len(apart) == FRAMES
+    np.testing.assert_allclose(params.transl[held_out], start.transl[held_out], atol=1e-12)
+    np.testing.assert_allclose(params.body_pose[held_out], start.body_pose[held_out], atol=1e-9)
+    assert np.abs(params.transl[0] - start.transl[0]).max() > 1e-4
+    np.testing.assert_array_equal(params.transl[:held_out], apart.transl[:held_out])
+    assert np.abs(apart.transl[held_out] - start.transl[held_out]).max() > 1e-4
+    numbers = json.loads((refined / "66_refine" / "refinement.json").read_text())
+    assert numbers["training"]["frames"] == list(range(held_out)) and numbers["held_out"]["frames"] == [held_out]
+
+
+def test_it_stands_until_something_changes(refined, capture, capsys):
+    assert refine(refined, capture) == 0
+    assert json.loads(capsys.readouterr().out)["stages"]["refine"]["ran"] is False
+    assert refine(refined, capture, "--seed", "1") == 0
+    assert json.loads(capsys.readouterr().out)["stages"]["refine"]["ran"] is True
+    assert refine(refined, capture) == 0
+
+
+def test_what_comes_after_takes_the_refined_ones(refined, capture):
+    noisy = capture / "params" / "params_noisy.npz"
+    inputs = TrainInputs(capture, noisy)
+    scene, before = open_scene(refined, inputs), open_scene(refined, inputs, refined=False)
+    np.testing.assert_array_equal(scene.capture.params(2).transl, load_params(refined / REFINED_PARAMS).transl[2:3])
+    np.testing.assert_array_equal(before.capture.params(2).transl, load_params(noisy).transl[2:3])
+    assert scene.digests[REFINED_PARAMS] == sha256_file(refined / REFINED_PARAMS) != before.digests.get(REFINED_PARAMS)
+    # Other parameters than those that it began with are taken as they are.
+    other = capture / "params" / "params.npz"
+    assert open_scene(refined, TrainInputs(capture, Path("params_noisy.npz"))).digests == scene.digests
+    assert params_in_use(refined, other) == other and params_in_use(refined, noisy) == refined / REFINED_PARAMS
+    with pytest.raises(InputError, match="Ring1"):
+        open_scene(refined, TrainInputs(capture, noisy, hold_out=("Ring1",)))
+
+
+def test_registered_parameters_come_before_the_captures_own(tmp_path):
+    assert params_to_begin_with(tmp_path, None) is None
+    (tmp_path / "05_register").mkdir()
+    gestures().save(tmp_path / REGISTERED_PARAMS)
+    assert params_in_use(tmp_path, None) == tmp_path / REGISTERED_PARAMS
+    assert params_in_use(tmp_path, Path("given.npz")) == Path("given.npz")
+
+
+def test_whether_poses_are_refined(refined, capture, tmp_path):
+    run = doll().write_run(tmp_path / "run")
+    exact, tracked = TrainInputs(capture, Path("params.npz")), TrainInputs(capture, Path("params_noisy.npz"))
+    assert not wants_refinement(run, exact, "auto") and wants_refinement(run, tracked, "auto")
+    assert wants_refinement(run, exact, "on") and not wants_refinement(run, tracked, "off")
+    with pytest.raises(InputError, match="66_refine"):
+        wants_refinement(refined, TrainInputs(capture, capture / "params" / "params_noisy.npz"), "off")
+
+
+def test_a_refinement_of_another_template_is_not_taken(refined, capture, tmp_path):
+    run = shutil.copytree(refined, tmp_path / "run")
+    it = doll().template
+    replace(it, vertex_colors=it.vertex_colors // 2).save(run / TEMPLATE)
+    noisy = capture / "params" / "params_noisy.npz"
+    assert params_in_use(run, noisy) == noisy
+    assert standing_refinement(run, sha256_file(run / TEMPLATE)) is None
+
+
+def test_the_report_shows_it(refined):
+    record = standing_refinement(refined, sha256_file(refined / TEMPLATE))
+    assert record is not None and refinement_key_numbers(None) == ()
+    section = refine_section(record)
+    assert len(section.comparisons) == 4 and len(section.pictures) == 4
+    loss = next(curve for curve in section.curves if "loss" in curve.title)
+    assert set(loss.lines) == {"before", "after"} and len(loss.lines["after"][0]) == NOVEL_POSES[0]
+    assert any("held-out" in text for text in section.text) and section.checks
+    (number,) = refinement_key_numbers(record)
+    assert number.value.endswith("degrees")
+    seen = read_manifest(refined / "66_refine")["numbers"]["seen"]
+    assert seen["cameras"] == ["Ring0", "Ring1", "Ring2", "Ring3"] and NOVEL_POSES[0] not in seen["frames"]

@@ -1,0 +1,128 @@
+"""Poses of a doll refined on its photographs: disturbed ones come back, right ones stay, held-out ones are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avatar.gaussians.sampling import SamplingConfig
+from avatar.training.refinement.align import Alignment
+from avatar.training.refinement.config import Level, RefineConfig
+from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from tests.dolls.gesturing import NOVEL_POSES, disturbed, gestures, sequence, template, write_gestures
+
+CONFIG = RefineConfig(
+    sampling=SamplingConfig(count=2500, head_share=None, sh_degree=0, opacity=0.95),
+    reference_levels=(Level(0, 2),),
+    levels=(Level(1, 2), Level(0, 4)),
+    pixels_per_error=500.0,
+)
+QUICK = replace(CONFIG, reference_levels=(Level(1, 1),), levels=(Level(1, 1),))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_gestures(tmp_path_factory.mktemp("captures") / "gestures")
+
+
+@pytest.fixture(scope="module")
+def start() -> BodyParams:
+    return disturbed(gestures())
+
+
+@pytest.fixture(scope="module")
+def frames(capture, start, tmp_path_factory):
+    return sequence(capture, start, tmp_path_factory.mktemp("start"))
+
+
+@pytest.fixture(scope="module")
+def found(frames) -> Refinement:
+    return refine_poses(frames, CONFIG)
+
+
+def error(params: BodyParams, rows: tuple[int, ...]) -> float:
+    """Mean distance of the bare skin from the truth, millimetres."""
+    bare = ~template().cloth_mask
+    apart = template().pose(params)[:, bare] - template().pose(gestures().select(list(rows)))[:, bare]
+    return 1e3 * float(np.linalg.norm(apart, axis=-1).mean())
+
+
+def test_disturbed_poses_come_back(found, start):
+    # A pixel of these pictures is 13 mm.
+    before = error(start.select(list(found.frames)), found.frames)
+    assert before > 10.0 and error(found.params, found.frames) < 0.3 * before
+    assert (found.after < found.before).all() and found.kept == ()
+
+
+def test_what_changed_is_told(found, start):
+    assert found.frames == (0, 1, 2, 3, 4) and found.turned.shape == (5, len(found.joints))
+    apart = 1e3 * np.linalg.norm(found.params.transl - start.select(list(found.frames)).transl, axis=1)
+    np.testing.assert_allclose(found.moved, apart, atol=1e-6)
+    assert found.turned[:, found.joints.index("head")].max() > 0.2
+    np.testing.assert_array_equal(found.params.betas, start.select(list(found.frames)).betas)
+
+
+def test_frames_whose_photographs_like_the_start_better_keep_it(frames, found, start, monkeypatch):
+    def astray(self, levels, told):
+        self.state = replace(self.state, transl=self.state.transl + [0.1, 0.0, 0.0])
+
+    monkeypatch.setattr(Alignment, "run", astray)
+    kept = refine_held_out(frames, found.gaussians, CONFIG)
+    assert kept.kept == NOVEL_POSES and not kept.turned.any() and not kept.moved.any()
+    given = start.select(list(NOVEL_POSES))
+    np.testing.assert_allclose(kept.params.transl, given.transl, atol=1e-12)
+    np.testing.assert_allclose(kept.params.body_pose, given.body_pose, atol=1e-9)
+
+
+def test_right_poses_stay(capture, tmp_path):
+    exact = refine_poses(sequence(capture, gestures(), tmp_path), CONFIG)
+    assert error(exact.params, exact.frames) < 2.0
+
+
+def test_the_same_seed_gives_the_same_bits(frames):
+    one, two = (refine_poses(frames, QUICK) for _ in range(2))
+    for name, array in one.params.as_dict().items():
+        np.testing.assert_array_equal(array, two.params.as_dict()[name])
+    assert not np.array_equal(one.params.transl, refine_poses(frames, replace(QUICK, seed=1)).params.transl)
+
+
+def test_held_out_cameras_are_never_read_and_held_out_frames_are_refused(frames, monkeypatch):
+    from avatar.training.refinement import refine as module
+
+    read: set[tuple[str, int]] = set()
+    real = module.read_view
+
+    def recorded(capture, camera, frame):
+        read.add((camera, frame))
+        return real(capture, camera, frame)
+
+    monkeypatch.setattr(module, "read_view", recorded)
+    refine_poses(frames, QUICK)
+    splits = frames.capture.splits
+    assert {camera for camera, _ in read} == set(splits.train_cameras)
+    assert {frame for _, frame in read} == set(splits.train_frames)
+    with pytest.raises(InputError, match="trained on"):
+        refine_poses(frames, QUICK, frames=(0, NOVEL_POSES[0]))
+    with pytest.raises(InputError, match="trained on"):
+        refine_poses(frames, QUICK, reference=NOVEL_POSES[0])
+
+
+def test_held_out_frames_are_refined_apart_on_training_cameras(frames, found, start):
+    apart = refine_held_out(frames, found.gaussians, CONFIG)
+    assert apart.frames == NOVEL_POSES and apart.gaussians is found.gaussians
+    assert error(apart.params, NOVEL_POSES) < 0.6 * error(start.select(list(NOVEL_POSES)), NOVEL_POSES)
+    with pytest.raises(InputError, match="held out"):
+        refine_held_out(frames, found.gaussians, CONFIG, frames=(0,))
+
+
+def test_steps_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="levels"):
+        RefineConfig(levels=())
+    with pytest.raises(InputError, match="levels"):
+        RefineConfig(levels=(Level(0, 0),))
+    with pytest.raises(InputError, match="robust"):
+        RefineConfig(robust=0.0)
