@@ -94,7 +94,7 @@ def test_a_build_registers_where_the_capture_says_that_its_parameters_are_tracke
 
 
 def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
-    unused = shutil.ignore_patterns("geometry", "normals", "rgbs", "masks", "params")
+    unused = shutil.ignore_patterns("geometry", "normals", "rgbs", "masks", "params", "keypoints")
     capture = shutil.copytree(FIXTURE, tmp_path / "capture", ignore=unused)
     with pytest.raises(InputError, match=r"params/000000\.npz"):
         registration_of(tmp_path, capture=capture)
