@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -129,6 +130,15 @@ class AvatarSequence:
         self._motions: OrderedDict[int, Motion] = OrderedDict()
         self._expected: dict[tuple[str, int], Future[View]] = {}
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
+
+    @cached_property
+    def normal_maps(self) -> int:
+        """The number of training views that have a normal map, none where they are not read."""
+        if not self.config.normals:
+            return 0
+        rows = np.isin(list(self.capture.cameras), self.train_cameras)
+        views = rows[:, None] & np.isin(self.capture.frames, self.train_frames) & self.capture.presence()
+        return int((views & self.capture.presence("normal")).sum())
 
     def motion(self, frame: int) -> Motion:
         """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.

@@ -15,6 +15,7 @@ from avatar.metrics.view_quality import ViewQuality, mean_quality, spread_over_f
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_values import jsonable
+from smplxpp.metrics.pose_error import PoseError
 
 SCHEMA = 1
 SKINNING_ALONE = "skinning alone"
@@ -94,6 +95,9 @@ class EvalReport:
         skinning_alone: distances of the template that follows its joints, as `ModelFigures.surfaces`.
         conventions: what the figures mean, in words.
         inputs: what the figures rest on, as far as it is known.
+        refined_poses: models in held-out frames whose poses were refined on the training cameras' photographs; in
+            `models` they are as the tracker gave them.
+        poses: errors of the poses in use, by frames ("training frames" ...), where the exact ones are known.
     """
 
     capture: str
@@ -102,14 +106,18 @@ class EvalReport:
     skinning_alone: dict[str, Surfaces] = field(default_factory=dict)
     conventions: dict[str, str] = field(default_factory=dict)
     inputs: InputProtocol = field(default_factory=InputProtocol)
+    refined_poses: dict[str, ModelFigures] = field(default_factory=dict)
+    poses: dict[str, PoseError] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Make what JSON holds, with counts, means and spreads; infinite figures are null, as JSON has none."""
         out = jsonable(self)
-        for name, model in self.models.items():
-            for what in ("mean", "spread", "counts"):
-                out["models"][name][what] = jsonable({part: getattr(model, what)(part) for part in model.views})
-            _add_spreads(out["models"][name]["surfaces"], model.surfaces)
+        out["inputs"]["name"] = self.inputs.name
+        for key, models in (("models", self.models), ("refined_poses", self.refined_poses)):
+            for name, model in models.items():
+                for what in ("mean", "spread", "counts"):
+                    out[key][name][what] = jsonable({part: getattr(model, what)(part) for part in model.views})
+                _add_spreads(out[key][name]["surfaces"], model.surfaces)
         _add_spreads(out["skinning_alone"], self.skinning_alone)
         return {"schema": SCHEMA, **out}
 
@@ -135,6 +143,8 @@ class EvalReport:
                 skinning_alone=_surfaces(values["skinning_alone"]),
                 conventions=dict(values["conventions"]),
                 inputs=InputProtocol.from_dict(values.get("inputs", {})),
+                refined_poses={name: _model(model) for name, model in values.get("refined_poses", {}).items()},
+                poses={name: _pose(error) for name, error in values.get("poses", {}).items()},
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
@@ -172,6 +182,12 @@ def _model(values: Mapping[str, Any]) -> ModelFigures:
         parameters=dict(values["parameters"]),
         bytes=values["bytes"],
     )
+
+
+def _pose(values: Mapping[str, Any]) -> PoseError:
+    # Distances of vertices that there are none of are null.
+    figures = {name: float("nan") if value is None else value for name, value in values.items() if name != "frames"}
+    return PoseError(frames=int(values["frames"]), **figures)
 
 
 def _quality(values: Mapping[str, Any]) -> ViewQuality:

@@ -12,6 +12,7 @@ from avatar.metrics.surface_quality import HEAD
 from smplxpp.core.labels import CLOTH_LABELS, SKIN
 
 MEGABYTE = 1e6
+REFINED_POSES = ", poses refined on training cameras"
 
 
 SPREAD = ".spread"
@@ -75,11 +76,15 @@ def summary_table(report: EvalReport) -> FigureTable:
         columns.append(Column(f"surface.{name}.{SKIN.name}.p2s", "P2S skin", f"{title}, mm", 2, "lower"))
     columns += [Column("fps", "FPS", "", 1, "higher"), Column("megabytes", "MB", "", 2, "lower")]
     rows = {name: summary_figures(model) for name, model in report.models.items()}
-    return FigureTable(tuple(columns), rows, f"Evaluation on {report.capture}: {report.inputs.sentence()}")
+    return FigureTable(
+        tuple(columns), rows, report.inputs.caption(f"evaluation on {report.capture}; {report.inputs.sentence()}")
+    )
 
 
-def image_table(report: EvalReport, name: str) -> FigureTable:
-    """Make the table of the image figures of one set of views."""
+def image_table(report: EvalReport, name: str, *, refined: bool = False) -> FigureTable:
+    """Make the table of the image figures of one set of views, of refined poses where `refined` says so."""
+    models = report.refined_poses if refined else report.models
+    title = f"{SETS[name]}{REFINED_POSES}" if refined else SETS[name]
     metric = report.metric or ""
     columns = (
         Column("images", "images", "", 0),
@@ -96,12 +101,12 @@ def image_table(report: EvalReport, name: str) -> FigureTable:
         Column("ssim_head", "SSIM", "head", 4, "higher"),
         Column("perceptual_head", metric, "head", 4, "lower"),
     )
-    rows = {model: _of_set(figures, name) for model, figures in report.models.items() if name in figures.views}
-    counts = next(figures.counts(name) for figures in report.models.values() if name in figures.views)
+    rows = {model: _of_set(figures, name) for model, figures in models.items() if name in figures.views}
+    counts = next(figures.counts(name) for figures in models.values() if name in figures.views)
     held = (
         f"{counted(counts.images, 'image')}, {counted(counts.frames, 'frame')} of {counted(counts.cameras, 'camera')}"
     )
-    return FigureTable(columns, rows, f"{SETS[name]}: {held}; {report.inputs.sentence()}")
+    return FigureTable(columns, rows, report.inputs.caption(f"{title}, {held}; {report.inputs.sentence()}"))
 
 
 def _of_set(model: ModelFigures, name: str) -> dict[str, float | None]:
@@ -128,7 +133,9 @@ def surface_table(report: EvalReport) -> FigureTable:
         ]
     rows = {SKINNING_ALONE: surface_figures(report.skinning_alone)} if report.skinning_alone else {}
     rows |= {name: surface_figures(model.surfaces) for name, model in report.models.items() if model.surfaces}
-    return FigureTable(tuple(columns), rows, f"Posed mesh and true surface: {report.inputs.sentence()}")
+    return FigureTable(
+        tuple(columns), rows, report.inputs.caption(f"posed mesh and true surface; {report.inputs.sentence()}")
+    )
 
 
 def cost_table(report: EvalReport) -> FigureTable:
@@ -147,7 +154,21 @@ def cost_table(report: EvalReport) -> FigureTable:
         Column("megabytes", "MB", "", 2, "lower"),
     )
     rows = {name: summary_figures(model) for name, model in report.models.items()}
-    return FigureTable(columns, rows, f"Speed{where} and size")
+    return FigureTable(columns, rows, report.inputs.caption(f"speed{where} and size"))
+
+
+def pose_table(report: EvalReport) -> FigureTable:
+    """Make the table of the poses in use against the exact ones."""
+    columns = (
+        Column("frames", "frames", "", 0),
+        Column("body_mm", "body", "mm", 1, "lower"),
+        Column("bare_mm", "under bare skin", "mm", 1, "lower"),
+        Column("covered_mm", "under cloth", "mm", 1, "lower"),
+        Column("joints_mm", "joints", "mm", 1, "lower"),
+        Column("degrees", "degrees a joint", "", 2, "lower"),
+    )
+    caption = report.inputs.caption("poses in use against the exact ones, which nothing else here has seen")
+    return FigureTable(columns, {name: vars(one) for name, one in report.poses.items()}, caption, row_title="poses")
 
 
 def evaluation_tables(report: EvalReport) -> dict[str, FigureTable]:
@@ -155,5 +176,8 @@ def evaluation_tables(report: EvalReport) -> dict[str, FigureTable]:
     tables = {"summary": summary_table(report)}
     measured = [name for name in SETS if any(name in model.views for model in report.models.values())]
     tables |= {name: image_table(report, name) for name in measured}
+    again = [name for name in SETS if any(name in model.views for model in report.refined_poses.values())]
+    tables |= {f"{name}_refined": image_table(report, name, refined=True) for name in again}
+    tables |= {"poses": pose_table(report)}
     tables |= {"surface": surface_table(report), "cost": cost_table(report)}
     return {name: table for name, table in tables.items() if table.rows and table.columns}

@@ -93,7 +93,7 @@ def ablate(
     stages = ablation_stages(preset, training_frames=len(trainer.sequence(CLOTHED).train_frames))
     own = trainer.sequence(CLOTHED)
     known = replace(
-        input_protocol(run, inputs, scene.capture),
+        input_protocol(run, scene.capture),
         training_frames=len(own.train_frames),
         training_cameras=len(own.train_cameras),
     )

@@ -58,7 +58,14 @@ def ablation_table(result: AblationResult) -> FigureTable:
         ]
     columns += [Column("megabytes", "MB", "", 1, "lower"), Column("minutes", "min", "training", 1)]
     rows = {one.row.title: row_figures(one) for one in result.rows.values()}
-    return FigureTable(tuple(columns), rows, f"Ablation on {capture}", row_title="")
+    return FigureTable(tuple(columns), rows, _caption(result, capture), row_title="")
+
+
+def _caption(result: AblationResult, capture: str) -> str:
+    if not result.rows:
+        return ""
+    known = result.report.inputs
+    return known.caption(f"ablation on {capture}; {known.sentence()}")
 
 
 def row_figures(result: RowResult) -> dict[str, float | None]:

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.runs.stage import goes_on
 from smplxpp.core.errors import InputError
 
@@ -52,6 +52,8 @@ class Ablate:
     """Points of a mesh for its distance to the true surface; 0 leaves the surface out."""
     hold_out: tuple[str, ...] = ()
     """Cameras to keep from training and to measure on; by default those that the capture holds out."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -88,7 +90,7 @@ class Ablate:
         with _progress(enabled=not self.json) as (training, measuring):
             outcome = ablate(
                 self.run_folder,
-                TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale),
+                TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol),
                 rows,
                 preset,
                 config,

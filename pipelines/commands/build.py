@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json as jsonlib
+import logging
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pipelines.commands.options import OptionalPath
+from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
 from pipelines.runs.layout import (
     BIND_STAGE,
@@ -24,10 +25,11 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
-from pipelines.stages.said_of_inputs import TRACKED, said_of_inputs, said_of_parameters
-from smplxpp.capture import find_reference
+from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
+from smplxpp.capture import ReferenceFrame, find_reference
 from smplxpp.core.errors import InputError
 
+log = logging.getLogger(__name__)
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
 
@@ -49,7 +51,10 @@ class Build:
     """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
     auto: `capture` with --capture, else 4ddress."""
     label_source: Literal["auto", "scan", "views"] = "auto"
-    """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the scan's first."""
+    """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the views' where there
+    are any. Labels of a scan are what nobody has of a person that was photographed."""
+    protocol: OptionalText = None
+    """With --capture: the protocol whose parameters and labels are used; later commands on the run keep to it."""
     frame: int = 0
     """Reference frame, near T-pose."""
     body: OptionalPath = None
@@ -142,16 +147,10 @@ class Build:
         label_set = self.label_set
         if self.capture is not None:
             registered = self._registers()
-            found = find_reference(self.capture, frame=self.frame, params=self.params, fitted=not registered)
-            labels = self.labels or (found.scan_labels if self.label_source != "views" else None)
-            if labels is None and not found.label_maps:
-                raise InputError(
-                    f"capture {found.subject}",
-                    expected="labels of the scan or label maps of its views",
-                    received="neither",
-                    remedy="name a file with --labels",
-                )
-            motion = self.capture / "params" / "params.npz"
+            found = find_reference(
+                self.capture, frame=self.frame, params=self.params, protocol=self.protocol, fitted=not registered
+            )
+            labels = self.labels or self._scan_labels(found)
             return BuildInputs(
                 subject=found.subject,
                 scan=found.scan,
@@ -162,9 +161,12 @@ class Build:
                 label_maps={} if labels else found.label_maps,
                 cameras=None if labels else found.cameras_file,
                 label_set="capture" if label_set == "auto" else label_set,
-                motion=motion if motion.is_file() and not registered else None,
+                motion=None if registered else found.motion,
                 body=self.body,
+                protocol=self.protocol,
             )
+        if self.protocol is not None:
+            raise InputError("option protocol", expected="with --capture", received="with --scan")
         if self.params is None or self.scan is None:
             raise InputError("input", expected="--params with --scan", received="no --params")
         return BuildInputs(
@@ -185,10 +187,13 @@ class Build:
             return self.register == "on"
         if self._standing_registration() is not None:
             return True
-        if self.params is None and not any((self.capture / "params").glob("*.npz")):
+        if not self.capture.is_dir():
+            return False
+        said = SaidOfInputs.of_folder(self.capture, self.protocol)
+        params = said.own_parameters() if self.params is None else named_params(self.capture, self.params)
+        if params is None:
             return (self.capture / "keypoints").is_dir()
-        said = said_of_inputs(self.capture).get("parameters") if self.capture.is_dir() else None
-        return said_of_parameters(said, self.params, self.capture) == TRACKED
+        return said.given_parameters(params) == TRACKED
 
     def _standing_registration(self) -> RegisterInputs | None:
         """What `smplxpp register` has made in this run of this capture, from these parameters if any are named."""
@@ -201,7 +206,7 @@ class Build:
         ):
             return None
         params = named_params(self.capture, self.params)
-        same = found.capture.resolve() == self.capture.resolve()
+        same = found.capture.resolve() == self.capture.resolve() and found.protocol == self.protocol
         return found if same and (params is None or params.resolve() == found.params) else None
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
@@ -211,6 +216,7 @@ class Build:
         return self._standing_registration() or RegisterInputs(
             capture=self.capture,
             params=named_params(self.capture, self.params),
+            protocol=self.protocol,
             body=self.body,
             scan=self.scan,
             frame=self.frame,
@@ -219,6 +225,32 @@ class Build:
             units=self.units,
             up=self.up,
         )
+
+    def _scan_labels(self, found: ReferenceFrame) -> Path | None:
+        """The labels that come with the scan, if they are used; None where the views' label maps are.
+
+        Raises:
+            InputError: the labels that are asked for are not there.
+        """
+        if found.label_maps and self.label_source != "scan":
+            return None
+        if found.scan_labels is None or self.label_source == "views":
+            expected = {"scan": "labels of the scan", "views": "label maps of its views"}.get(
+                self.label_source, "label maps of its views or labels of the scan"
+            )
+            barred = f", by protocol {self.protocol}" if self.protocol else ""
+            raise InputError(
+                f"capture {found.subject}",
+                expected=expected,
+                received=f"none for frame {found.frame}{barred}",
+                remedy="name a file with --labels",
+            )
+        if self.label_source == "auto":
+            log.warning(
+                "no label maps of frame %d: the labels that come with the scan are used, which are no estimate",
+                found.frame,
+            )
+        return found.scan_labels
 
     def config(self) -> BuildConfig:
         """The choices of this build.

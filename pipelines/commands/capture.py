@@ -38,6 +38,8 @@ class CaptureCheckCommand:
     """Folder of mattes to check instead of the capture's own masks."""
     params: OptionalPath = None
     """Body parameters to check instead of the capture's own."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are checked."""
     body: OptionalPath = None
     """Body model file that the parameters are for; the open body by default."""
     out: OptionalPath = None
@@ -56,7 +58,12 @@ class CaptureCheckCommand:
 
         body = load_body(self.body)
         capture = open_capture(
-            self.capture, format=_reader(self.format), masks=self.masks, params=self.params, body=body
+            self.capture,
+            format=_reader(self.format),
+            masks=self.masks,
+            params=self.params,
+            body=body,
+            protocol=self.protocol,
         )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
         with counted_progress("images", enabled=not self.json) as progress:

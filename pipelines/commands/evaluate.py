@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import OptionalPath, require_avatar
+from pipelines.commands.options import OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress
 from smplxpp.core.errors import InputError
 
@@ -39,6 +39,11 @@ class Evaluate:
     """Cameras that count as held out, in the place of the capture's."""
     hold_out_frames: tuple[int, ...] = ()
     """Frames that count as held out, in the place of the capture's."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
+    held_out_poses: Literal["tracked", "both"] = "both"
+    """Poses of held-out frames: as tracked, or beside them those that the run refined on the training cameras, where it
+    has any."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the training."""
     body: OptionalPath = None
@@ -96,13 +101,14 @@ class Evaluate:
             speed_pictures=self.speed_pictures,
             shown=self.shown,
         )
-        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         with counted_progress("frames", enabled=not self.json) as progress:
             record = evaluate(
                 self.run_folder,
                 inputs,
                 config,
                 models=self.models,
+                refined=self.held_out_poses == "both",
                 device=choose_device(self.device),
                 force=self.force,
                 progress=progress,

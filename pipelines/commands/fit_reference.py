@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.options import OptionalInt, OptionalPath, require_avatar
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress, training_progress
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
@@ -34,6 +34,8 @@ class FitReference:
     """Folder of the capture: cameras, images, masks and body parameters of the frame."""
     frame: int = 0
     """Frame to fit."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -80,7 +82,7 @@ class FitReference:
 
         require_positive("option max-minutes", self.max_minutes, finite=False)
         config = self.config()
-        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         if wants_refinement(self.run_folder, inputs, self.refine_poses):
             with counted_progress("poses", enabled=not self.json) as told:
                 refine(self.run_folder, inputs, RefineConfig(seed=self.seed), told=told)

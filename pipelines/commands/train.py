@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, require_avatar
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.layout import BIND_STAGE
 from pipelines.runs.stage import StageRecord, goes_on
@@ -80,6 +80,8 @@ class Train:
     installed; a name gives the term to any preset."""
     hold_out: tuple[str, ...] = ()
     """Cameras to keep from training and to measure on; by default those that the capture holds out."""
+    protocol: OptionalText = None
+    """Protocol of the capture, whose parameters, labels and normals are read; by default the one of the build."""
     params: OptionalPath = None
     """Body parameters to take instead of the capture's own, the same as for the build."""
     body: OptionalPath = None
@@ -112,7 +114,7 @@ class Train:
         from pipelines.stages.scene import TrainInputs, open_scene
         from pipelines.stages.train import train, with_batch
 
-        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale)
+        inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         if not self.max_minutes > 0:
             raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
         config = self.config()

@@ -56,7 +56,6 @@ def draw_bones(
     for joint, parent in enumerate(parents):
         if parent >= 0 and shown[joint] and shown[parent]:
             draw.line([tuple(places[parent]), tuple(places[joint])], fill=BONE, width=max(1, round(1.6 * unit)))
-    for joint in np.flatnonzero(shown):
-        x, y = places[joint]
+    for x, y in places[shown]:
         draw.ellipse([x - 2.0 * unit, y - 2.0 * unit, x + 2.0 * unit, y + 2.0 * unit], fill=JOINT)
     return np.asarray(whole.resize((width, height), Image.Resampling.BOX))

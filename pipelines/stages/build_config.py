@@ -33,6 +33,7 @@ class BuildInputs:
         label_set: name of the label set that labels and label maps use, or a JSON mapping file.
         motion: parameters of the capture's own frames, for validation and the report; may be None.
         body: SMPL-X-layout body file, None for the open body.
+        protocol: of the capture, by which these files were found; None: without one.
     """
 
     subject: str
@@ -46,6 +47,7 @@ class BuildInputs:
     label_set: str = "4ddress"
     motion: Path | None = None
     body: Path | None = None
+    protocol: str | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -115,7 +117,7 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
         content = json.loads((run / BUILD_FILE).read_text())
         choices = content["config"]
         config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
-        values = content["inputs"]
+        values = {"protocol": None, **content["inputs"]}  # builds from before there were protocols had none
         found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
         found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         for name in ("labels", "cameras", "motion"):

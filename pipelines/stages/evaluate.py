@@ -18,7 +18,7 @@ from avatar.evaluation.protocol import (
     view_sets,
     with_people,
 )
-from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
+from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.gaussians.bound_file import load_bound
 from avatar.models.model_file import load_avatar
@@ -31,19 +31,23 @@ from pipelines.figures.evaluation import surface_picture, write_tiles
 from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.digests import TRAINING, sha256_file
-from pipelines.runs.layout import EVALUATE_STAGE
+from pipelines.runs.layout import EVALUATE_STAGE, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
 from pipelines.stages.evaluate_inputs import input_protocol
+from pipelines.stages.evaluate_poses import exact_params, pose_errors, refined_poses
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.stages.scene_digests import params_digest
+from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.validation import require_known
 from smplxpp.metrics.distance import MM
+from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 
 SEEN_OF_A_PIXEL = 0.05
 """How finely photographs place a surface, pixels; points of a clear pattern are found to 0.05 to 0.1.
@@ -60,6 +64,7 @@ def evaluate(
     config: EvaluationConfig,
     *,
     models: tuple[str, ...] = (),
+    refined: bool = True,
     device: str = "cpu",
     force: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -68,6 +73,7 @@ def evaluate(
 
     Args:
         models: names among `MODEL_FILES`; empty: `MEASURED`, as far as there are files.
+        refined: measure held-out poses that the run refined on training cameras too, where it has any.
         force: measure anew even if the stage stands.
         progress: called with frames done and all frames.
 
@@ -76,9 +82,12 @@ def evaluate(
             lacks views, masks or parameters.
     """
     files = model_files(run, models)
-    scene = open_scene(run, inputs)
+    scene = open_scene(run, inputs, measures=True)
     with_people(scene.capture, view_sets(scene.capture, config.protocol))  # a bad file ends it before work starts
-    known = input_protocol(run, inputs, scene.capture)
+    known = input_protocol(run, scene.capture)
+    body = load_body(inputs.body)
+    exact = exact_params(scene.capture, inputs.body, body)
+    again = refined_poses(run, scene.capture) if refined else None
     sequence = AvatarSequence(scene.capture, scene.template, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
     refuse_seen(
@@ -93,17 +102,37 @@ def evaluate(
             **scene.digests,
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
             "capture/surfaces": surface_digest(scene.capture, config.protocol),
+            **({} if again is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}),
+            **({} if exact is None else {"capture/exact parameters": params_digest(exact)}),
         },
         code=(__name__,),
         libraries=TRAINING,
         seed=config.seed,
     )
 
+    def _of_refined(capture: Capture) -> dict[str, ModelFigures]:
+        sets = tuple(name for name in view_sets(capture, config.protocol) if name.startswith("novel_pose"))
+        if not sets:
+            return {}
+        held_out = replace(config, protocol=replace(config.protocol, sets=sets), speed_pictures=0, shown=0)
+        there = AvatarSequence(capture, scene.template, device=device)
+        return evaluate_models(loaded, there, held_out, progress=progress).report.models
+
     def work(folder: Path) -> StageOutput:
         found = evaluate_models(loaded, sequence, config, files=files, progress=progress)
+        report = replace(found.report, inputs=known)
+        if again is not None:
+            report = replace(report, refined_poses=_of_refined(again))
+        if exact is not None:
+            captures = {"": scene.capture} | ({} if again is None else {", refined on training cameras": again})
+            report = replace(
+                report,
+                poses=pose_errors(captures, exact, scene.template),
+                conventions={**report.conventions, "poses": POSE_CONVENTION},
+            )
         return _write(
             folder,
-            replace(found, report=replace(found.report, inputs=known)),
+            replace(found, report=report),
             overlap=scene.overlap,
             pixel=pixel_size(sequence),
         )

@@ -3,62 +3,56 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from avatar.evaluation.input_protocol import NOT_KNOWN, InputProtocol
-from pipelines.runs.layout import TRAIN_STAGES
+from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
+from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_build
-from pipelines.stages.params_in_use import params_in_use
-from pipelines.stages.said_of_inputs import TRACKED, said_of_inputs, said_of_parameters
-from pipelines.stages.scene import TrainInputs
+from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps, path_of_params
+from pipelines.stages.scene import normal_maps
 from smplxpp.capture import Capture
-from smplxpp.capture.readers import simple
 
 
-def input_protocol(run: Path, inputs: TrainInputs, capture: Capture) -> InputProtocol:
+def input_protocol(run: Path, capture: Capture) -> InputProtocol:
     """Collect what capture, build and trainings say of the inputs; "not known" for whatever none of them says.
 
     A capture speaks for its own files alone: for the parameters that lie in it, and for the labels of a template that
-    was built from it.
+    was built from it. It says what a file is by the file's name under "inputs", or by naming it in a protocol that is
+    called exact or tracked. Parameters that the run made are tracked, if what they began with was.
 
     Raises:
         InputError: a capture that says it in other words than docs/captures.md.
     """
-    root = capture.recording.root
-    said = said_of_inputs(root) if capture.recording.format == simple.NAME else {}
-    has_normals = any(capture.recording.files.get("normal", {}).values())
-    frames, cameras = _trained_on(run)
+    said = SaidOfInputs.of(capture)
+    build = load_build(run)
+    parameters, stage = said.parameters(run, path_of_params(capture.recording.params))
+    of_template = parameters
+    if build is not None:
+        of_template = said.parameters(run, build[0].params or run / REGISTERED_PARAMS)[0]
+    if of_template != parameters:
+        parameters = NOT_KNOWN if NOT_KNOWN in (parameters, of_template) else MIXED
+    used, frames, cameras = _trained(run)
+    there, all_views = normal_maps(capture)
+    if used == "surface":
+        normals = "estimated"
+    else:
+        normals = "none" if not there or used == "none" else said.of_views("normals", folder_of_maps(capture, "normal"))
     return InputProtocol(
-        parameters=_of_parameters(said.get("parameters"), run, inputs.params, root),
-        labels=said.get("labels", NOT_KNOWN) if _labelled_by(run, root) else NOT_KNOWN,
-        normals=said.get("normals", NOT_KNOWN) if has_normals else "none",
+        parameters=parameters,
+        stage=stage,
+        labels=NOT_KNOWN if build is None else said.labels(build[0]),
+        normals=normals,
+        views_with_normals=there,
+        training_views=all_views,
         training_frames=frames,
         training_cameras=cameras,
     )
 
 
-def _of_parameters(said: Any, run: Path, chosen: Path | None, root: Path) -> str:
-    """The word for the parameters in use: those that a run has fitted are tracked, whatever it started from."""
-    if params_in_use(run, chosen) != chosen:
-        return TRACKED
-    return said_of_parameters(said, chosen, root) or NOT_KNOWN
-
-
-def _labelled_by(run: Path, root: Path) -> bool:
-    """Whether the labels of the run's template are files of this capture."""
-    build = load_build(run)
-    if build is None:
-        return False
-    found = build[0]
-    sources = list(found.label_maps.values()) or [found.labels or found.scan]
-    return all(path.exists() and path.resolve().is_relative_to(root.resolve()) for path in sources)
-
-
-def _trained_on(run: Path) -> tuple[int | None, int | None]:
-    """Frames and cameras of the last training that is in the run."""
+def _trained(run: Path) -> tuple[str | None, int | None, int | None]:
+    """Source of the normals, and frames and cameras, of the last training that is in the run."""
     for stage in reversed(TRAIN_STAGES):
         numbers = (read_manifest(run / stage) or {}).get("numbers", {})
         if "training_frames" in numbers and "training_cameras" in numbers:
-            return numbers["training_frames"], numbers["training_cameras"]
-    return None, None
+            return numbers.get("normals"), numbers["training_frames"], numbers["training_cameras"]
+    return None, None, None

@@ -306,6 +306,7 @@ class Trainer:
             with explain_resource_errors(self.run), self.options.bar(stage.name, stage.iterations) as report:
                 output = stage.work(self, replace(self._session(stage, identity), report=report), folder)
             output.numbers["seen"] = self._seen(stage)
+            output.numbers["protocol"] = self.scene.capture.protocol
             return output
 
         return run_stage(self.run, identity, work, force=force)

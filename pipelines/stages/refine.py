@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.data.sequence import AvatarSequence, SequenceConfig
+from avatar.evaluation.input_protocol import TRACKED
 from avatar.gaussians.bound_file import save_bound
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
@@ -29,7 +30,7 @@ from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with, told_of_given
 from pipelines.stages.refine_pictures import write_pictures
-from pipelines.stages.scene import TrainInputs, TrainScene, open_cameras, open_scene
+from pipelines.stages.scene import TrainInputs, TrainScene, of_protocol, open_cameras, open_scene
 from smplxpp.capture import Capture
 from smplxpp.capture.writers.cameras import write_plain_cameras_json
 from smplxpp.core.array_file import write_arrays
@@ -64,7 +65,7 @@ def wants_refinement(run: Path, inputs: TrainInputs, choice: Choice) -> bool:
     begins = params_to_begin_with(run, inputs.params)
     if stands or begins == run / REGISTERED_PARAMS:
         return True
-    return input_protocol(run, inputs, open_cameras(inputs)[0]).parameters == "tracked"
+    return input_protocol(run, open_cameras(of_protocol(run, inputs))[0]).parameters == TRACKED
 
 
 def refine(

@@ -15,6 +15,7 @@ from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, 
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
+from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
@@ -47,6 +48,7 @@ class TrainInputs:
             they are for, None for the open body.
         hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
         scale: of the images, 1 for all pixels.
+        protocol: of the capture; None: the run's.
     """
 
     capture: Path
@@ -54,6 +56,7 @@ class TrainInputs:
     body: Path | None = None
     hold_out: tuple[str, ...] = ()
     scale: float = 1.0
+    protocol: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,7 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             that does not stand in the images.
     """
     template = open_template(run)
+    inputs = of_protocol(run, inputs)
     inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture, train, held_out = open_cameras(inputs)
     if frame not in capture.frames:
@@ -130,21 +134,24 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
-def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True) -> TrainScene:
+def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures: bool = False) -> TrainScene:
     """Open the template of a run and a capture, and look at both.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
 
     Args:
         refined: with the run's refined parameters, if it has any that began with these.
+        measures: nothing is trained; then another protocol than the run's is logged and not refused.
 
     Raises:
-        InputError: no template; no training camera, image, mask or parameters; images of another size than their
-            camera; nobody in the masks; a template that does not stand in the images, or parameters of another body.
+        InputError: no template; another protocol than the template's; no training camera, image, mask or parameters;
+            images of another size than their camera; nobody in the masks; a template that does not stand in the images,
+            or parameters of another body.
     """
     template = open_template(run)
     if not template.cloth_mask.any():
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
+    inputs = of_protocol(run, inputs, measures=measures)
     inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
     capture, params = _with_params(_opened(inputs))
     capture = _with_masks(capture)
@@ -177,6 +184,13 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True) -> Train
     return TrainScene(template, capture, frame, built_frame, template_frame, overlap, digests)
 
 
+def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainInputs:
+    """The inputs with the protocol that is read."""
+    own_params = inputs.params is not None
+    protocol = chosen_protocol(run, inputs.protocol, own_params=own_params, measures=measures)
+    return replace(inputs, protocol=protocol)
+
+
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
@@ -192,7 +206,7 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
         InputError: unknown cameras, none, or none to train on.
     """
     body = None if inputs.body is None else load_body(inputs.body)
-    capture = open_capture(inputs.capture, params=inputs.params, body=body)
+    capture = open_capture(inputs.capture, params=inputs.params, body=body, protocol=inputs.protocol)
     if not capture.cameras or not capture.presence().any():
         raise InputError(
             f"capture {capture.name}",
@@ -217,6 +231,14 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
     if not train:
         raise InputError("cameras", expected="at least one to train on", received="all held out")
     return capture, train, tuple(held_out)
+
+
+def normal_maps(capture: Capture) -> tuple[int, int]:
+    """Training views that have a normal map, and all training views."""
+    splits = capture.splits
+    rows = np.isin(list(capture.cameras), splits.train_cameras)
+    views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
+    return int((views & capture.presence("normal")).sum()), int(views.sum())
 
 
 def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from smplxpp.capture import Capture
+from smplxpp.capture.recording import ParamSource
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 
@@ -23,9 +24,7 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
         if name in capture.recording.distortions:
             cameras.update(repr(capture.recording.distortions[name]).encode())
     for frame, row in params.items():
-        numbers.update(str(frame).encode())
-        for array in ARRAY_NAMES:
-            numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
+        _add_frame(numbers, frame, row)
     splits, used = capture.splits, 0
     for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
         for kind in ("image", "mask", "normal"):
@@ -39,3 +38,17 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
         f"capture/names and sizes of {used} files": files.hexdigest(),
         "capture/splits": hashlib.sha256(repr((splits, capture.recording.background)).encode()).hexdigest(),
     }
+
+
+def params_digest(source: ParamSource) -> str:
+    """Return the SHA-256 of the parameters of all frames."""
+    numbers = hashlib.sha256()
+    for frame in source.frames().tolist():
+        _add_frame(numbers, frame, source.read(frame))
+    return numbers.hexdigest()
+
+
+def _add_frame(numbers: hashlib._Hash, frame: int, row: BodyParams) -> None:
+    numbers.update(str(frame).encode())
+    for array in ARRAY_NAMES:
+        numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())

@@ -25,8 +25,9 @@ from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import refine
-from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
+from pipelines.stages.scene import TrainInputs, TrainScene, normal_maps, open_scene
 from pipelines.stages.teacher import TeacherStage
+from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -128,6 +129,7 @@ def train(
         scene = together.run_on_rank0(lambda: open_scene(run, inputs))
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
+    _tell_of_normals(scene.capture, config, steps)
     metric = load_metric(config.perceptual, device=together.device)
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
@@ -153,6 +155,20 @@ def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: Trai
             report(Progress(done, total, 0.0, 0.0))
 
         return refine(run, inputs, config, force=options.force, told=told)
+
+
+def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ...]) -> None:
+    """Say once what a loss with a normal term goes without."""
+    trainings = [getattr(config.preset, name) for name in ("teacher", "bake", "compensate") if name in steps]
+    there, views = normal_maps(capture)
+    if there == views or not any(training.weights.normal for training in trainings):
+        return
+    if there:
+        log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
+    elif config.teacher and config.preset.teacher.track is not None:
+        log.info("capture %s has no normal maps: those of the followed surface stand for them", capture.name)
+    else:
+        log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:

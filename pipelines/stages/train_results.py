@@ -99,6 +99,7 @@ def _output(
         "training_frames": len(sequence.train_frames),
         "training_cameras": len(sequence.train_cameras),
         "held_out_cameras": held_out,
+        "normals": _normals(sequence, folder),
         "convention": CONVENTION,
         "seconds_of_tracking": seconds[TRACK],
         "seconds_of_pretraining": seconds[PRETRAIN],
@@ -108,6 +109,13 @@ def _output(
         **found,
     }
     return StageOutput(_checks(everything, overlap), everything)
+
+
+def _normals(sequence: AvatarSequence, folder: Path) -> str:
+    """Where the normals of the loss came from: "maps" of the capture, the followed "surface", or "none"."""
+    if sequence.normal_maps:
+        return "maps"
+    return "surface" if any("normal" in line for line in read_metrics(folder / METRICS_FILE)) else "none"
 
 
 def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:

@@ -111,7 +111,9 @@ def write_estimated_labels(
     wrong = seen = 0
     for k, name in enumerate(capture.cameras):
         series = capture.recording.series("label", name)
-        for frame in () if series is None else series.numbers.tolist():
+        if series is None:
+            continue
+        for frame in series.numbers.tolist():
             path = series.required(frame)
             exact = np.asarray(read_labels(path))
             estimated = estimated_labels(exact, seed=[seed, _LABEL_SEED, k, frame], background=background)

@@ -114,6 +114,27 @@ def _turn_back(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], mean: csr_
         turned = turned_faces(mesh, mesh.vertices + d)
         if turned.sum() < fewest:
             best, fewest = d, int(turned.sum())
+    return _carry_whole(mesh, best, walls, limit) if fewest else best
+
+
+def _carry_whole(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit: float) -> np.ndarray:
+    """Carry faces that are still turned over as a whole, by the longest way of their corners; the best of all rounds.
+
+    A sliver turns when one of its corners goes further than it is high, however gently the others follow.
+    """
+    turned = turned_faces(mesh, mesh.vertices + d)
+    best, fewest = d, int(turned.sum())
+    for _ in range(_UNFLIP_ROUNDS):
+        corners = mesh.faces[turned]
+        longest = np.linalg.norm(d[corners], axis=-1).argmax(axis=1)
+        d = d.copy()
+        d[corners] = d[corners[np.arange(len(corners)), longest]][:, None]
+        d = _clear(mesh, d, walls, limit)
+        turned = turned_faces(mesh, mesh.vertices + d)
+        if turned.sum() < fewest:
+            best, fewest = d, int(turned.sum())
+        if not fewest:
+            break
     return best
 
 

@@ -61,6 +61,11 @@ class Capture:
         return self.recording.format
 
     @property
+    def protocol(self) -> str | None:
+        """Name of the protocol whose files are read, None without one."""
+        return self.recording.protocol
+
+    @property
     def label_set(self) -> str:
         """What the numbers of `labels` mean."""
         return self.recording.label_set

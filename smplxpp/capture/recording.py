@@ -79,6 +79,8 @@ class Recording:
         params, meshes, keypoints: or None.
         fps: frames a second, or None where the set does not say.
         problems: what the reader had to leave out.
+        protocol: name of the protocol whose files these are, None without one. protocols: names of those that the
+            capture has.
     """
 
     name: str
@@ -95,6 +97,8 @@ class Recording:
     keypoints: KeypointSource | None = None
     fps: float | None = None
     problems: tuple[Problem, ...] = field(default=())
+    protocol: str | None = None
+    protocols: tuple[str, ...] = ()
 
     def series(self, kind: str, camera: str) -> FileSeries | None:
         """The files of a kind for a camera."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from smplxpp.capture.files import FileSeries
+from smplxpp.capture.protocols import ProtocolFiles, choose_protocol, read_description
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
 
@@ -20,8 +21,10 @@ class ReferenceFrame:
         frame: number of the frame.
         scan, params: files; no parameters where there need be none. `params_frame` is the row of `params` that belongs
             to the frame.
+        motion: parameters of the capture's frames from the same source as `params`, or None.
         scan_labels: labels of the scan's vertices, or None.
-        label_maps: label image of each camera by name, with `cameras_file` their cameras.
+        label_maps: label image of each camera by name, without those that the capture holds out; with `cameras_file`
+            their cameras.
     """
 
     subject: str
@@ -29,27 +32,36 @@ class ReferenceFrame:
     scan: Path
     params: Path | None
     params_frame: int
+    motion: Path | None = None
     scan_labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
     cameras_file: Path | None = None
 
 
 def find_reference(
-    capture: str | Path, *, frame: int = 0, params: str | Path | None = None, fitted: bool = True
+    capture: str | Path,
+    *,
+    frame: int = 0,
+    params: str | Path | None = None,
+    protocol: str | None = None,
+    fitted: bool = True,
 ) -> ReferenceFrame:
     """Find frame `frame` in a capture folder of our simple layout.
 
     The layout: `scans/scan_FFFFFF.ply` (`.obj`), `scans/scan_FFFFFF_labels.npz`, `params/params.npz` (stacked) or
     `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `cameras.json` or `calibration.csv`. `params` names another
-    stacked parameter file (for instance a tracker's). Without `fitted` there need be no parameters: a registration is
-    to make them.
+    stacked parameter file (for instance a tracker's), whose rows are the motion then; `protocol` names the protocol
+    whose parameters and labels are taken, the scan's own labels only if it allows them. Without `fitted` there need be
+    no parameters: a registration is to make them.
 
     Raises:
-        InputError: no such folder, or scan or parameters missing.
+        InputError: no such folder, no such protocol, or scan or parameters missing.
     """
     root = Path(capture)
     if not root.is_dir():
         raise InputError("capture", expected="an existing folder", received=str(root))
+    description = read_description(root)
+    files = choose_protocol(root, description, protocol)
     number = f"{frame:06d}"
     scan = _first(root / "scans", [f"scan_{number}{suffix}" for suffix in (".ply", ".obj", ".glb")])
     if scan is None:
@@ -60,10 +72,15 @@ def find_reference(
             received=f"scans of {', '.join(have[:5]) or 'no frame'}",
             remedy="choose another frame with --frame, or build with --scan, --params and --labels",
         )
-    single = root / "params" / f"{number}.npz"
-    own = params is None and single.is_file()
-    params_file, row = (single, 0) if own else (stacked_params(root, params), frame)
-    if fitted and not params_file.is_file():
+    params_file, row, motion = _parameters(root, files, params, frame)
+    if fitted and params_file is None:
+        raise InputError(
+            f"protocol {files.name} of capture {root.name}",
+            expected="a file of parameters",
+            received="none",
+            remedy="name one with --params, or register the body (--register on)",
+        )
+    if fitted and params_file is not None and not params_file.is_file():
         raise InputError(
             f"capture {root.name}",
             expected=f"params/{number}.npz or params/params.npz",
@@ -71,20 +88,37 @@ def find_reference(
             remedy="convert your fit with `smplxpp params convert`",
         )
     pattern = re.compile(rf"^(?P<camera>.+)_label{number}\.(png|npy)$")
-    maps = {}
-    for path in sorted((root / "labels").glob(f"*/*_label{number}.*")):
-        if match := pattern.match(path.name):
+    maps, held_out = {}, set(map(str, description.get("novel_views", ())))
+    folder = () if files.labels is None else (root / files.labels).glob(f"*/*_label{number}.*")
+    for path in sorted(folder):
+        if (match := pattern.match(path.name)) and match["camera"] not in held_out:
             maps[match["camera"]] = path
     return ReferenceFrame(
         subject=root.resolve().name,
         frame=frame,
         scan=scan,
-        params=params_file if params_file.is_file() else None,
+        params=params_file if params_file is not None and params_file.is_file() else None,
         params_frame=row,
-        scan_labels=_first(root / "scans", [f"scan_{number}_labels.npz"]),
+        motion=motion,
+        scan_labels=_first(root / "scans", [f"scan_{number}_labels.npz"]) if files.scan_labels else None,
         label_maps=maps,
         cameras_file=_first(root, ["cameras.json", "calibration.csv"]),
     )
+
+
+def _parameters(
+    root: Path, files: ProtocolFiles, given: str | Path | None, frame: int
+) -> tuple[Path | None, int, Path | None]:
+    """Return the file that holds the frame, the frame's row in it, and the file with all frames, as far as named."""
+    if given is not None:
+        named = stacked_params(root, given)
+        return named, frame, named if named.is_file() else None
+    if files.name is not None:
+        chosen = files.parameter_file(root)
+        return chosen, frame, chosen
+    stacked, single = stacked_params(root), root / "params" / f"{frame:06d}.npz"
+    motion = stacked if stacked.is_file() else None
+    return (single, 0, motion) if single.is_file() else (stacked, frame, motion)
 
 
 def _first(folder: Path, names: list[str]) -> Path | None:

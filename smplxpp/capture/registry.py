@@ -42,6 +42,7 @@ def open_capture(
     person: int | None = None,
     body: BodyModel | None = None,
     hold_out_every: int | None = None,
+    protocol: str | None = None,
     cache_bytes: int = 1 << 30,
 ) -> Capture:
     """Open a capture of any known layout; nothing but calibration and lists of files is read.
@@ -56,10 +57,13 @@ def open_capture(
         person: whose keypoints, where there are several people; None: in each frame the surest.
         body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
         hold_out_every: hold out every n-th training camera as a novel view.
+        protocol: name of the protocol whose files are read, of those that the capture has; `params` goes before its
+            parameters.
         cache_bytes: bound of the decoded images kept, in each process that reads.
 
     Raises:
-        InputError: no such folder, no layout that fits or several, or what the reader refuses.
+        InputError: no such folder, no layout that fits or several, a protocol that the capture has not or whose files
+            are missing, or what the reader refuses.
     """
     # Absolute: a loader's worker may have another working directory.
     root = Path(path).absolute()
@@ -68,8 +72,17 @@ def open_capture(
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
     reader = READERS[format or detect_format(root)]
-    options = ReaderOptions(params=None if params is None else Path(params), body=body, person=person)
+    options = ReaderOptions(
+        params=None if params is None else Path(params), protocol=protocol, body=body, person=person
+    )
     recording = reader.read(root, options)
+    if recording.protocol != protocol:
+        raise InputError(
+            f"protocol {protocol} of capture {root.name}",
+            expected=f"a capture of our own layout ({simple.NAME}), which can have protocols",
+            received=f"one of the layout {recording.format}",
+            remedy="name its parameters with --params, or convert it with `smplxpp capture convert`",
+        )
     if masks is not None:
         recording = with_masks(recording, Path(masks))
     if keypoints is not None:

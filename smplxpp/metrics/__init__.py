@@ -12,6 +12,7 @@ from smplxpp.metrics.distance import (
     summarize,
 )
 from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
+from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
 from smplxpp.metrics.quality import MeshQuality, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
 from smplxpp.metrics.self_intersection import self_intersections
@@ -26,6 +27,7 @@ __all__ = [
     "MeshComparison",
     "MeshQuality",
     "PenetrationReport",
+    "PoseError",
     "StretchReport",
     "SurfaceSamples",
     "VariationStats",
@@ -34,9 +36,11 @@ __all__ = [
     "directed_distances",
     "edge_stretch",
     "flipped_faces",
+    "mean_pose_error",
     "mesh_quality",
     "penetration",
     "point_to_surface",
+    "pose_error",
     "presets",
     "sample_surface",
     "self_intersections",

@@ -42,10 +42,9 @@ class Observations:
             in the cameras' pixels; None: nothing of the kind.
         scans: by frame.
         initial: a fit to start from, a row a frame.
-        shape_frames: the frames that the shape is solved on; None: all. Held-out frames are not among them.
-        fps: frames a second, None where not known.
         shape_frames: those that the shape, and whatever else all frames share, is solved on; None: all. Frames held out
             are none of them: they get their poses alone.
+        fps: frames a second, None where not known.
     """
 
     frames: tuple[int, ...]
@@ -57,4 +56,3 @@ class Observations:
     initial: BodyParams | None = None
     shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
-    shape_frames: tuple[int, ...] | None = None

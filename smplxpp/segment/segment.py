@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, Num
+from scipy.sparse import csr_matrix, identity
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
@@ -24,6 +25,8 @@ class SegmentConfig:
         fold: cosine deficit that counts as a fold.
         pseudo_votes: added to every label, so that no probability is zero.
         full_votes: sum of votes from which a face is trusted fully.
+        rings: of neighbours whose votes speak for a face's confidence where its own are fewer than that: a pixel is
+            often larger than a face, and then votes fall on one face of several.
         label_trust: weight of the labels given with the scan, as a share of full votes.
         island_area: patches below this fraction of the surface's area take their surroundings' label.
     """
@@ -35,6 +38,7 @@ class SegmentConfig:
     fold: float = 0.1
     pseudo_votes: float = 0.02
     full_votes: float = 3.0
+    rings: int = 4
     label_trust: float = 0.35
     island_area: float = 1e-4
 
@@ -46,7 +50,7 @@ class SegmentedScan:
     Attributes:
         face_labels: (M,) int64 label ids.
         confidence: (M,) in [0, 1]: the share of the votes that the label has, times how far the votes sum up to full
-            trust; 0 where the label comes from the neighbours alone.
+            trust; of a face with fewer votes than that, they are counted with those around it. 0 where no vote is near.
         seen: (M,) bool: some vote fell on the face.
         island_faces: faces relabelled because their patch was too small.
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
@@ -113,10 +117,33 @@ def segment_scan(
     index, after = minimize_potts(problem)
     cut = candidates[index]
     labels = _absorb_islands(mesh, cut, pairs, ends, config.island_area)
-    confidence = np.where(total > 0, votes[np.arange(len(labels)), labels] / np.maximum(total, 1e-300), 0.0) * certainty
+    confidence = _confidence(votes, labels, pairs, config)
     return SegmentedScan(
         labels, confidence, total > 0, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE
     )
+
+
+def _confidence(
+    votes: Float64[np.ndarray, "M L"], labels: Int64[np.ndarray, " M"], pairs: np.ndarray, config: SegmentConfig
+) -> Float64[np.ndarray, " M"]:
+    """How clearly the votes on each face, or on it and the rings around it, speak for its label."""
+    own = np.stack([votes.sum(axis=1), votes[np.arange(len(labels)), labels]], axis=1)
+    few = np.flatnonzero(own[:, 0] < config.full_votes)
+    ones = np.ones(len(pairs), dtype=np.int8)
+    touching = csr_matrix((ones, pairs.T), shape=(len(labels),) * 2)
+    near = touching + touching.T + identity(len(labels), dtype=np.int8, format="csr")
+    reached = near[few]
+    for _ in range(config.rings):
+        if not len(few):
+            break
+        reached.data[:] = 1
+        total = np.asarray(reached @ votes.sum(axis=1))
+        own[few] = np.stack([total, (reached @ votes)[np.arange(len(few)), labels[few]]], axis=1)
+        left = total < config.full_votes
+        few, reached = few[left], reached[left] @ near
+    total, agreeing = own.T
+    certainty = np.minimum(total, config.full_votes) / config.full_votes
+    return np.where(total > 0, agreeing / np.maximum(total, 1e-300), 0.0) * certainty
 
 
 def _votes_of_labels(

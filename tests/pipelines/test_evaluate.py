@@ -31,7 +31,6 @@ from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES
 from pipelines.stages.evaluate_inputs import input_protocol
-from pipelines.stages.scene import TrainInputs
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -139,10 +138,10 @@ def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
     figures, pictures = evaluation_sections(record)
     assert [table.caption for table in figures.tables][:2] == [
-        "Evaluation on doll: parameters not known, labels not known, normals none, "
+        "not known: evaluation on doll; parameters not known, labels not known, normals none, "
         "trained on a number of frames that is not known",
-        "training views: 2 images, 1 frame of 2 cameras; parameters not known, labels not known, normals none, "
-        "trained on a number of frames that is not known",
+        "not known: training views, 2 images, 1 frame of 2 cameras; parameters not known, labels not known, "
+        "normals none, trained on a number of frames that is not known",
     ]
     assert any("Perceptual distance: none was measured" in text for text in figures.text)
     assert figures.tables[0].header[1] == "novel views: PSNR" and len(figures.tables[0].rows) == 2
@@ -170,24 +169,32 @@ def test_inputs_are_what_capture_build_and_training_say(tmp_path):
     run.mkdir()
 
     def known(params: Path | None = None) -> InputProtocol:
-        capture = open_capture(root)
-        return input_protocol(run, TrainInputs(root, params), capture)
+        return input_protocol(run, open_capture(root, params=params))
 
     def say(**said: object) -> None:
         content = json.loads((root / "capture.json").read_text()) | {"inputs": said}
         (root / "capture.json").write_text(json.dumps(content))
 
-    assert known() == InputProtocol(normals="none")
+    nothing, some = InputProtocol(normals="none"), {"views_with_normals": 0, "training_views": 28}
+
+    def expected(*words: str) -> InputProtocol:
+        return InputProtocol(*words, **some)
+
+    assert known() == replace(nothing, **some)
     say(parameters="exact", labels="true", normals="estimated")
-    assert known() == InputProtocol("exact", normals="none")  # labels: nobody says what the run was built from
+    assert known() == expected("exact", "not known", "none")  # labels: nobody says what the run was built from
     (root / "scan.ply").touch()
     (root / "params" / "params_noisy.npz").touch()
     save_build(run, BuildInputs("doll", root / "scan.ply", root / "params" / "000000.npz"), BuildConfig())
-    assert known() == InputProtocol("exact", "true", "none")
+    assert known() == expected("exact", "true", "none") and known().name == "exact"
     assert known(root / "params" / "params_noisy.npz").parameters == "not known"
     say(parameters={"params.npz": "exact", "params_noisy.npz": "tracked"}, labels="estimated")
     for path in (Path("params_noisy.npz"), root / "params" / "params_noisy.npz"):
-        assert known(path) == InputProtocol("tracked", "estimated", "none")
+        # A template made with exact parameters, driven by tracked ones, is neither.
+        assert known(path) == expected("mixed", "estimated", "none") and known(path).name == "mixed"
+    save_build(run, BuildInputs("doll", root / "scan.ply", root / "params" / "params_noisy.npz"), BuildConfig())
+    assert known(path) == expected("tracked", "estimated", "none") and known(path).name == "tracked"
+    assert known().parameters == "mixed"
     (tmp_path / "params_noisy.npz").touch()
     assert known(tmp_path / "params_noisy.npz").parameters == "not known"
     save_build(run, BuildInputs("doll", tmp_path / "other.ply", root / "params" / "000000.npz"), BuildConfig())
@@ -197,15 +204,19 @@ def test_inputs_are_what_capture_build_and_training_say(tmp_path):
     (run / "85_bake" / "manifest.json").write_text(json.dumps(manifest))
     assert known().sentence().endswith("trained on 4 frames of 6 cameras")
     say(parameters="good")
+    save_build(run, BuildInputs("doll", root / "scan.ply", root / "params" / "000000.npz"), BuildConfig())
     with pytest.raises(InputError, match="'exact' or 'tracked'"):
         known()
 
 
 def test_the_fixture_says_that_its_inputs_are_exact(tmp_path):
     capture = open_capture(FIXTURE)
-    assert input_protocol(tmp_path, TrainInputs(FIXTURE), capture) == InputProtocol("exact", "not known", "true")
-    noisy = TrainInputs(FIXTURE, Path("params_noisy.npz"))
-    assert input_protocol(tmp_path, noisy, capture).parameters == "tracked"
+    found = input_protocol(tmp_path, capture)
+    assert (found.parameters, found.labels, found.normals) == ("exact", "not known", "true")
+    assert (found.views_with_normals, found.training_views) == (7, 91)
+    assert "normals true (7 of 91 views), trained" in found.sentence()
+    noisy = input_protocol(tmp_path, open_capture(FIXTURE, params="params_noisy.npz"))
+    assert noisy.parameters == "tracked" and noisy.name == "not known"
 
 
 def test_an_evaluation_of_other_models_does_not_stand(evaluated, tmp_path):
@@ -272,7 +283,7 @@ def test_the_terminal_shows_the_tables(evaluated, capture, capsys):
     arguments = ["evaluate", str(evaluated), "--capture", str(capture), "--device", "cpu", *QUICK, "--no-report"]
     assert main(arguments) == 0
     out = capsys.readouterr().out
-    assert "Evaluation on doll" in out and "skinning alone" in out and "stands, not run again" in out
+    assert "not known: evaluation on doll" in out and "skinning alone" in out and "stands, not run again" in out
 
 
 def test_tiles_keep_every_pixel(tmp_path):

@@ -69,7 +69,25 @@ def test_unseen_faces_are_flagged_and_take_the_neighbours_label(ball):
     result = segment_scan(ball, votes=votes)
     np.testing.assert_array_equal(result.seen, ~unseen)
     assert (result.face_labels[unseen] == 3).all()
-    assert (result.confidence[unseen] == 0).all()
+    # Votes speak for the faces right beside them, and for no face further into what nobody saw.
+    deep = np.linalg.norm(ball.triangles.mean(1) - [0, 1, 0], axis=1) < 0.2
+    assert deep.any() and (result.confidence[deep] == 0).all()
+
+
+def test_faces_smaller_than_a_pixel_are_as_sure_as_their_surroundings(ball):
+    """Once a scan of 80k faces in images of 256 x 320 had a confidence of 0.35 with 99.6 % of its labels right."""
+    truth, rng = halves(ball), np.random.default_rng(0)
+    votes = np.zeros((ball.face_count, 6))
+    hit = rng.random(ball.face_count) < 0.4
+    votes[hit, truth[hit]] = 1.0
+    result = segment_scan(ball, votes=votes)
+    sure = result.confidence
+    assert sure.mean() > 0.9
+    away = np.abs(ball.triangles.mean(1)[:, 1]) > 0.2
+    assert sure[away].mean() > 0.97 > sure[~away].mean()
+    votes[hit] = 0.0
+    votes[hit, rng.integers(0, 6, int(hit.sum()))] = 1.0  # labels that say nothing make nothing sure
+    assert segment_scan(ball, votes=votes).confidence.mean() < 0.5
 
 
 def test_given_labels_lose_specks(ball):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,22 +26,25 @@ from avatar.training.engine.processes import Distributed
 from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
-log = logging.getLogger(__name__)
+Surface = Callable[[View, int], View]
+"""Gives a view of a frame normals that the capture has not."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaskContext:
-    """What a task has beside data, model and configuration; the perceptual distance alone changes its steps.
+    """What a task has beside data, model and configuration; perceptual distance and surface alone change its steps.
 
     Attributes:
         perceptual: for the perceptual term; None leaves it out.
         distributed: the processes that train together; None: this one alone.
         preview: called at every evaluation with rendered (H, W, 3) uint8 images by name.
+        surface: for the normal term, normals of views that have no map; None leaves the term out for these.
     """
 
     perceptual: PerceptualDistance | None = None
     distributed: Distributed | None = None
     preview: Preview = lambda images: None
+    surface: Surface | None = None
 
 
 ALONE = TaskContext()
@@ -148,7 +150,7 @@ class PhotometricTask(OptimizationTask[Item]):
         self.sequence, self.model, self.config, self.preview = sequence, model, config, context.preview
         self.perceptual = context.perceptual if config.weights.perceptual else None
         self.iteration = 0
-        self._told_of_normals = False
+        self.surface = context.surface if config.weights.normal else None
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
         super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
 
@@ -167,10 +169,13 @@ class PhotometricTask(OptimizationTask[Item]):
         """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
-        """Return the item's photographs, at half their size in the coarse part of the training."""
+        """Return the item's photographs, at half their size in the coarse part of the training, with all normals."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
         coarse = self.iteration < self.config.coarse * self.config.iterations
-        return [view.halved() for view in views] if coarse else views
+        views = [view.halved() for view in views] if coarse else views
+        if self.surface is None:
+            return views
+        return [self.surface(view, item.frame) if view.normals is None else view for view in views]
 
     def compared(
         self,
@@ -196,8 +201,6 @@ class PhotometricTask(OptimizationTask[Item]):
         for index, view in enumerate(views):
             target = targets[index] if targets else photograph(view, self.sequence.background)
             normals = bool(weights.normal) and target.normals is not None
-            if weights.normal and not normals:
-                self._tell_of_normals(view)
             rendering = render_view(
                 posed, index, view, self.sequence.background, eps2d=self.config.eps2d, normals=normals, extra=extra
             )
@@ -238,16 +241,6 @@ class PhotometricTask(OptimizationTask[Item]):
     def head_box_of(self, view: View) -> Box | None:
         """Return the box of the head in a measured view, to measure it apart; None leaves it out."""
         return None
-
-    def _tell_of_normals(self, view: View) -> None:
-        """Say once that a term of the loss which was asked for is missing."""
-        if not self._told_of_normals:
-            self._told_of_normals = True
-            log.info(
-                "the loss has no normal term (weight %g) where a view has no normal map; the first such view is %s's",
-                self.config.weights.normal,
-                view.name,
-            )
 
     def generator(self, *key: int) -> np.random.Generator:
         """Return noise that the seed, the step and a key decide."""

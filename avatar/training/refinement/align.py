@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float64
 
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
+from avatar.training.refinement.appearance import AppearanceSums
 from avatar.training.refinement.cameras import CameraCorrections
-from avatar.training.refinement.colors import ColorSums
 from avatar.training.refinement.config import Level, RefineConfig
 from avatar.training.refinement.evidence import Evidence, Photometer
 from avatar.training.refinement.posing import PosedTemplate
@@ -67,7 +68,7 @@ class Alignment:
     Args:
         gaussians: on the template.
         frames: numbers, ascending. start: their registered poses, a row each. views: photographs of a frame.
-        learn_colors: False: the colours are right.
+        learns_appearance: False: the Gaussians are right.
     """
 
     def __init__(
@@ -78,15 +79,18 @@ class Alignment:
         start: BodyState,
         views: Views,
         *,
-        learn_colors: bool = True,
+        learns_appearance: bool = True,
     ) -> None:
         assert len(frames) == len(start), "a row a frame"
-        self.scene, self.gaussians, self.frames, self.learn_colors = scene, gaussians, frames, learn_colors
+        self.scene, self.gaussians, self.frames = scene, gaussians, frames
+        self.learns_appearance = learns_appearance
         self.start = self.state = start
         self.history: list[PassReport] = []
         body = scene.posed.body
         self.variables = Variables.of_body(body.joint_count, body.num_expressions, scene.config)
         self._views, self._cached, self._bytes = views, dict[tuple[int, int], list[View]](), 0
+        labels = scene.posed.template.vertex_labels[scene.posed.template.faces[:, 0]]
+        self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
         self._motion = GaussianMotion(scene.posed, gaussians, self.variables)
 
     def run(self, levels: Sequence[Level], told: Callable[[], None] = lambda: None) -> None:
@@ -111,11 +115,11 @@ class Alignment:
         damping, best = np.full(F, DAMPING), np.full(F, np.inf)
         kept, normal = self.state, None
         for step in range(level.steps + 1):
-            colors = ColorSums(len(self.gaussians))
+            sums = AppearanceSums(self._groups, self._motion.firmness)
             losses, gradients, curvatures = [], [], []
             for row in range(F):
                 evidence, gradient, curvature = self._look(row, level.halvings)
-                colors.add(evidence)
+                sums.add(evidence)
                 losses.append(evidence.loss)
                 gradients.append(gradient)
                 curvatures.append(curvature)
@@ -132,8 +136,8 @@ class Alignment:
             best = np.where(bad, best, loss)
             kept, normal = self.state, found
             self.history.append(PassReport(level.halvings, float(loss.mean()), int(bad.sum())))
-            if self.learn_colors:
-                self.gaussians = colors.learned(self.gaussians)
+            if self.learns_appearance:
+                self.gaussians = sums.learned(self.gaussians, F)
             if step < level.steps:
                 self.state = self._stepped(found, damping)
                 if self.scene.cameras is not None:

@@ -51,7 +51,7 @@ class RefineConfig:
         default_factory=lambda: SamplingConfig(count=30_000, head_share=0.15, sh_degree=0, opacity=0.95)
     )
     reference_levels: tuple[Level, ...] = (Level(1, 3),)
-    levels: tuple[Level, ...] = (Level(2, 2), Level(1, 5))
+    levels: tuple[Level, ...] = (Level(2, 2), Level(1, 4), Level(0, 1))
     jaw: bool = True
     expression: bool = True
     hands: bool = False

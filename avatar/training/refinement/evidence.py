@@ -28,8 +28,8 @@ class Evidence:
         loss: robust.
         vertices: gradient of the posed vertices.
         curvature: of the centres of the Gaussians, symmetric, at least 0.
-        means: centres of the Gaussians, world, metres.
-        color_gradient, color_mass: what moves colours, see `Appearance`.
+        means, normals: centres of the Gaussians and their normals, world, metres. pull: gradient of the centres.
+        color_gradient, color_mass: what moves colours, see `AppearanceSums`.
         cameras: gradient and curvature of each view's Gaussians alone, by camera; empty if not asked for.
     """
 
@@ -37,6 +37,8 @@ class Evidence:
     vertices: Float32[Tensor, "V 3"]
     curvature: Float32[Tensor, "N 3 3"]
     means: Float32[Tensor, "N 3"]
+    normals: Float32[Tensor, "N 3"]
+    pull: Float32[Tensor, "N 3"]
     color_gradient: Float32[Tensor, "N 3"]
     color_mass: Float32[Tensor, " N"]
     cameras: dict[str, tuple[Tensor, Tensor]]
@@ -91,7 +93,10 @@ class Photometer:
                 curvature += into
         torch.autograd.backward((world.means, world.quats, world.scales), [t.grad for t in held])
         assert leaf.grad is not None
-        return Evidence(loss, leaf.grad, curvature, held[0].detach(), colors, mass, own)
+        pull = held[0].grad
+        assert pull is not None
+        means, normals = held[0].detach(), world.normals.detach()
+        return Evidence(loss, leaf.grad, curvature, means, normals, pull, colors, mass, own)
 
     def firm_loss(
         self,

@@ -125,7 +125,7 @@ def refine_held_out(
         raise InputError(f"capture {sequence.capture.name}", expected="held-out frames", received="none")
     scene, start = _scene(sequence, config), _start(sequence, chosen)
     view = _training_views(sequence)
-    alignment = Alignment(scene, gaussians, chosen, _state(scene.posed, start), view, learn_colors=False)
+    alignment = Alignment(scene, gaussians, chosen, _state(scene.posed, start), view, learns_appearance=False)
     return _finish(alignment, start, sequence, _Progress(told, replace(config, reference_levels=()), len(chosen)))
 
 

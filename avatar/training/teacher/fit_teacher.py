@@ -20,6 +20,7 @@ from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, Ph
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.surface_normals import with_surface_normals
 from avatar.training.tracking.track import TrackConfig, follow_surface
 from smplxpp.core.spread import spread_inside
 
@@ -122,5 +123,6 @@ def fit_teacher(
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
-    progress = session.run(lambda: TeacherTask(sequence, teacher, config, session.context), config)
+    context = with_surface_normals(session.context, sequence, track)
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, context), config)
     return teacher.eval(), progress

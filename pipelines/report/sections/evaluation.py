@@ -71,7 +71,7 @@ def _figures(record: StageRecord) -> Section:
             f"{_listed(list(numbers['models']))} on the same views. Training views: cameras and frames that were "
             "trained on. Novel views: held-out cameras at training frames. Novel poses: held-out cameras at held-out "
             f"frames. All figures, and these tables as text, CSV and LaTeX, lie in {EVALUATE_STAGE}.",
-            f"What they rest on: {inputs.sentence()}. Perceptual distance: {distance}.",
+            f"What they rest on, in a word: {inputs.name}; {inputs.sentence()}. Perceptual distance: {distance}.",
             *(f"{name[0].upper()}{name[1:]}: {words}" for name, words in numbers["conventions"].items()),
         ),
         pictures=tuple(

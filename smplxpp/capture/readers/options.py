@@ -14,10 +14,12 @@ class ReaderOptions:
 
     Attributes:
         params: a parameter file or folder instead of the set's own.
+        protocol: name of the protocol whose files are read; None: without one.
         body: the body model that the parameters are for; None: the open body.
         person: whose keypoints are taken, where there are several people; None: the surest.
     """
 
     params: Path | None = None
+    protocol: str | None = None
     body: BodyModel | None = None
     person: int | None = None

@@ -15,7 +15,13 @@ from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfol
 from smplxpp.capture.keypoints import found_keypoints
 from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.params import ParamFiles, find_params
-from smplxpp.capture.readers.common import read_json
+from smplxpp.capture.protocols import (
+    ProtocolFiles,
+    choose_protocol,
+    description_file,
+    read_description,
+    read_protocols,
+)
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.capture.splits import Splits
@@ -32,8 +38,6 @@ _FOLDERS = {
     "normal": ("normals", "normal"),
 }
 _CAMERA_FILES = ("cameras.json", "calibration.csv")
-# Written by hand, or by the tool that made the capture.
-_DESCRIPTIONS = ("capture.json", "manifest.json")
 _BLACK = (0.0, 0.0, 0.0)
 
 
@@ -51,15 +55,14 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         InputError: images without a camera file, a broken camera file or description.
     """
     lenses = _lenses(root)
-    path = next((root / name for name in _DESCRIPTIONS if (root / name).is_file()), root / _DESCRIPTIONS[0])
-    description = read_json(path) if path.is_file() else {}
+    description = read_description(root)
     try:
         return _described(root, lenses, description, options)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"file {path}",
+            f"file {description_file(root)}",
             expected="an object with the keys of docs/captures.md",
             received=f"{type(error).__name__}: {error}",
         ) from None
@@ -69,7 +72,8 @@ def _described(
     root: Path, lenses: list[tuple[Camera, Distortion | None]], description: Mapping[str, Any], options: ReaderOptions
 ) -> Recording:
     cameras = {camera.name: camera for camera, _ in lenses}
-    files, problems = _files(root, cameras, description)
+    protocol = choose_protocol(root, description, options.protocol)
+    files, problems = _files(root, cameras, description, protocol)
     topology, frames = root / "geometry" / "topology.npz", r"frame_(?P<frame>\d{6})\.npz"
     recording = Recording(
         name=str(description.get("name", root.resolve().name)),
@@ -80,11 +84,13 @@ def _described(
         files=files,
         background=_background(description),
         label_set=str(description.get("label_set", "capture")),
-        params=_params(root, options),
+        params=_params(root, options, protocol),
         meshes=PosedTopology(topology, FileSeries.find(topology.parent, frames)) if topology.is_file() else None,
         keypoints=found_keypoints(root / "keypoints", cameras, format="auto", person=options.person),
         fps=None if description.get("fps") is None else float(description["fps"]),
         problems=tuple(problems),
+        protocol=protocol.name,
+        protocols=tuple(read_protocols(description)),
     )
     return replace(recording, splits=_splits(recording, description)) if description else recording
 
@@ -98,9 +104,12 @@ def stacked_params(root: Path, name: str | Path | None = None) -> Path:
     return inside if not path.is_file() and inside.is_file() else path
 
 
-def _params(root: Path, options: ReaderOptions) -> ParamSource | None:
+def _params(root: Path, options: ReaderOptions, protocol: ProtocolFiles) -> ParamSource | None:
     if options.params is not None:
         return find_params(stacked_params(root, options.params), body=options.body)
+    if protocol.name is not None:
+        named = protocol.parameter_file(root)
+        return None if named is None else find_params(named, body=options.body)
     single = FileSeries.find(root / "params", r"(?P<frame>\d{6})\.npz")
     if len(single):
         return ParamFiles(single, body=options.body)
@@ -118,11 +127,15 @@ def _lenses(root: Path) -> list[tuple[Camera, Distortion | None]]:
 
 
 def _files(
-    root: Path, cameras: Mapping[str, Camera], description: Mapping[str, Any]
+    root: Path, cameras: Mapping[str, Camera], description: Mapping[str, Any], protocol: ProtocolFiles
 ) -> tuple[dict[str, dict[str, FileSeries]], list[Problem]]:
     files: dict[str, dict[str, FileSeries]] = {}
     problems = []
-    for kind, (folder, tag) in _FOLDERS.items():
+    chosen = {"label": protocol.labels, "normal": protocol.normals}
+    for kind, (own, tag) in _FOLDERS.items():
+        folder = chosen.get(kind, own)
+        if folder is None:
+            continue
         suffixes = (*IMAGE_SUFFIXES, ".npy") if kind == "label" else IMAGE_SUFFIXES
         found = {
             name: FileSeries.find(root / folder / name, image_name(f"{name}_{tag}", suffixes=suffixes))
@@ -133,7 +146,8 @@ def _files(
             problems.append(
                 Problem(f"{root / folder / name}: a folder of camera {name}, which is not calibrated", name)
             )
-        listed = description.get(f"{kind}s", {})
+        # What ought to exist is said of the capture's own folder.
+        listed = description.get(f"{kind}s", {}) if folder == own else {}
         for name, frames in listed.items() if isinstance(listed, Mapping) else ():
             if name in found:
                 missing = np.setdiff1d(np.asarray(frames, dtype=np.int64), found[name].numbers).tolist()

@@ -321,16 +321,6 @@ def test_half_precision_is_the_networks_alone(frames):
     assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)
 
 
-def test_a_normal_loss_without_normal_maps_is_told_once(frames, caplog):
-    caplog.set_level("INFO")
-    steps(make("compensate", frames), 3)
-    told = [record.getMessage() for record in caplog.records if "normal" in record.getMessage()]
-    assert len(told) == 1 and "no normal map" in told[0] and "0.02" in told[0]
-    caplog.clear()
-    steps(make("compensate", frames, weights=replace(WEIGHTS, normal=0.0)), 1)
-    assert not caplog.records
-
-
 def test_a_normal_loss_with_normal_maps_tells_nothing(frames, caplog, monkeypatch):
     caplog.set_level("INFO")
     view = type(frames).view

@@ -1,0 +1,118 @@
+"""Poses in an evaluation: how far they are from the exact ones, and held-out ones that were refined on photographs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture, open_capture
+from smplxpp.capture.params import StackedParams
+from smplxpp.capture.protocols import EXACT
+from smplxpp.capture.recording import ParamSource
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+from smplxpp.metrics import PoseError, mean_pose_error, pose_error
+from smplxpp.raster import outer_visible_points
+from smplxpp.template.template import Template
+
+log = logging.getLogger(__name__)
+COMPARED = 100
+"""Frames of either kind whose poses are compared, evenly spread; all where there are no more."""
+BEHIND = 5e-4
+"""Metres behind a surface from which a vertex counts as covered: parts keep a millimetre from the body."""
+
+
+def exact_params(capture: Capture, body: Path | None, model: BodyModel) -> ParamSource | None:
+    """The exact parameters of a capture that has a protocol of that name; for measuring alone, never for training."""
+    if EXACT not in capture.recording.protocols or capture.protocol == EXACT:
+        return None
+    try:
+        return open_capture(capture.root, body=None if body is None else model, protocol=EXACT).recording.params
+    except InputError as error:
+        log.warning("poses are not compared with the exact ones: %s", error)
+        return None
+
+
+def pose_errors(captures: Mapping[str, Capture], exact: ParamSource, template: Template) -> dict[str, PoseError]:
+    """Errors of the poses in use, of training frames and of held-out ones.
+
+    What is in use is the template's body, which has one shape, in the poses of the frames; the exact body has its own.
+
+    Args:
+        captures: "" with the poses in use; others, whose held-out poses alone count, by what is said of these.
+    """
+    covered, known = covered_vertices(template), set(exact.frames().tolist())
+    found: dict[str, PoseError] = {}
+    for title, capture in captures.items():
+        splits = capture.splits
+        kinds = {"training frames": () if title else splits.train_frames, "held-out frames": splits.novel_pose_frames}
+        for kind, frames in kinds.items():
+            there = [frame for frame in frames if frame in known and capture.params(frame) is not None]
+            errors = [
+                pose_error(
+                    replace(_params(capture, frame), betas=np.zeros((1, 0))),
+                    _from_template(exact.read(frame), template),
+                    template.body,
+                    covered,
+                )
+                for frame in spread(there, COMPARED)
+            ]
+            if errors:
+                found[f"{kind}{title}"] = mean_pose_error(errors)
+    return found
+
+
+def _from_template(params: BodyParams, template: Template) -> BodyParams:
+    """Parameters for the template's body, whose mean shape is the template's."""
+    size = template.body.num_betas
+    betas = np.zeros((len(params), size))
+    betas[:, : params.betas.shape[1]] += params.betas[:, :size]
+    betas[:, : len(template.betas)] -= template.betas[:size]
+    return replace(params, betas=betas)
+
+
+def covered_vertices(template: Template) -> Bool[np.ndarray, " V"]:
+    """The vertices of the body that some view from outside would show, if no part covered them in the T-pose."""
+    body = template.part_mesh(template.part_names[0])
+    seen = [outer_visible_points(mesh, body.vertices, tolerance=BEHIND) for mesh in (body, template.mesh)]
+    return seen[0] & ~seen[1]
+
+
+def refined_poses(run: Path, capture: Capture) -> Capture | None:
+    """The capture with held-out poses that the run refined on the training cameras; None where it has not."""
+    path = run / REFINED_HELD_OUT_PARAMS
+    own = capture.recording.params
+    if own is None or not path.is_file() or not capture.splits.novel_pose_frames:
+        return None
+    source = _HeldOutFrom(own, StackedParams(path), frozenset(capture.splits.novel_pose_frames))
+    return replace(capture, recording=replace(capture.recording, params=source))
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOutFrom:
+    """Parameters whose held-out frames come from another source, as far as it has them."""
+
+    own: ParamSource
+    other: ParamSource
+    held_out: frozenset[int]
+
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        return self.own.frames()
+
+    def read(self, frame: int) -> BodyParams:
+        other = frame in self.held_out and frame in self.other.frames()
+        return (self.other if other else self.own).read(frame)
+
+
+def _params(capture: Capture, frame: int) -> BodyParams:
+    params = capture.params(frame)
+    assert params is not None  # frames without were left out
+    return params
