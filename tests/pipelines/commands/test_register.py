@@ -85,12 +85,10 @@ def registration_of(out, **options) -> RegisterInputs | None:
 def test_a_build_registers_where_the_capture_says_that_its_parameters_are_tracked(tmp_path):
     assert registration_of(tmp_path) is None  # params.npz: exact
     tracked = registration_of(tmp_path, params=Path("params_noisy.npz"))
-    assert tracked == RegisterInputs(
-        capture=FIXTURE, params=TRACKED, labels=FIXTURE / "scans" / "scan_000000_labels.npz", label_set="capture"
-    )
+    assert tracked == RegisterInputs(capture=FIXTURE, params=TRACKED)
     assert registration_of(tmp_path, params=Path("params_noisy.npz"), register="off") is None
-    asked = registration_of(tmp_path, register="on", label_source="views")
-    assert asked.params is None and asked.labels is None
+    asked = registration_of(tmp_path, register="on", label_source="scan")
+    assert asked.params is None and asked.labels == FIXTURE / "scans" / "scan_000000_labels.npz"
 
 
 def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
