@@ -22,6 +22,7 @@ from pipelines.runs.layout import (
     REGISTER_STAGE,
     TRAIN_STAGES,
 )
+from pipelines.runs.places import same_place
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
@@ -208,8 +209,12 @@ class Build:
         ):
             return None
         params = named_params(self.capture, self.params)
-        same = found.capture.resolve() == self.capture.resolve() and found.protocol == self.protocol
-        return found if same and (params is None or params.resolve() == found.params) else None
+        same = same_place(found.capture, self.capture) and found.protocol == self.protocol
+        return (
+            found
+            if same and (params is None or (found.params is not None and same_place(params, found.params)))
+            else None
+        )
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
         """What the body is registered to, None where the parameters are given."""

@@ -91,7 +91,9 @@ def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
     cameras = _training_cameras(capture, inputs)
     files = find_scans(inputs.capture) if inputs.scan is None else {inputs.frame: inputs.scan}
     frames = _frames(capture, files, inputs)
-    files = {frame: path for frame, path in files.items() if frame in frames}
+    # A held-out frame's scan shows what held-out cameras saw.
+    held_out = set(capture.splits.novel_pose_frames)
+    files = {frame: path for frame, path in files.items() if frame in frames and frame not in held_out}
     keypoints, unread = _keypoints(capture, cameras)
     if not cameras and not files:
         _refuse_nothing(capture)
@@ -106,7 +108,6 @@ def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
             received="neither",
             remedy="detect keypoints (docs/captures.md says which files are read), or name a fit with --params",
         )
-    held_out = set(capture.splits.novel_pose_frames)
     shape = tuple(frame for frame in frames if frame not in held_out)
     if not shape:
         raise InputError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import REGISTER_FILE
+from pipelines.runs.places import absolute
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.atomic import atomic_write_text
 
@@ -56,7 +57,7 @@ _PATHS = ("capture", "params", "body", "scan", "labels")
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:
     """Write `register.json` into a run."""
-    values = {key: str(value.resolve()) if isinstance(value, Path) else value for key, value in asdict(inputs).items()}
+    values = {key: str(absolute(value)) if isinstance(value, Path) else value for key, value in asdict(inputs).items()}
     atomic_write_text(run / REGISTER_FILE, json.dumps(values, indent=1) + "\n")
 
 

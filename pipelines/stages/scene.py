@@ -12,6 +12,7 @@ import numpy as np
 from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.places import lies_in
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
@@ -194,7 +195,7 @@ def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> Tr
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
-    if built is None or inputs.capture.resolve() not in built[0].scan.resolve().parents:
+    if built is None or not lies_in(built[0].scan, inputs.capture):
         return None
     return built[0].frame
 

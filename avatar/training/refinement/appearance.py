@@ -59,6 +59,4 @@ class AppearanceSums:
         trust = frames / DEPTH_SIGMA**2
         depth = torch.zeros_like(self._pull).index_copy_(0, self.groups, gaussians.normal_offset.double())
         depth = (depth - (self._pull + trust * depth) / (self._stiffness + trust)).clamp(DEEPEST, HIGHEST)
-        return replace(
-            gaussians, dc=(gaussians.dc - step).clamp(0.0, 1.0), normal_offset=depth[self.groups].float()
-        )
+        return replace(gaussians, dc=(gaussians.dc - step).clamp(0.0, 1.0), normal_offset=depth[self.groups].float())
