@@ -28,6 +28,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
+from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -193,7 +194,8 @@ class Build:
         said = SaidOfInputs.of_folder(self.capture, self.protocol)
         params = said.own_parameters() if self.params is None else named_params(self.capture, self.params)
         if params is None:
-            return (self.capture / "keypoints").is_dir()
+            files = choose_protocol(self.capture, read_description(self.capture), self.protocol)
+            return files.keypoints is not None and (self.capture / files.keypoints).is_dir()
         return said.given_parameters(params) == TRACKED
 
     def _standing_registration(self) -> RegisterInputs | None:

@@ -129,7 +129,8 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             f"capture {capture.name}",
             expected=f"body parameters of frame {frame}",
             received="none",
-            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+            remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
+            "`smplxpp register`",
         )
     capture = replace(capture, splits=Splits(train, held_out, (frame,), ()))
     overlap = silhouette_overlap(
@@ -299,7 +300,8 @@ def _with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:
             f"capture {capture.name}",
             expected="body parameters of the training frames",
             received=why[splits.train_frames[0]],
-            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+            remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
+            "`smplxpp register`",
         )
     if why:
         _warn(f"{len(why)} of {len(known) + len(why)} frames are left out: {next(iter(why.values()))}")
