@@ -190,13 +190,13 @@ def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypa
 
 def test_a_damaged_mask_and_a_damaged_scan_are_named_and_the_rest_goes_on(tmp_path, capture, solver):
     (capture / "masks" / "Cam002" / "Cam002_mask000001.png").write_bytes(b"no picture")
-    (capture / "scans" / "scan_000013.ply").write_bytes(b"no scan")
+    (capture / "scans" / "scan_000001.ply").write_bytes(b"no scan")
     (capture / "masks" / "Cam003" / "Cam003_mask000001.png").unlink()
     record = register_capture(tmp_path / "run", inputs_of(capture))
     problems = json.loads((tmp_path / "run" / REGISTRATION).read_text())["problems"]
     assert record.manifest["numbers"]["problems"] == len(problems) == 2
     assert any("camera Cam002, frame 1: mask left out" in words for words in problems)
-    assert any("frame 13: the scan is left out" in words for words in problems)
+    assert any("frame 1: the scan is left out" in words for words in problems)
     assert set(solver.shown[0].scans) == {0} and solver.shown[0].mask("Cam003", 1) is None
 
 
