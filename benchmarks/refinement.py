@@ -48,7 +48,7 @@ class RefinementBenchmark:
     capture: Path
     """Folder of the capture, with exact and noisy parameters and true vertices."""
     starts: tuple[str, ...] = ("noise", "smoothed")
-    """Of noise, smoothed, exact (what refinement does to poses that are right)."""
+    """Of noise, smoothed, given (noisy parameters as they are), exact (what refinement does to poses that are right)."""
     frames: int = 10_000
     """At most so many training frames, from the first."""
     held_out: bool = False
@@ -119,7 +119,12 @@ def smoothed(template: Template, exact: BodyParams, capture: Path) -> BodyParams
     return replace(quiet.to_params(template.body, fps=given.fps), betas=exact.betas)
 
 
-_START = {"noise": noise, "smoothed": smoothed, "exact": lambda template, exact, capture: exact}
+def given(template: Template, exact: BodyParams, capture: Path) -> BodyParams:
+    """The capture's noisy parameters as they are; the shape is the template's."""
+    return replace(load_params(capture / "params" / "params_noisy.npz"), betas=exact.betas)
+
+
+_START = {"noise": noise, "smoothed": smoothed, "given": given, "exact": lambda template, exact, capture: exact}
 
 
 def _compared(
@@ -140,7 +145,10 @@ def errors(
     bare, under = _bare_and_under(root, template.body.vertex_count)
     distance = []
     for row, frame in enumerate(frames):
-        truth = np.load(root / "geometry" / f"frame_{frame:06d}.npz")["verts"][: template.body.vertex_count]
+        path = root / "geometry" / f"frame_{frame:06d}.npz"
+        if not path.is_file():
+            continue
+        truth = np.load(path)["verts"][: template.body.vertex_count]
         posed = template.posed_body(params.frame(row)).vertices[0]
         distance.append(MM * np.linalg.norm(posed - truth, axis=1))
     of_vertices = np.array(distance)

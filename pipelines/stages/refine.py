@@ -27,9 +27,9 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
-from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with, told_of_given
 from pipelines.stages.refine_pictures import write_pictures
+from pipelines.stages.said_of_inputs import SaidOfInputs, path_of_params
 from pipelines.stages.scene import TrainInputs, TrainScene, of_protocol, open_cameras, open_scene
 from smplxpp.capture import Capture
 from smplxpp.capture.writers.cameras import write_plain_cameras_json
@@ -65,7 +65,9 @@ def wants_refinement(run: Path, inputs: TrainInputs, choice: Choice) -> bool:
     begins = params_to_begin_with(run, inputs.params)
     if stands or begins == run / REGISTERED_PARAMS:
         return True
-    return input_protocol(run, open_cameras(of_protocol(run, inputs))[0]).parameters == TRACKED
+    capture = open_cameras(of_protocol(run, inputs))[0]
+    # Of these parameters alone, whatever the template was built with.
+    return SaidOfInputs.of(capture).given_parameters(path_of_params(capture.recording.params)) == TRACKED
 
 
 def refine(
