@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,17 +23,22 @@ class Garment:
 
     Attributes:
         name, label: of the garment, and the label that a segmentation would give it.
-        cloth: its mesh and authored weights. rule: what gives these weights, in words.
+        make: makes its mesh and authored weights. rule: what gives these weights, in words.
         loose: whether it hangs free of the skin, so that no point of the body says what it follows.
         beside_hands: whether the arms may hang beside it (it follows none).
     """
 
     name: str
     label: str
-    cloth: ClothMesh
+    make: Callable[[], ClothMesh]
     rule: str
     loose: bool = False
     beside_hands: bool = False
+
+    @cached_property
+    def cloth(self) -> ClothMesh:
+        """Its mesh and authored weights, made when they are asked for."""
+        return self.make()
 
 
 def layer(
@@ -109,9 +115,9 @@ def skirt_weights(
     """How a skirt is painted, in its own coordinates.
 
     Down to the hips' joints it follows the trunk at the same height and azimuth. From there to 22 cm below them the
-    thighs take over a share that grows smoothly to `legs`; the pelvis keeps the rest. Left and right share it by how far a
-    point lies to the side of its own ring (smoothly, half each at the middle). From 5 cm above the knee to 25 cm below
-    it the shins take over up to `shins` of the legs' share.
+    thighs take over a share that grows smoothly to `legs`; the pelvis keeps the rest. Left and right share it by how
+    far a point lies to the side of its own ring (smoothly, half each at the middle). From 5 cm above the knee to 25 cm
+    below it the shins take over up to `shins` of the legs' share.
     """
     joints, body = mannequin.joints, mannequin.body
     hip, knee = joints["left_hip"][1], joints["left_knee"][1]

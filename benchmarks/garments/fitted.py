@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
-from benchmarks.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
+from benchmarks.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
 from benchmarks.garments.mannequin import Mannequin
 from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
 from pipelines.synth.noise import ramp
 
 _GROWN = "the weights of the skin that each vertex was grown from"
+_HOOD_UP = "the head from the chin up, from the neck's base down the shoulders' skin straight below, smooth between"
+_HOOD_DOWN = "shirt: as grown; the hood's roll: spine3, at its sides half the collar bone"
+_SCARF = "roll: neck 0.4 to 0.8 by height, else spine3; the end: the trunk's skin at its height and azimuth"
 
 
 def fitted_garments(mannequin: Mannequin) -> list[Garment]:
@@ -24,7 +30,8 @@ def fitted_garments(mannequin: Mannequin) -> list[Garment]:
     def shirt(p: np.ndarray, *, cuff: float, hem: float) -> np.ndarray:
         neck = np.hypot(p[:, 0], p[:, 2] - j["neck"][2] - 0.018) - 0.07
         neck = np.where(p[:, 1] > j["neck"][1] - 0.13, neck, 1.0)
-        return np.minimum(np.minimum(neck, p[:, 1] - hem), np.minimum(cuff - np.abs(p[:, 0]), j["neck"][1] + 0.03 - p[:, 1]))
+        height = np.minimum(p[:, 1] - hem, j["neck"][1] + 0.03 - p[:, 1])
+        return np.minimum(np.minimum(neck, height), cuff - np.abs(p[:, 0]))
 
     def overalls(p: np.ndarray) -> np.ndarray:
         trousers = legs(p, top=waist + 0.02, hem=ankle[1] + 0.02)
@@ -46,26 +53,27 @@ def fitted_garments(mannequin: Mannequin) -> list[Garment]:
     def glove(p: np.ndarray) -> np.ndarray:
         return np.abs(p[:, 0]) - elbow[0] - 0.1
 
-    tee = layer(mannequin, lambda p: shirt(p, cuff=0.5 * (shoulder[0] + elbow[0]), hem=crotch + 0.08), ease=0.011)
+    def grown(level: Level, *, ease: float, fairing: int = 4) -> Callable[[], ClothMesh]:
+        return partial(layer, mannequin, level, ease=ease, fairing=fairing)
+
+    tee = grown(lambda p: shirt(p, cuff=0.5 * (shoulder[0] + elbow[0]), hem=crotch + 0.08), ease=0.011)
     return [
         Garment("T-shirt", "upper", tee, _GROWN),
-        Garment("trousers", "lower", layer(mannequin, lambda p: legs(p, top=waist, hem=ankle[1]), ease=0.01), _GROWN),
-        Garment(
-            "shorts", "lower", layer(mannequin, lambda p: legs(p, top=waist, hem=crotch - 0.16), ease=0.014), _GROWN
-        ),
-        Garment("overalls with straps", "lower", layer(mannequin, overalls, ease=0.008), _GROWN),
-        Garment("high boots", "shoe", layer(mannequin, lambda p: boots(p, top=knee[1] + 0.12), ease=0.009), _GROWN),
-        Garment("low shoes", "shoe", layer(mannequin, lambda p: boots(p, top=ankle[1] + 0.01), ease=0.008), _GROWN),
-        Garment("open jacket", "outer", layer(mannequin, lambda p: coat(p, open_by=0.05), ease=0.017), _GROWN),
-        Garment("jumpsuit", "upper", layer(mannequin, suit, ease=0.009), _GROWN),
-        Garment("long gloves", "upper", layer(mannequin, glove, ease=0.004, fairing=2), _GROWN),
-        _hood_up(mannequin),
-        _hood_down(mannequin, tee),
-        _scarf(mannequin),
+        Garment("trousers", "lower", grown(lambda p: legs(p, top=waist, hem=ankle[1]), ease=0.01), _GROWN),
+        Garment("shorts", "lower", grown(lambda p: legs(p, top=waist, hem=crotch - 0.16), ease=0.014), _GROWN),
+        Garment("overalls with straps", "lower", grown(overalls, ease=0.008), _GROWN),
+        Garment("high boots", "shoe", grown(lambda p: boots(p, top=knee[1] + 0.12), ease=0.009), _GROWN),
+        Garment("low shoes", "shoe", grown(lambda p: boots(p, top=ankle[1] + 0.01), ease=0.008), _GROWN),
+        Garment("open jacket", "outer", grown(lambda p: coat(p, open_by=0.05), ease=0.017), _GROWN),
+        Garment("jumpsuit", "upper", grown(suit, ease=0.009), _GROWN),
+        Garment("long gloves", "upper", grown(glove, ease=0.004, fairing=2), _GROWN),
+        Garment("hood up", "upper", partial(_hood_up, mannequin), _HOOD_UP),
+        Garment("hood down", "upper", lambda: _hood_down(mannequin, tee()), _HOOD_DOWN),
+        Garment("scarf", "upper", partial(_scarf, mannequin), _SCARF),
     ]
 
 
-def _hood_up(mannequin: Mannequin) -> Garment:
+def _hood_up(mannequin: Mannequin) -> ClothMesh:
     """A hood over the head with a cape over the shoulders."""
     j = mannequin.joints
 
@@ -79,17 +87,15 @@ def _hood_up(mannequin: Mannequin) -> Garment:
     chin, base = j["jaw"][1] - 0.02, j["neck"][1] - 0.01
     head = ramp(cloth.vertices[:, 1], base, chin)[:, None]
     weights = head * mannequin.rigid("head", len(cloth.vertices)) + (1 - head) * mannequin.below(cloth.vertices)
-    rule = "the head from the chin upwards, the shoulders' skin straight below from the neck's base down, smooth between"
-    return Garment("hood up", "upper", ClothMesh(cloth.vertices, cloth.faces, weights), rule)
+    return ClothMesh(cloth.vertices, cloth.faces, weights)
 
 
-def _hood_down(mannequin: Mannequin, shirt: ClothMesh) -> Garment:
+def _hood_down(mannequin: Mannequin, shirt: ClothMesh) -> ClothMesh:
     """A shirt, and its hood as a roll about the nape."""
     j = mannequin.joints
     t = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 50)
-    curve = np.stack(
-        [0.115 * np.sin(t), j["neck"][1] + 0.012 - 0.03 * (1 + np.cos(t)), j["neck"][2] - 0.02 - 0.095 * np.cos(t)], axis=1
-    )
+    height = j["neck"][1] + 0.012 - 0.03 * (1 + np.cos(t))
+    curve = np.stack([0.115 * np.sin(t), height, j["neck"][2] - 0.02 - 0.095 * np.cos(t)], axis=1)
     points, faces = tube_along(curve, 0.016 + 0.026 * np.cos(t / 1.5) ** 2)
     roll = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
     roll = facing_out(roll, np.repeat(curve, 24, axis=0))
@@ -98,11 +104,10 @@ def _hood_down(mannequin: Mannequin, shirt: ClothMesh) -> Garment:
     left = (vertices[:, 0] > 0)[:, None]
     side = np.where(left, mannequin.rigid("left_collar", len(points)), mannequin.rigid("right_collar", len(points)))
     weights = (1 - 0.5 * collar) * mannequin.rigid("spine3", len(points)) + 0.5 * collar * side
-    rule = "shirt: as grown; the hood's roll: spine3, at its sides half the collar bone"
-    return Garment("hood down", "upper", joined(shirt, ClothMesh(vertices, roll.faces, weights)), rule)
+    return joined(shirt, ClothMesh(vertices, roll.faces, weights))
 
 
-def _scarf(mannequin: Mannequin) -> Garment:
+def _scarf(mannequin: Mannequin) -> ClothMesh:
     """A roll about the neck and one end that hangs down the chest."""
     j = mannequin.joints
     t = np.linspace(0, 2 * np.pi, 61)[:-1]
@@ -127,5 +132,4 @@ def _scarf(mannequin: Mannequin) -> Garment:
     end = facing_out(end, points - [0.0, 0.0, 1.0])
     pushed = push_out(end.mesh, mannequin.skin.mesh, clearance=0.008, solid=True)
     end = end.with_vertices(smooth(end.mesh, pushed, steps=2))
-    rule = "roll: neck 0.4 to 0.8 by height, else spine3; the end: the trunk's skin at its height and azimuth"
-    return Garment("scarf", "upper", joined(ring, end), rule)
+    return joined(ring, end)

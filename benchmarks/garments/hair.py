@@ -14,24 +14,34 @@ _BACK, _OPEN = 1.5 * np.pi, 0.95  # azimuth of the back; how far the curtain's e
 
 def hairstyles(mannequin: Mannequin) -> list[Garment]:
     """A bob on the shoulders, long hair down the back, hair over chest and arms, and a braid over the chest."""
-    shoulder = mannequin.joints["left_shoulder"][1]
-    bob = _curtain(mannequin, shoulder + 0.045, spread=0.05)
-    long = _curtain(mannequin, mannequin.joints["spine2"][1], spread=0.035, half=1.25)
-    wide = _curtain(mannequin, mannequin.joints["spine3"][1], spread=0.075, half=np.pi - 0.6)
+    j = mannequin.joints
     head = "the head down to the chin; from there it passes smoothly to "
+
+    def bob() -> ClothMesh:
+        return _lying(mannequin, _curtain(mannequin, j["left_shoulder"][1] + 0.045, spread=0.05))
+
+    def long() -> ClothMesh:
+        return _hanging(mannequin, _curtain(mannequin, j["spine2"][1], spread=0.035, half=1.25), keeps=0.2)
+
+    def wide() -> ClothMesh:
+        return _hanging(mannequin, _curtain(mannequin, j["spine3"][1], spread=0.075, half=np.pi - 0.6), keeps=0.1)
+
     return [
-        Garment("bob on the shoulders", "hair", _lying(mannequin, bob), head + "the shoulders' skin straight below"),
-        Garment(
-            "long loose hair", "hair", _hanging(mannequin, long, keeps=0.2), head + "0.8 of the trunk at its height"
-        ),
+        Garment("bob on the shoulders", "hair", bob, head + "the shoulders' skin straight below"),
+        Garment("long loose hair", "hair", long, head + "0.8 of the trunk at its height"),
         Garment(
             "hair over chest and shoulders",
             "hair",
-            _hanging(mannequin, wide, keeps=0.1),
+            wide,
             head + "0.9 of the trunk at its height; the arms move without it",
             beside_hands=True,
         ),
-        _braid(mannequin),
+        Garment(
+            "braid over the chest",
+            "hair",
+            lambda: _braid(mannequin),
+            "by the place along the braid: the head down to the chin, the trunk at its height from 14 cm below",
+        ),
     ]
 
 
@@ -61,14 +71,14 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
         ),
         axis=-1,
     ).reshape(-1, 3)
-    cloth = ClothMesh(
-        points, grid_faces(60, 70, closed=False), np.zeros((len(points), mannequin.body.joint_count))
-    )
+    cloth = ClothMesh(points, grid_faces(60, 70, closed=False), np.zeros((len(points), mannequin.body.joint_count)))
     inside = np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + centre])
     cloth = facing_out(cloth, inside)
     pushed = push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
     pushed = smooth(cloth.mesh, pushed, steps=4)
-    return cloth.with_vertices(push_out(cloth.mesh.with_vertices(pushed), mannequin.skin.mesh, clearance=0.007, solid=True))
+    return cloth.with_vertices(
+        push_out(cloth.mesh.with_vertices(pushed), mannequin.skin.mesh, clearance=0.007, solid=True)
+    )
 
 
 def _handed_over(mannequin: Mannequin, cloth: ClothMesh, below: np.ndarray, *, keeps: float, over: float) -> ClothMesh:
@@ -89,7 +99,7 @@ def _hanging(mannequin: Mannequin, curtain: ClothMesh, *, keeps: float) -> Cloth
     return joined(_cap(mannequin), lower)
 
 
-def _braid(mannequin: Mannequin) -> Garment:
+def _braid(mannequin: Mannequin) -> ClothMesh:
     """A braid from behind the left ear over the shoulder down the chest."""
     j = mannequin.joints
     t = np.linspace(0, 1, 70)
@@ -112,6 +122,4 @@ def _braid(mannequin: Mannequin) -> Garment:
     middle = np.repeat(curve, 24, axis=0)
     line = ClothMesh(middle, cloth.faces, cloth.weights)
     weights = _handed_over(mannequin, line, mannequin.trunk_weights(middle), keeps=0.0, over=0.14).weights
-    rule = "by the place along the braid: the head down to the chin, the trunk at its height from 14 cm below"
-    braid = ClothMesh(cloth.vertices, cloth.faces, weights)
-    return Garment("braid over the chest", "hair", joined(_cap(mannequin), braid), rule)
+    return joined(_cap(mannequin), ClothMesh(cloth.vertices, cloth.faces, weights))

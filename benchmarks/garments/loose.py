@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from benchmarks.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
@@ -9,9 +11,13 @@ from benchmarks.garments.mannequin import Mannequin
 from pipelines.synth.cloth_mesh import ClothMesh, push_out
 
 _SKIRT = (
-    "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the rest "
-    "stays with the pelvis; left and right by the place across the ring; below the knee the shins take up to {shins} of it"
+    "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "
+    "rest stays with the pelvis; left and right by the place across the ring; below the knee the shins take up to "
+    "{shins} of it"
 )
+_COAT = "body and sleeves as grown from the skin; panels as a skirt's with legs 0.7, shins 0.3"
+_CAPE = "trunk at the same height and azimuth down to the hips, below that pelvis with up to 0.4 of the thighs"
+_SLEEVES = "body as grown from the skin; sleeves: the arm's skin at the same place along the arm, however far they hang"
 _CELL = 0.014
 
 
@@ -22,8 +28,8 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
     chest = j["spine3"][1] + 0.085
 
     def skirt(name: str, hem: float, *, label: str = "lower", top: float = waist, legs: float, shins: float, **cut):
-        cloth = _hung(mannequin, top, hem, legs=legs, shins=shins, **cut)
-        return Garment(name, label, cloth, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
+        make = partial(_hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
+        return Garment(name, label, make, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
 
     fall = {"flare": 0.55, "pleats": (11, 0.03)}
     return [
@@ -34,9 +40,9 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
         skirt("full circle skirt", knee + 0.08, legs=0.6, shins=0.2, flare=0.8, pleats=(12, 0.08)),
         skirt("dress", knee + 0.03, label="upper", top=chest, legs=0.8, shins=0.3, flare=0.2, pleats=(8, 0.03)),
         skirt("dress labelled lower", ankle + 0.2, top=chest, legs=0.8, shins=0.4, **fall),
-        _coat(mannequin),
-        _cape(mannequin),
-        _kimono(mannequin),
+        Garment("open coat", "outer", partial(_coat, mannequin), _COAT, loose=True),
+        Garment("cape", "outer", partial(_cape, mannequin), _CAPE, loose=True),
+        Garment("wide sleeves", "upper", partial(_kimono, mannequin), _SLEEVES, loose=True),
     ]
 
 
@@ -53,7 +59,7 @@ def _hung(
     return ClothMesh(cloth.vertices, cloth.faces, skirt_weights(mannequin, points, legs=legs, shins=shins))
 
 
-def _coat(mannequin: Mannequin) -> Garment:
+def _coat(mannequin: Mannequin) -> ClothMesh:
     """A long coat, open in front: body and sleeves to the hips, and panels from there down."""
     j = mannequin.joints
     hip, knee = j["left_hip"][1], j["left_knee"][1]
@@ -67,11 +73,10 @@ def _coat(mannequin: Mannequin) -> Garment:
 
     top = layer(mannequin, level, ease=0.018, fairing=10)
     panels = _hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
-    rule = "body and sleeves as grown from the skin; panels as a skirt's with legs 0.7, shins 0.3"
-    return Garment("open coat", "outer", joined(top, panels), rule, loose=True)
+    return joined(top, panels)
 
 
-def _cape(mannequin: Mannequin) -> Garment:
+def _cape(mannequin: Mannequin) -> ClothMesh:
     """A cape about the back, from the shoulders to the knees."""
     j = mannequin.joints
     top, hem = j["neck"][1] - 0.05, j["left_knee"][1] + 0.05
@@ -86,11 +91,10 @@ def _cape(mannequin: Mannequin) -> Garment:
     cloth = facing_out(cloth, np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + mannequin.axis[1]]))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True))
     weights = skirt_weights(mannequin, points, legs=0.4, shins=0.0)
-    rule = "trunk at the same height and azimuth down to the hips, below that pelvis with up to 0.4 of the thighs"
-    return Garment("cape", "outer", ClothMesh(cloth.vertices, cloth.faces, weights), rule, loose=True)
+    return ClothMesh(cloth.vertices, cloth.faces, weights)
 
 
-def _kimono(mannequin: Mannequin) -> Garment:
+def _kimono(mannequin: Mannequin) -> ClothMesh:
     """A robe's upper part with sleeves that hang wide below the arms."""
     j = mannequin.joints
     hip, shoulder, wrist = j["left_hip"][1], j["left_shoulder"], j["left_wrist"]
@@ -98,7 +102,9 @@ def _kimono(mannequin: Mannequin) -> Garment:
     def level(p: np.ndarray) -> np.ndarray:
         x, y, z = p.T
         neck = np.where(y > j["neck"][1] - 0.13, np.hypot(x, z - j["neck"][2] - 0.03) - 0.085, 1.0)
-        return np.minimum(np.minimum(neck, y - hip - 0.02), np.minimum(shoulder[0] + 0.12 - np.abs(x), j["neck"][1] + 0.03 - y))
+        return np.minimum(
+            np.minimum(neck, y - hip - 0.02), np.minimum(shoulder[0] + 0.12 - np.abs(x), j["neck"][1] + 0.03 - y)
+        )
 
     pieces = [layer(mannequin, level, ease=0.014, fairing=8)]
     along = np.linspace(shoulder[0] + 0.10, wrist[0] - 0.03, 40)
@@ -111,8 +117,9 @@ def _kimono(mannequin: Mannequin) -> Garment:
         z = shoulder[2] + np.broadcast_to((width * np.cos(angle))[None, :], y.shape)
         points = np.stack(np.broadcast_arrays(sign * along[:, None], y, z), axis=-1).reshape(-1, 3)
         sleeve = ClothMesh(points, grid_faces(40, 48, closed=True), mannequin.arm_weights(points))
-        middle = np.repeat(np.column_stack([sign * along, 0 * along + shoulder[1], 0 * along + shoulder[2]]), 48, axis=0)
+        middle = np.repeat(
+            np.column_stack([sign * along, 0 * along + shoulder[1], 0 * along + shoulder[2]]), 48, axis=0
+        )
         sleeve = facing_out(sleeve, middle)
         pieces.append(sleeve.with_vertices(push_out(sleeve.mesh, mannequin.skin.mesh, clearance=0.005, solid=True)))
-    rule = "body as grown from the skin; sleeves: the arm's skin at the same place along the arm, however far they hang"
-    return Garment("wide sleeves", "upper", joined(*pieces), rule, loose=True)
+    return joined(*pieces)

@@ -71,10 +71,11 @@ def cases(body: BodyModel, shape: str, *, poses: tuple[str, ...] = POSES) -> Ite
     for k, garment in enumerate(garments_of(mannequin)):
         for pose in poses:
             if pose != "hands" or garment.beside_hands:
-                yield _case(mannequin, garment, shape, pose, seed=k)
+                yield scan(mannequin, garment, shape, pose, seed=k)
 
 
-def _case(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed: int) -> Case:
+def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed: int) -> Case:
+    """One garment as scanned in a pose of `POSES`; in the T-pose as it was made."""
     cloth = garment.cloth
     if pose == "T":
         source = mannequin.body.mesh(mannequin.body.forward(mannequin.params).vertices[0])

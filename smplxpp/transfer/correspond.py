@@ -66,8 +66,12 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
 
 
 def prefer_facing(
-    found: Correspondence, source: TriangleMesh, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"],
-    *, length: float
+    found: Correspondence,
+    source: TriangleMesh,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    *,
+    length: float,
 ) -> Correspondence:
     """Where the closest point faces another way, a near point that faces the same way, if there is one.
 

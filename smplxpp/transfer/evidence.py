@@ -12,7 +12,7 @@ _TOGETHER = 0.1  # two joints are neighbours where a vertex follows both by at l
 _NEIGHBOUR = 0.1  # how far a neighbour of the joint that cloth is led to may speak, against that joint
 LEAST_REACH = 1e-6  # the whole body speaks where nothing that may speak is near
 _OWN = 0.3  # a joint with this share of the confident cloth's weight is no longer what the label says about it
-_UNHEARD = (0.05, 0.0125)  # share of the body nearby that may speak: from the first to the second it loses its say
+_UNHEARD = (0.01, 0.001)  # share of the body nearby that may speak: from the first to the second it loses its say
 
 
 def lead(
@@ -50,8 +50,9 @@ def joint_reach(
 ) -> Float64[np.ndarray, "N J"]:
     """How far each joint may speak for a vertex: wholly where confident cloth leads to it, a little beside that.
 
-    A sleeve that hangs before the thigh is led to the arm, and the thigh, no neighbour of the arm, is not asked; neither
-    is the hand beside a skirt. What a label excludes (`allowed`) is not asked either, unless confident cloth follows it.
+    A sleeve that hangs before the thigh is led to the arm, and the thigh, no neighbour of the arm, is not asked;
+    neither is the hand beside a skirt. What a label excludes (`allowed`) is not asked either, unless confident cloth
+    follows it.
     """
     passed_on = np.where(neighbours, _NEIGHBOUR, 0.0)
     np.fill_diagonal(passed_on, 1.0)
@@ -75,9 +76,7 @@ def speaking(reach: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"])
     return np.maximum(reach @ weights.T, LEAST_REACH)
 
 
-def components_without(
-    component: Int32[np.ndarray, " N"], confident: Bool[np.ndarray, " N"]
-) -> Bool[np.ndarray, " N"]:
+def components_without(component: Int32[np.ndarray, " N"], confident: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     """The vertices of components that have no confident vertex."""
     return (np.bincount(component, confident) == 0)[component]
 

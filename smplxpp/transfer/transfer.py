@@ -148,6 +148,9 @@ def _values(
         lean = lean_on_the_lead(at.found.distance, heard, far=(config.far[0] * size, config.far[1] * size))
         lean[at.confident | alone] = 0.0
         values = values + lean[:, None] * (led - values)
+    if reach is not None and alone.any():  # a little of what may not speak comes along with what may
+        values[alone] *= reach[alone] > 0
+        values[alone] /= values[alone].sum(axis=1, keepdims=True)
     out = np.zeros((len(values), joint_count))
     out[:, used] = values
     return out
