@@ -31,7 +31,6 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
         make = partial(_hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
         return Garment(name, label, make, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
 
-    fall = {"flare": 0.55, "pleats": (11, 0.03)}
     return [
         skirt("mini skirt", hip - 0.2, legs=0.9, shins=0.0, flare=0.05),
         skirt("knee skirt", knee + 0.02, legs=0.9, shins=0.3, flare=0.04),
@@ -39,7 +38,7 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
         skirt("flared skirt", knee + 0.04, legs=0.8, shins=0.3, flare=0.3, pleats=(9, 0.04)),
         skirt("full circle skirt", knee + 0.08, legs=0.6, shins=0.2, flare=0.8, pleats=(12, 0.08)),
         skirt("dress", knee + 0.03, label="upper", top=chest, legs=0.8, shins=0.3, flare=0.2, pleats=(8, 0.03)),
-        skirt("dress labelled lower", ankle + 0.2, top=chest, legs=0.8, shins=0.4, **fall),
+        skirt("dress labelled lower", ankle + 0.2, top=chest, legs=0.8, shins=0.4, flare=0.55, pleats=(11, 0.03)),
         Garment("open coat", "outer", partial(_coat, mannequin), _COAT, loose=True),
         Garment("cape", "outer", partial(_cape, mannequin), _CAPE, loose=True),
         Garment("wide sleeves", "upper", partial(_kimono, mannequin), _SLEEVES, loose=True),

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from pipelines.synth.cloth_mesh import ClothMesh
 from smplxpp.body import BodyModel
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 
 _STEP = 0.02
@@ -134,7 +133,7 @@ def _outlines(points: np.ndarray, depth: float) -> tuple[float, np.ndarray]:
     heights = np.arange(points[:, 1].min(), points[:, 1].max(), _STEP)
     axes = np.stack([np.cos(_AZIMUTH), np.sin(_AZIMUTH)])
     cosine = np.cos(_AZIMUTH[:, None] - _AZIMUTH)
-    rows = []
+    rows: list[np.ndarray] = []
     for height in heights:
         near = points[np.abs(points[:, 1] - height) < 0.75 * _STEP]
         if len(near) < 3:
@@ -144,8 +143,3 @@ def _outlines(points: np.ndarray, depth: float) -> tuple[float, np.ndarray]:
         rays = np.where(cosine > 0.05, support / np.maximum(cosine, 0.05), np.inf)
         rows.append(np.maximum(rays.min(axis=1), 0.02))
     return float(heights[0]), np.array(rows)
-
-
-def skin_mesh(mannequin: Mannequin) -> TriangleMesh:
-    """The skin alone, as cloth is pushed out of it."""
-    return mannequin.skin.mesh
