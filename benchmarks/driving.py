@@ -80,7 +80,8 @@ def methods(peer: Path | None) -> dict[str, Method]:
         "paper + regions": configured(paper),
         "extension only": configured(replace(paper, falloff=full.falloff)),
         "smoothing only": configured(replace(full, falloff=None, unmatched="nearest")),
-        "ours, no regions": configured(full, by_label=False),
+        "ours, no labels": configured(full, by_label=False),
+        "ours, 0.1": configured(TransferConfig.restricted()),
         "ours": configured(full),
     }
 

@@ -18,8 +18,9 @@ from smplxpp.transfer.regions import JOINTS_OF_LABEL
 class TransferConfig:
     """Settings of `transfer_weights`; every length is a fraction of a mesh's `extent`, so units do not matter.
 
-    The default goes beyond the published method in three ways, each of which None or 0 turns off: `falloff`,
-    `smoothing`, and (through `for_label`) `allowed_joints`. `TransferConfig.paper()` is the published method.
+    The default goes beyond the published method in four ways, each of which None or 0 turns off: `falloff`,
+    `smoothing`, `confident`, and (through `for_label`) `allowed_joints`. `TransferConfig.paper()` is the published
+    method.
 
     Attributes:
         falloff: p of the extension of the source's weights into free space (`extend_weights`); None copies the closest
@@ -27,8 +28,13 @@ class TransferConfig:
         smoothing: how strongly a vertex is believed: weights are smoothed over this multiple of its distance to the
             source. None believes matched vertices wholly and the others not at all.
         normal_doubt: how many times wider still where the normals are perpendicular (twice as many where opposite).
-        allowed_joints: names or indices of the joints that the target may follow; None allows all. The source is
-            restricted to the faces that these joints own.
+        confident: a matched vertex within this fraction of the source's extent is confident. The others listen to the
+            joints that confident ones lead to along the surface. None: no vertex is.
+        far: between these fractions of the source's extent a vertex passes from what the body nearby says to what
+            confident vertices lead to.
+        allowed_joints: names or indices of the joints that the target may follow; None allows all. They steer what is
+            not confident: a confident vertex keeps the joints that it is matched to. Without confident vertices
+            (`confident` None) the source is restricted to the faces that these joints own.
         unmatched: what a connected component without any match gets: "extend" the extension like all others,
             "nearest" the closest source point's weights, "rigid:JOINT" (name or index) one joint, "raise" an error.
         max_distance: a vertex is matched within this fraction of the target's extent.
@@ -44,6 +50,8 @@ class TransferConfig:
     falloff: float | None = 6.0
     smoothing: float | None = 0.4
     normal_doubt: float = 2.0
+    confident: float | None = 0.015
+    far: tuple[float, float] = (0.055, 0.1)
     allowed_joints: tuple[str | int, ...] | None = None
     unmatched: str = "extend"
     max_distance: float = 0.05
@@ -55,7 +63,7 @@ class TransferConfig:
     joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing"):
+        for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing", "confident"):
             value = getattr(self, name)
             if value is not None:
                 require_positive(f"config {name}", value, finite=False)
@@ -63,6 +71,8 @@ class TransferConfig:
             raise InputError("config falloff", expected="more than 2, or None", received=str(self.falloff))
         for name in ("normal_doubt", "averaging_steps"):
             require_at_least(f"config {name}", getattr(self, name), 0)
+        if len(self.far) != 2 or not 0 <= self.far[0] < self.far[1]:
+            raise InputError("config far", expected="two fractions, none negative, growing", received=str(self.far))
         if self.max_influences is not None:
             require_at_least("config max_influences", self.max_influences, 1)
         require_choice("config laplacian", self.laplacian, ("auto", "cotangent", "intrinsic"))
@@ -83,7 +93,12 @@ class TransferConfig:
 
         Components that nothing matches (for which the publication says nothing) copy the closest point.
         """
-        return TransferConfig(falloff=None, smoothing=None, normal_doubt=0.0, unmatched="nearest")
+        return TransferConfig(falloff=None, smoothing=None, normal_doubt=0.0, confident=None, unmatched="nearest")
+
+    @staticmethod
+    def restricted() -> TransferConfig:
+        """The default of version 0.1, in which a label's joints overrule matches: for comparison."""
+        return TransferConfig(confident=None, normal_doubt=2.0, smoothing=0.4, falloff=6.0)
 
     @staticmethod
     def for_label(name: str, *, base: TransferConfig | None = None) -> TransferConfig:

@@ -9,9 +9,12 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32, Int64
+from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
+
+_FACING = np.pi / 3  # up to this angle a closest point faces as the target does
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,47 @@ def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence
     barycentric = _barycentric(closest, *(source.vertices[corners[:, k]] for k in range(3)))
     found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))
     ours, theirs = target.vertex_normals, normalize_rows(found.interpolate(source, source.vertex_normals))
-    # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
-    angle = np.arctan2(row_lengths(np.cross(ours, theirs)), np.einsum("ij,ij->i", ours, theirs))
+    angle = _angles(ours, theirs)
     missing = ~(ours.any(axis=1) & theirs.any(axis=1))
     angle[missing] = np.nan
     return Correspondence(face, barycentric, np.sqrt(squared), angle)
+
+
+def prefer_facing(
+    found: Correspondence,
+    source: TriangleMesh,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    *,
+    length: float,
+) -> Correspondence:
+    """Where the closest point faces another way, a near point that faces the same way, if there is one.
+
+    What a garment covers lies behind it and faces as it does; a hand beside a skirt, the arm beside a bodice faces
+    against it, however near. For vertices whose closest point faces more than 60 degrees away, the face is
+    taken whose centre y and normal n' minimise `|x - y|^2 + length^2 |n - n'|^2`, and its point nearest to x; so an
+    opposite normal costs as much as `2 length` of distance. A lining, which faces against all that is near,
+    keeps its closest point.
+
+    Args:
+        points, normals: of the target, turned outwards. length: metres.
+    """
+    rows = np.flatnonzero(~(found.angle <= _FACING) & normals.any(axis=1))
+    if not len(rows):
+        return found
+    x, n = points[rows], normals[rows]
+    tree = cKDTree(np.hstack([source.face_centers, length * source.face_normals]))
+    face = tree.query(np.hstack([x, length * n]), workers=-1)[1]
+    corners = source.faces[face]
+    barycentric = _barycentric(x, *(source.vertices[corners[:, k]] for k in range(3)))
+    there = Correspondence(face, barycentric, np.empty(len(rows)), np.empty(len(rows)))
+    distance = row_lengths(x - there.interpolate(source, source.vertices))
+    angle = _angles(n, normalize_rows(there.interpolate(source, source.vertex_normals)))
+    better = ~(angle >= found.angle[rows])
+    out = {name: getattr(found, name).copy() for name in ("face", "barycentric", "distance", "angle")}
+    for name, value in (("face", face), ("barycentric", barycentric), ("distance", distance), ("angle", angle)):
+        out[name][rows[better]] = value[better]
+    return Correspondence(**out)
 
 
 def face_outward(
@@ -91,6 +130,12 @@ def face_outward(
     )
     angle = np.where(turned, np.pi - found.angle, found.angle)
     return replace(found, angle=angle), np.where(turned[:, None], -1.0, 1.0) * target.vertex_normals
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Radians between unit vectors."""
+    # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
+    return np.arctan2(row_lengths(np.cross(a, b)), np.einsum("ij,ij->i", a, b))
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.correspond import Correspondence
+from smplxpp.transfer.evidence import LEAST_REACH, speaking
 
 _SAMPLES = 1000
 _NEIGHBOURS = 32  # at a few radii of a sample the rest of the kernel is a few percent
+_LEAST_SAY = 0.02  # of a sample, for the vertex that listens most
 _LEAST_AGREEMENT = 0.02  # a lining faces away from all skin near it, and still belongs there
 
 
@@ -51,7 +53,8 @@ def extend_weights(
     samples: SurfaceSamples,
     *,
     falloff: float = 6.0,
-) -> Float64[np.ndarray, "N J"]:
+    reach: Float[np.ndarray, "N J"] | None = None,
+) -> tuple[Float64[np.ndarray, "N J"], Float64[np.ndarray, " N"]]:
     """Weights at points off the body: a mean over the body that widens with the distance to it.
 
         W(x) = integral of W(y) g(x, y) |x - y|^-p dA(y) / integral of g(x, y) |x - y|^-p dA(y)
@@ -67,10 +70,22 @@ def extend_weights(
         found: closest points of `points`; copied: (N, J) the weights there.
         samples: of the same surface.
         falloff: p > 2.
+        reach: (N, J) how far each joint may speak for a point (`evidence.joint_reach`): g is multiplied by what it
+            says of y's weights. None: all may.
 
     Returns:
-        (N, J), rows summing to 1; equal to `copied` where the distance is zero.
+        (N, J), rows summing to 1, equal to `copied` where the distance is zero; and (N,) the share of the kernel that
+        `reach` lets through, 1 without it.
     """
+    told = None
+    if reach is not None:
+        told = speaking(reach, samples.weights)
+        asked = told.max(axis=0) > _LEAST_SAY  # a limb that nothing is led to takes no neighbour's place
+        if asked.any():
+            told = told[:, asked]
+            samples = SurfaceSamples(
+                samples.points[asked], samples.normals[asked], samples.weights[asked], samples.area
+            )
     half = falloff / 2.0
     rho2 = samples.area / np.pi
     # Everything is multiplied by d^(p-2), so that a distance of zero is no special case.
@@ -84,9 +99,15 @@ def extend_weights(
     scale = d2 + rho2
     far = (scale[:, None] / (distance**2 + rho2)) ** half * (fraction / scale * samples.area)[:, None]
     far *= _agreement(cosine)
+    heard = np.ones(len(points))
+    if reach is not None and told is not None:
+        whole = near + far.sum(axis=1)
+        near = near * np.maximum((reach * copied).sum(axis=1), LEAST_REACH)
+        far *= np.take_along_axis(told, index, axis=1)
+        heard = (near + far.sum(axis=1)) / whole
     rows = np.repeat(np.arange(len(points)), count)
     matrix = sp.csr_matrix((far.ravel(), (rows, index.ravel())), (len(points), len(samples.points)))
-    return (near[:, None] * copied + matrix @ samples.weights) / (near + far.sum(axis=1))[:, None]
+    return (near[:, None] * copied + matrix @ samples.weights) / (near + far.sum(axis=1))[:, None], heard
 
 
 def _agreement(cosine: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 
@@ -9,11 +11,20 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.transfer.components import settle_unmatched, vertex_components
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward
+from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward, prefer_facing
+from smplxpp.transfer.evidence import (
+    components_without,
+    joint_reach,
+    lead,
+    lean_on_the_lead,
+    neighbouring_joints,
+)
 from smplxpp.transfer.extend import extend_weights, sample_surface
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.regions import restrict_source
 from smplxpp.transfer.repair import check_placement, check_source, check_target, consistent_winding, extent
+
+_FACING_LENGTH = 0.02  # of the source's extent: what an opposite normal costs in distance, halved
 
 
 def transfer_weights(
@@ -28,7 +39,10 @@ def transfer_weights(
     With the default settings each vertex takes the body's weights, averaged over a neighbourhood that grows with its
     distance from the body (`extend_weights`), and the whole is smoothed along the cloth over a length that grows alike
     (`fit_smoothly`): close cloth moves with the skin under it, loose cloth between two limbs blends them instead of
-    tearing. `TransferConfig.paper()` is "Robust Skin Weights Transfer via Weight Inpainting" (Abdrashitov, Raichstat,
+    tearing. Vertices that lie on the skin and face as it does are confident: they keep its weights whatever the label
+    says, and what they lead to along the cloth decides which limbs the others may follow at all (`evidence`), so that
+    a skirt does not follow the hand beside it, and far from the body it takes the place of what the body says.
+    `TransferConfig.paper()` is "Robust Skin Weights Transfer via Weight Inpainting" (Abdrashitov, Raichstat,
     Monsen, Hill; SIGGRAPH Asia 2023 Technical Communications): closest points are believed where near and facing the
     same way, the rest is inpainted.
 
@@ -59,22 +73,29 @@ def transfer_weights(
     joint_count = weights.shape[1]
     source = consistent_winding(source, subject="source mesh")
     target = consistent_winding(target, subject="target mesh")
-    length = config.length_scale * extent(source)
+    size = extent(source)
     allowed = config.allowed_mask(joint_count)
-    if allowed is not None:
+    if allowed is not None and config.confident is None:
         source, weights = restrict_source(source, weights, allowed)
     found = closest_points(source, target)
     check_placement(source, target, found.distance)
     component = vertex_components(target)
     limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
-    matched = found.matched(max_distance=limit, max_angle=np.radians(config.max_angle_deg))
-    values = _values(source, weights, target, found, normals, config)
+    if config.confident is not None:
+        found = prefer_facing(found, source, target.vertices, normals, length=_FACING_LENGTH * size)
+    angle = np.radians(config.max_angle_deg)
+    matched = found.matched(max_distance=limit, max_angle=angle)
+    near = min(limit, (config.confident or 0.0) * size)
+    confident = found.matched(max_distance=near, max_angle=angle) & (config.confident is not None)
+    values = _values(source, weights, _Matches(target, normals, found, component, confident), allowed, size, config)
     settled, values, policies = settle_unmatched(component, matched, values, config)
     # Joints that nothing uses cost nothing in the solver.
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
-    dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, length, config)
+    dense[:, occurring] = _smooth(
+        target, found, values[:, occurring], matched, settled, config.length_scale * size, config
+    )
     return SkinWeights.from_dense(
         dense,
         max_influences=config.max_influences,
@@ -86,22 +107,61 @@ def transfer_weights(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """The target, its outward normals, where its vertices meet the source, their component, and which are confident."""
+
+    target: TriangleMesh
+    normals: np.ndarray
+    found: Correspondence
+    component: np.ndarray
+    confident: np.ndarray
+
+
 def _values(
     source: TriangleMesh,
     weights: np.ndarray,
-    target: TriangleMesh,
-    found: Correspondence,
-    normals: np.ndarray,
+    at: _Matches,
+    allowed: np.ndarray | None,
+    size: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """The weights (N, J) each vertex would take by itself: the closest point's, or their extension."""
-    used = np.flatnonzero(weights.any(axis=0))
-    values = found.interpolate(source, weights[:, used])
+    """The weights (N, J) each vertex would take by itself, and by what confident vertices lead to."""
+    joint_count, used = weights.shape[1], np.flatnonzero(weights.any(axis=0))
+    weights = weights[:, used]
+    copied = at.found.interpolate(source, weights)
+    led = reach = None
+    alone = components_without(at.component, at.confident)
+    if at.confident.any():
+        led = _lead(at, copied, config.length_scale * size, config)
+        reach = joint_reach(led, neighbouring_joints(weights), None if allowed is None else allowed[used])
+        reach[alone] = 1.0 if allowed is None else allowed[used]
+    elif allowed is not None and config.confident is not None:
+        reach = np.repeat(allowed[None, used].astype(np.float64), len(copied), axis=0)
+    values, heard = copied, np.ones(len(copied))
     if config.falloff is not None:
-        samples = sample_surface(source, weights[:, used])
-        values = extend_weights(target.vertices, normals, found, values, samples, falloff=config.falloff)
-    out = np.zeros((target.vertex_count, weights.shape[1]))
+        samples = sample_surface(source, weights)
+        values, heard = extend_weights(
+            at.target.vertices, at.normals, at.found, copied, samples, falloff=config.falloff, reach=reach
+        )
+    if led is not None:
+        lean = lean_on_the_lead(at.found.distance, heard, far=(config.far[0] * size, config.far[1] * size))
+        lean[at.confident | alone] = 0.0
+        values = values + lean[:, None] * (led - values)
+    if reach is not None and alone.any():  # a little of what may not speak comes along with what may
+        values[alone] *= reach[alone] > 0
+        values[alone] /= values[alone].sum(axis=1, keepdims=True)
+    out = np.zeros((len(values), joint_count))
     out[:, used] = values
+    return out
+
+
+def _lead(at: _Matches, copied: np.ndarray, length: float, config: TransferConfig) -> np.ndarray:
+    """What confident vertices lead to (N, J); vertices without a face and components without one keep `copied`."""
+    kept = at.confident | components_without(at.component, at.confident)
+    mesh, used = at.target.submesh(np.ones(at.target.face_count, dtype=bool))
+    out = copied.copy()
+    out[used] = lead(mesh, copied[used], kept[used], length=length, laplacian=config.laplacian)
     return out
 
 

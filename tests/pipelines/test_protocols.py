@@ -85,7 +85,9 @@ def run_of(folder: Path, root: Path, protocol: str | None, **options) -> Path:
 
 
 def test_a_build_takes_the_files_of_its_protocol(root, tmp_path):
-    exact, tracked = (Build(out=tmp_path, capture=root, protocol=name).inputs() for name in ("exact", "tracked"))
+    exact, tracked = (
+        Build(out=tmp_path, capture=root, protocol=name, register="off").inputs() for name in ("exact", "tracked")
+    )
     for inputs, params, labels in ((exact, "params.npz", "labels"), (tracked, "params_noisy.npz", "labels_estimated")):
         assert inputs.params.name == inputs.motion.name == params
         assert inputs.labels is None and {path.parts[-3] for path in inputs.label_maps.values()} == {labels}

@@ -180,7 +180,16 @@ def test_meshes_without_faces():
 
 
 @pytest.mark.parametrize(
-    "settings_", [{"falloff": 2.0}, {"smoothing": 0.0}, {"unmatched": "zero"}, {"max_influences": 0}, {"falloff": None}]
+    "settings_",
+    [
+        {"falloff": 2.0},
+        {"smoothing": 0.0},
+        {"unmatched": "zero"},
+        {"max_influences": 0},
+        {"falloff": None},
+        {"confident": 0.0},
+        {"far": (0.1, 0.1)},
+    ],
 )
 def test_bad_settings(settings_):
     with pytest.raises(InputError, match="config"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import igl
 import numpy as np
 import pytest
@@ -141,6 +143,34 @@ def test_a_forbidden_limb_is_never_followed(body, skirt):
     assert free[:, 3].max() > 0.5  # the hand touches the skirt
     config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES)
     assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
+
+
+def test_a_confident_match_keeps_its_joints_whatever_is_allowed(body):
+    """A close stocking on the left leg keeps `left`, although only hips and the other leg are allowed."""
+    mesh, weights = body
+    stocking = tube(0.09, 0.1, 0.6, x=0.1)
+    config = TransferConfig(allowed_joints=("hips", "right"), joint_names=NAMES)
+    assert transfer_weights(mesh, weights, stocking, config=config).dense()[:, 1].min() > 0.95
+    overruled = replace(config, confident=None)
+    assert transfer_weights(mesh, weights, stocking, config=overruled).dense()[:, 1].max() == 0
+
+
+def test_cloth_that_lies_on_the_skin_elsewhere_does_not_follow_the_hand_beside_it(body):
+    """A close skirt is led to the legs all over; the hand that nearly touches it faces against it."""
+    mesh, weights = body
+    angle = np.arange(48) * (2 * np.pi / 48)
+    sheet = tube(0.2, 0.1, 0.95, around=48)
+    # An oval round both legs, 1 cm off their outer sides.
+    flat = np.stack([0.19 * np.cos(angle), 0.09 * np.sin(angle)], axis=1)
+    points = sheet.vertices.copy()
+    points[:, [0, 2]] = np.tile(flat, (30, 1))
+    points[:, 0] += 0.004 * np.sin(9 * points[:, 1])
+    skirt = sheet.with_vertices(points)
+    hand = tube(0.03, 0.4, 0.7, along=10, x=0.228)
+    rows = len(weights) - hand.vertex_count
+    near = mesh.with_vertices(np.concatenate([mesh.vertices[:rows], hand.vertices]))
+    assert transfer_weights(near, weights, skirt).dense()[:, 3].max() < 0.02
+    assert transfer_weights(near, weights, skirt, config=TransferConfig.restricted()).dense()[:, 3].max() > 0.3
 
 
 def test_labels_name_joints_of_the_model_by_their_number():

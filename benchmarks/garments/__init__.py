@@ -1,0 +1,1 @@
+"""Garments made by procedure on the open body, each with weights that a stated rule gives it."""

@@ -1,0 +1,125 @@
+"""Hair as a scan shows it: shells over the head and locks that lie on shoulders, back and chest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
+from benchmarks.garments.mannequin import Mannequin
+from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
+from pipelines.synth.noise import ramp
+
+_BACK, _OPEN = 1.5 * np.pi, 0.95  # azimuth of the back; how far the curtain's edges stay from the front
+
+
+def hairstyles(mannequin: Mannequin) -> list[Garment]:
+    """A bob on the shoulders, long hair down the back, hair over chest and arms, and a braid over the chest."""
+    j = mannequin.joints
+    head = "the head down to the chin; from there it passes smoothly to "
+
+    def bob() -> ClothMesh:
+        return _lying(mannequin, _curtain(mannequin, j["left_shoulder"][1] + 0.045, spread=0.05))
+
+    def long() -> ClothMesh:
+        return _hanging(mannequin, _curtain(mannequin, j["spine2"][1], spread=0.035, half=1.25), keeps=0.2)
+
+    def wide() -> ClothMesh:
+        return _hanging(mannequin, _curtain(mannequin, j["spine3"][1], spread=0.075, half=np.pi - 0.6), keeps=0.1)
+
+    return [
+        Garment("bob on the shoulders", "hair", bob, head + "the shoulders' skin straight below"),
+        Garment("long loose hair", "hair", long, head + "0.8 of the trunk at its height"),
+        Garment(
+            "hair over chest and shoulders",
+            "hair",
+            wide,
+            head + "0.9 of the trunk at its height; the arms move without it",
+            beside_hands=True,
+        ),
+        Garment(
+            "braid over the chest",
+            "hair",
+            lambda: _braid(mannequin),
+            "by the place along the braid: the head down to the chin, the trunk at its height from 14 cm below",
+        ),
+    ]
+
+
+def _cap(mannequin: Mannequin) -> ClothMesh:
+    """The hair on the skull, rigid to the head."""
+    j = mannequin.joints
+
+    def level(p: np.ndarray) -> np.ndarray:
+        hairline = j["head"][1] + 0.02 + 1.25 * np.clip(p[:, 2] - j["head"][2] + 0.02, 0, None)
+        return p[:, 1] - hairline
+
+    cloth = layer(mannequin, level, ease=0.017, fairing=12)
+    return ClothMesh(cloth.vertices, cloth.faces, mannequin.rigid("head", len(cloth.vertices)))
+
+
+def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float = np.pi - _OPEN) -> ClothMesh:
+    """A sheet about the back of the head, `half` radians to each side, that hangs and is pushed off the skin."""
+    j = mannequin.joints
+    top = j["head"][1] + 0.055
+    heights, azimuths = np.linspace(top, bottom, 60), np.linspace(_BACK - half, _BACK + half, 70)
+    down = ((top - heights) / (top - bottom))[:, None]
+    radius = np.broadcast_to(0.096 + spread * down**2, (60, 70))
+    centre = j["head"][2] + 0.005
+    points = np.stack(
+        np.broadcast_arrays(
+            1.0 * radius * np.cos(azimuths), heights[:, None], centre + 1.15 * radius * np.sin(azimuths)
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+    cloth = ClothMesh(points, grid_faces(60, 70, closed=False), np.zeros((len(points), mannequin.body.joint_count)))
+    inside = np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + centre])
+    cloth = facing_out(cloth, inside)
+    pushed = push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
+    pushed = smooth(cloth.mesh, pushed, steps=4)
+    return cloth.with_vertices(
+        push_out(cloth.mesh.with_vertices(pushed), mannequin.skin.mesh, clearance=0.007, solid=True)
+    )
+
+
+def _handed_over(mannequin: Mannequin, cloth: ClothMesh, below: np.ndarray, *, keeps: float, over: float) -> ClothMesh:
+    """Head down to the chin, `below` from `over` metres under it, which still keeps a share with the head."""
+    chin = mannequin.joints["jaw"][1] - 0.045
+    head = (keeps + (1 - keeps) * ramp(cloth.vertices[:, 1], chin - over, chin))[:, None]
+    weights = head * mannequin.rigid("head", len(cloth.vertices)) + (1 - head) * below
+    return ClothMesh(cloth.vertices, cloth.faces, weights)
+
+
+def _lying(mannequin: Mannequin, curtain: ClothMesh) -> ClothMesh:
+    lower = _handed_over(mannequin, curtain, mannequin.below(curtain.vertices), keeps=0.0, over=0.10)
+    return joined(_cap(mannequin), lower)
+
+
+def _hanging(mannequin: Mannequin, curtain: ClothMesh, *, keeps: float) -> ClothMesh:
+    lower = _handed_over(mannequin, curtain, mannequin.trunk_weights(curtain.vertices), keeps=keeps, over=0.16)
+    return joined(_cap(mannequin), lower)
+
+
+def _braid(mannequin: Mannequin) -> ClothMesh:
+    """A braid from behind the left ear over the shoulder down the chest."""
+    j = mannequin.joints
+    t = np.linspace(0, 1, 70)
+    knots = np.array(
+        [
+            [0.075, j["head"][1] + 0.03, j["head"][2] - 0.075],
+            [0.095, j["neck"][1] + 0.05, j["neck"][2] - 0.01],
+            [0.098, j["neck"][1] - 0.01, j["neck"][2] + 0.075],
+            [0.095, j["spine3"][1] + 0.12, mannequin.axis[1] + 0.14],
+            [0.090, j["spine2"][1] + 0.02, mannequin.axis[1] + 0.15],
+        ]
+    )
+    curve = np.column_stack([np.interp(t, np.linspace(0, 1, 5), knots[:, k]) for k in range(3)])
+    for _ in range(30):
+        curve[1:-1] = 0.5 * curve[1:-1] + 0.25 * (curve[:-2] + curve[2:])
+    points, faces = tube_along(curve, 0.02 + 0.003 * np.sin(40 * t) - 0.008 * t)
+    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
+    cloth = facing_out(cloth, np.repeat(curve, 24, axis=0))
+    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.003, solid=True, reach=0.08))
+    middle = np.repeat(curve, 24, axis=0)
+    line = ClothMesh(middle, cloth.faces, cloth.weights)
+    weights = _handed_over(mannequin, line, mannequin.trunk_weights(middle), keeps=0.0, over=0.14).weights
+    return joined(_cap(mannequin), ClothMesh(cloth.vertices, cloth.faces, weights))

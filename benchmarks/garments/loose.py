@@ -1,0 +1,124 @@
+"""Garments that hang: sheets laid out by height and azimuth, painted by rules in those coordinates."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from benchmarks.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
+from benchmarks.garments.mannequin import Mannequin
+from pipelines.synth.cloth_mesh import ClothMesh, push_out
+
+_SKIRT = (
+    "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "
+    "rest stays with the pelvis; left and right by the place across the ring; below the knee the shins take up to "
+    "{shins} of it"
+)
+_COAT = "body and sleeves as grown from the skin; panels as a skirt's with legs 0.7, shins 0.3"
+_CAPE = "trunk at the same height and azimuth down to the hips, below that pelvis with up to 0.4 of the thighs"
+_SLEEVES = "body as grown from the skin; sleeves: the arm's skin at the same place along the arm, however far they hang"
+_CELL = 0.014
+
+
+def loose_garments(mannequin: Mannequin) -> list[Garment]:
+    """Skirts, dresses, coat, cape and wide sleeves."""
+    j = mannequin.joints
+    waist, hip, knee, ankle = j["spine1"][1] + 0.04, j["left_hip"][1], j["left_knee"][1], j["left_ankle"][1]
+    chest = j["spine3"][1] + 0.085
+
+    def skirt(name: str, hem: float, *, label: str = "lower", top: float = waist, legs: float, shins: float, **cut):
+        make = partial(_hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
+        return Garment(name, label, make, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
+
+    return [
+        skirt("mini skirt", hip - 0.2, legs=0.9, shins=0.0, flare=0.05),
+        skirt("knee skirt", knee + 0.02, legs=0.9, shins=0.3, flare=0.04),
+        skirt("long skirt", ankle + 0.06, legs=0.85, shins=0.5, flare=0.06),
+        skirt("flared skirt", knee + 0.04, legs=0.8, shins=0.3, flare=0.3, pleats=(9, 0.04)),
+        skirt("full circle skirt", knee + 0.08, legs=0.6, shins=0.2, flare=0.8, pleats=(12, 0.08)),
+        skirt("dress", knee + 0.03, label="upper", top=chest, legs=0.8, shins=0.3, flare=0.2, pleats=(8, 0.03)),
+        skirt("dress labelled lower", ankle + 0.2, top=chest, legs=0.8, shins=0.4, flare=0.55, pleats=(11, 0.03)),
+        Garment("open coat", "outer", partial(_coat, mannequin), _COAT, loose=True),
+        Garment("cape", "outer", partial(_cape, mannequin), _CAPE, loose=True),
+        Garment("wide sleeves", "upper", partial(_kimono, mannequin), _SLEEVES, loose=True),
+    ]
+
+
+def _hung(
+    mannequin: Mannequin, top: float, hem: float, *, legs: float, shins: float, gap: float = 0.0, **cut
+) -> ClothMesh:
+    """A skirt from `top` down to `hem`, open by `gap` radians to each side of the front."""
+    heights = np.linspace(top, hem, int((top - hem) / _CELL) + 2)
+    azimuths = around(100) if not gap else np.linspace(np.pi / 2 + gap, 2.5 * np.pi - gap, 100)
+    points, faces = hang(mannequin, heights, azimuths, closed=not gap, **cut)
+    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
+    cloth = facing_out(cloth, np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + mannequin.axis[1]]))
+    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
+    return ClothMesh(cloth.vertices, cloth.faces, skirt_weights(mannequin, points, legs=legs, shins=shins))
+
+
+def _coat(mannequin: Mannequin) -> ClothMesh:
+    """A long coat, open in front: body and sleeves to the hips, and panels from there down."""
+    j = mannequin.joints
+    hip, knee = j["left_hip"][1], j["left_knee"][1]
+
+    def level(p: np.ndarray) -> np.ndarray:
+        x, y, z = p.T
+        front = np.where(z > mannequin.axis[1], np.abs(x) - 0.045, 1.0)
+        neck = np.where(y > j["neck"][1] - 0.13, np.hypot(x, z - j["neck"][2] - 0.018) - 0.075, 1.0)
+        below = np.minimum(y - hip - 0.06, j["neck"][1] + 0.03 - y)
+        return np.minimum(np.minimum(front, neck), np.minimum(below, j["left_wrist"][0] - 0.02 - np.abs(x)))
+
+    top = layer(mannequin, level, ease=0.018, fairing=10)
+    panels = _hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
+    return joined(top, panels)
+
+
+def _cape(mannequin: Mannequin) -> ClothMesh:
+    """A cape about the back, from the shoulders to the knees."""
+    j = mannequin.joints
+    top, hem = j["neck"][1] - 0.05, j["left_knee"][1] + 0.05
+    heights = np.linspace(top, hem, 60)
+    azimuths = np.linspace(np.pi + 0.12, 2 * np.pi - 0.12, 70)
+    reach = 0.125 + 0.16 * ((top - heights) / (top - hem)) ** 0.7
+    outline = mannequin.outline(heights[:, None], azimuths[None, :]) * np.clip(-np.sin(azimuths), 0.75, 1.0) + 0.01
+    radius = np.maximum(outline, reach[:, None] * (1 + 0.05 * np.sin(9 * azimuths) * (reach[:, None] / 0.2)))
+    points = mannequin.at(heights[:, None], azimuths[None, :], np.maximum.accumulate(radius, axis=0)).reshape(-1, 3)
+    faces = grid_faces(len(heights), len(azimuths), closed=False)
+    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
+    cloth = facing_out(cloth, np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + mannequin.axis[1]]))
+    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True))
+    weights = skirt_weights(mannequin, points, legs=0.4, shins=0.0)
+    return ClothMesh(cloth.vertices, cloth.faces, weights)
+
+
+def _kimono(mannequin: Mannequin) -> ClothMesh:
+    """A robe's upper part with sleeves that hang wide below the arms."""
+    j = mannequin.joints
+    hip, shoulder, wrist = j["left_hip"][1], j["left_shoulder"], j["left_wrist"]
+
+    def level(p: np.ndarray) -> np.ndarray:
+        x, y, z = p.T
+        neck = np.where(y > j["neck"][1] - 0.13, np.hypot(x, z - j["neck"][2] - 0.03) - 0.085, 1.0)
+        return np.minimum(
+            np.minimum(neck, y - hip - 0.02), np.minimum(shoulder[0] + 0.12 - np.abs(x), j["neck"][1] + 0.03 - y)
+        )
+
+    pieces = [layer(mannequin, level, ease=0.014, fairing=8)]
+    along = np.linspace(shoulder[0] + 0.10, wrist[0] - 0.03, 40)
+    angle = around(48)
+    hangs = 0.07 + 0.19 * ((along - along[0]) / (along[-1] - along[0])) ** 0.8
+    drop = np.where(np.sin(angle)[None, :] < 0, hangs[:, None], 0.062)
+    for sign in (1.0, -1.0):
+        y = shoulder[1] + drop * np.sin(angle)[None, :]
+        width = np.where(np.sin(angle) < 0, 0.06 * (1 + 0.5 * np.sin(angle)), 0.06)
+        z = shoulder[2] + np.broadcast_to((width * np.cos(angle))[None, :], y.shape)
+        points = np.stack(np.broadcast_arrays(sign * along[:, None], y, z), axis=-1).reshape(-1, 3)
+        sleeve = ClothMesh(points, grid_faces(40, 48, closed=True), mannequin.arm_weights(points))
+        middle = np.repeat(
+            np.column_stack([sign * along, 0 * along + shoulder[1], 0 * along + shoulder[2]]), 48, axis=0
+        )
+        sleeve = facing_out(sleeve, middle)
+        pieces.append(sleeve.with_vertices(push_out(sleeve.mesh, mannequin.skin.mesh, clearance=0.005, solid=True)))
+    return joined(*pieces)

@@ -1,0 +1,87 @@
+"""Which vertices of the target the body settles, and what these say about the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int32
+
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.transfer.inpaint import fit_smoothly
+
+_TOGETHER = 0.1  # two joints are neighbours where a vertex follows both by at least this
+_NEIGHBOUR = 0.1  # how far a neighbour of the joint that cloth is led to may speak, against that joint
+LEAST_REACH = 1e-6  # the whole body speaks where nothing that may speak is near
+_OWN = 0.3  # a joint with this share of the confident cloth's weight is no longer what the label says about it
+_UNHEARD = (0.01, 0.001)  # share of the body nearby that may speak: from the first to the second it loses its say
+
+
+def lead(
+    mesh: TriangleMesh,
+    copied: Float[np.ndarray, "N J"],
+    confident: Bool[np.ndarray, " N"],
+    *,
+    length: float,
+    laplacian: str,
+) -> Float64[np.ndarray, "N J"]:
+    """The weights that confident vertices lead to along the surface: they keep theirs, the others are inpainted.
+
+    Args:
+        mesh: every vertex referenced. copied: weights of the closest points; components without a confident vertex
+            keep them. length, laplacian: see `fit_smoothly`.
+
+    Returns:
+        (N, J), none negative, rows summing to 1.
+    """
+    known = copied.any(axis=0)
+    out = np.zeros_like(copied, dtype=np.float64)
+    width = np.where(confident, 0.0, np.inf)
+    out[:, known] = np.clip(fit_smoothly(mesh, copied[:, known], width, length=length, laplacian=laplacian), 0.0, 1.0)
+    return out / out.sum(axis=1, keepdims=True)
+
+
+def neighbouring_joints(weights: Float[np.ndarray, "V J"]) -> Bool[np.ndarray, "J J"]:
+    """The pairs of joints that some vertex follows both, each with itself: the skeleton as the weights show it."""
+    strong = (weights > _TOGETHER).astype(np.float64)
+    return (strong.T @ strong > 0) | np.eye(weights.shape[1], dtype=bool)
+
+
+def joint_reach(
+    led: Float[np.ndarray, "N J"], neighbours: Bool[np.ndarray, "J J"], allowed: Bool[np.ndarray, " J"] | None
+) -> Float64[np.ndarray, "N J"]:
+    """How far each joint may speak for a vertex: wholly where confident cloth leads to it, a little beside that.
+
+    A sleeve that hangs before the thigh is led to the arm, and the thigh, no neighbour of the arm, is not asked;
+    neither is the hand beside a skirt. What a label excludes (`allowed`) is not asked either, unless confident cloth
+    follows it.
+    """
+    passed_on = np.where(neighbours, _NEIGHBOUR, 0.0)
+    np.fill_diagonal(passed_on, 1.0)
+    reach = np.minimum(led @ passed_on, 1.0)
+    return reach if allowed is None else np.where(allowed | (led > _OWN), reach, 0.0)
+
+
+def lean_on_the_lead(
+    distance: Float[np.ndarray, " N"], heard: Float[np.ndarray, " N"], *, far: tuple[float, float]
+) -> Float64[np.ndarray, " N"]:
+    """How far the lead replaces what the body nearby says: 0 to 1.
+
+    Smoothly from 0 to 1 between the two distances `far` (metres), and where hardly any of the body nearby may speak
+    (`heard`, a share).
+    """
+    return 1.0 - (1.0 - _step(distance, *far)) * (1.0 - _step(heard, *_UNHEARD))
+
+
+def speaking(reach: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"]) -> Float64[np.ndarray, "N S"]:
+    """How far each point of the body, by its weights, may speak for each vertex."""
+    return np.maximum(reach @ weights.T, LEAST_REACH)
+
+
+def components_without(component: Int32[np.ndarray, " N"], confident: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+    """The vertices of components that have no confident vertex."""
+    return (np.bincount(component, confident) == 0)[component]
+
+
+def _step(x: np.ndarray, start: float, end: float) -> np.ndarray:
+    """A smooth step from 0 at `start` to 1 at `end` (either order)."""
+    t = np.clip((x - start) / (end - start), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
