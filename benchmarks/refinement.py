@@ -48,7 +48,7 @@ class RefinementBenchmark:
     capture: Path
     """Folder of the capture, with exact and noisy parameters and true vertices."""
     starts: tuple[str, ...] = ("noise", "smoothed")
-    """Of noise, smoothed, given (noisy parameters as they are), exact (what refinement does to poses that are right)."""
+    """Of noise, smoothed, given (noisy parameters as they are), exact (what it does to poses that are right)."""
     frames: int = 10_000
     """At most so many training frames, from the first."""
     held_out: bool = False
