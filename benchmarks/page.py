@@ -11,6 +11,7 @@ from typing import Any
 
 from benchmarks.machine import RESULTS
 from benchmarks.page_tables import table, tables_of
+from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.atomic import atomic_write_text
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
@@ -31,6 +32,10 @@ PERSON = (
     "The embedded person (`data/fixtures/person`): 8 cameras of 256x320 and 240x240, 16 frames; one camera and 3 "
     "frames are held out. All inputs are exact, as above. Preset `demo`, 22k Gaussians, lean as `cpu` is. No "
     "perceptual distance was measured; the surface of a single held-out frame is known."
+)
+TRACKED_INPUTS = (
+    "**Nothing here is exact**: body parameters as a tracker gives them, estimated labels, normals estimated or none, "
+    "as the words below say."
 )
 DISTILLATION = (
     "No figure on this page rests on the paper's own distillation, in which the student learns from the teacher's "
@@ -249,6 +254,23 @@ PARTS = (
 )
 
 
+def part_of(name: str) -> Part:
+    """Return what is said of a stored result; one whose inputs are tracked is described by the exact one's words."""
+    known = {part.name: part for part in PARTS}
+    if name in known:
+        return known[name]
+    base = known.get(name.removesuffix(f"_{TRACKED}"))
+    if base is None:
+        return Part(name, name, "Not described.")
+    return Part(name, f"{base.title}: tracked inputs", f"{TRACKED_INPUTS} Else as below: {base.conditions}", base.lines)
+
+
+def _is_tracked(content: Mapping[str, Any]) -> bool:
+    """Whether a result's inputs were tracked ones, by its own word."""
+    figures = content["figures"]
+    return isinstance(figures, Mapping) and (figures.get("inputs") or {}).get("name") == TRACKED
+
+
 def page(results: Path = RESULTS) -> str:
     """Return the page that the stored results give."""
     lines = [
@@ -261,12 +283,13 @@ def page(results: Path = RESULTS) -> str:
         f"exact unless a row says `noisy`. {DISTILLATION}",
         "",
     ]
-    stored = {path.stem for path in results.glob("*.json")}
-    unknown = sorted(stored - {part.name for part in PARTS})
-    for part in (*PARTS, *(Part(name, name, "Not described.") for name in unknown)):
-        if part.name in stored:
-            content = json.loads((results / f"{part.name}.json").read_text())
-            lines += [f"## {part.title}", "", part.conditions, "", *_origin(content), *part.lines(content["figures"])]
+    stored = {path.stem: json.loads(path.read_text()) for path in sorted(results.glob("*.json"))}
+    names = [part.name for part in PARTS if part.name in stored]
+    names += [name for name in stored if name not in names]
+    # What a user will see comes before what only somebody with the truth at hand can have.
+    for part in map(part_of, sorted(names, key=lambda name: not _is_tracked(stored[name]))):
+        content = stored[part.name]
+        lines += [f"## {part.title}", "", part.conditions, "", *_origin(content), *part.lines(content["figures"])]
     return "\n".join(lines).rstrip() + "\n"
 
 

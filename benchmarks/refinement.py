@@ -48,7 +48,7 @@ class RefinementBenchmark:
     capture: Path
     """Folder of the capture, with exact and noisy parameters and true vertices."""
     starts: tuple[str, ...] = ("noise", "smoothed")
-    """Of noise, smoothed, given (noisy parameters as they are), exact (what it does to poses that are right)."""
+    """Of noise, smoothed, given (noisy parameters as they are), exact (what refinement does to right poses)."""
     frames: int = 10_000
     """At most so many training frames, from the first."""
     held_out: bool = False
@@ -142,7 +142,7 @@ def errors(
     template: Template, params: BodyParams, exact: BodyParams, root: Path, frames: tuple[int, ...]
 ) -> dict[str, float]:
     """Mean distances to the truth in mm: body vertices, bare skin, skin under cloth, joints; degrees a joint."""
-    bare, under = _bare_and_under(root, template.body.vertex_count)
+    bare, under = bare_and_under(root, template.body.vertex_count)
     distance = []
     for row, frame in enumerate(frames):
         path = root / "geometry" / f"frame_{frame:06d}.npz"
@@ -166,7 +166,7 @@ def errors(
     }
 
 
-def _bare_and_under(root: Path, count: int) -> tuple[Bool[np.ndarray, " V"], Bool[np.ndarray, " V"]]:
+def bare_and_under(root: Path, count: int) -> tuple[Bool[np.ndarray, " V"], Bool[np.ndarray, " V"]]:
     """Body vertices of some visible face, and those of hidden faces alone."""
     topology = np.load(root / "geometry" / "topology.npz")
     faces, hidden = topology["faces"], topology["face_hidden"]

@@ -32,7 +32,9 @@ from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.track import TrackTask
 from benchmarks.machine import store_results
 from pipelines.runs.stage import read_manifest
+from pipelines.stages.protocol import run_protocol
 from smplxpp.capture import open_capture
+from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
@@ -72,7 +74,10 @@ class TrainingBenchmark:
         }
         figures["minutes"] = round(sum(stage["seconds"] for stage in figures["stages"].values()) / 60.0, 2)
         print(json.dumps(figures, indent=1))
-        name = f"training_{open_capture(self.capture).name}_{self.preset}"
+        protocol = figures["inputs"]["name"]
+        name = f"training_{open_capture(self.capture).name}_{self.preset}" + (
+            f"_{TRACKED}" if protocol == TRACKED else ""
+        )
         command = f"smplxpp train --run RUN --capture DIR --preset {self.preset}; smplxpp evaluate RUN --capture DIR; "
         path = store_results(name, command + "python -m benchmarks.training --run RUN --capture DIR", figures)
         print(f"stored {path.name}")
@@ -178,7 +183,10 @@ def _rounded(value: Any) -> Any:
 
 def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict[str, float]]:
     """Milliseconds of a step of every training, and the shares of each kind of work in it."""
-    sequence = AvatarSequence(open_capture(capture), Template.load(run / "60_assemble" / "smplxpp.npz"))
+    protocol = run_protocol(run)
+    sequence = AvatarSequence(
+        open_capture(capture, protocol=protocol), Template.load(run / "60_assemble" / "smplxpp.npz")
+    )
     rig = sequence.rig
     teacher = load_avatar(run / "80_teacher" / "teacher.safetensors", rig)
     baked = load_avatar(run / "85_bake" / "student.safetensors", rig)

@@ -22,11 +22,13 @@ from pipelines.runs.layout import (
     REGISTER_STAGE,
     TRAIN_STAGES,
 )
+from pipelines.runs.places import same_place
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
+from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -192,7 +194,8 @@ class Build:
         said = SaidOfInputs.of_folder(self.capture, self.protocol)
         params = said.own_parameters() if self.params is None else named_params(self.capture, self.params)
         if params is None:
-            return (self.capture / "keypoints").is_dir()
+            files = choose_protocol(self.capture, read_description(self.capture), self.protocol)
+            return files.keypoints is not None and (self.capture / files.keypoints).is_dir()
         return said.given_parameters(params) == TRACKED
 
     def _standing_registration(self) -> RegisterInputs | None:
@@ -206,8 +209,12 @@ class Build:
         ):
             return None
         params = named_params(self.capture, self.params)
-        same = found.capture.resolve() == self.capture.resolve() and found.protocol == self.protocol
-        return found if same and (params is None or params.resolve() == found.params) else None
+        same = same_place(found.capture, self.capture) and found.protocol == self.protocol
+        return (
+            found
+            if same and (params is None or (found.params is not None and same_place(params, found.params)))
+            else None
+        )
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
         """What the body is registered to, None where the parameters are given."""

@@ -115,7 +115,7 @@ class Register:
             raise InputError("--frames", expected="a --capture that has them", received="a scan alone: see --frame")
         frames = None
         if self.frames is not None and self.capture is not None:
-            frames = selected_frames(self.frames, open_capture(self.capture))
+            frames = selected_frames(self.frames, open_capture(self.capture, protocol=self.protocol))
         return RegisterInputs(
             capture=self.capture,
             params=named_params(self.capture, self.params),

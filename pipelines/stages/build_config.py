@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE_STAGES
+from pipelines.runs.places import absolute
 from smplxpp.clean import WebConfig
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.labels import LABELS
@@ -102,7 +103,7 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
 
     def plain(value: Any) -> Any:
         if isinstance(value, Path):
-            return str(value.resolve())
+            return str(absolute(value))
         return {k: plain(v) for k, v in value.items()} if isinstance(value, dict) else value
 
     content = {"inputs": plain(asdict(inputs)), "config": asdict(config)}

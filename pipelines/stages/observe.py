@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -153,8 +152,8 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel) -> Observed:
 def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
     """Open the capture of a registration with the parameters that it starts from."""
     assert inputs.capture is not None
-    protocol: dict[str, Any] = {} if inputs.protocol is None else {"protocol": inputs.protocol}
-    return open_capture(inputs.capture, params=inputs.params if inputs.start else None, body=body, **protocol)
+    params = inputs.params if inputs.start else None
+    return open_capture(inputs.capture, params=params, body=body, protocol=inputs.protocol)
 
 
 def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keypoints2D], list[str]]:

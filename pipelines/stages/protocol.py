@@ -11,6 +11,12 @@ from smplxpp.core.errors import InputError
 log = logging.getLogger(__name__)
 
 
+def run_protocol(run: Path) -> str | None:
+    """The protocol that the template of a run was built by; None: without one, or nobody knows."""
+    build = load_build(run)
+    return None if build is None else build[0].protocol
+
+
 def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures: bool = False) -> str | None:
     """The protocol that a command reads a capture by: the one that is asked for, else the run's.
 
@@ -24,10 +30,9 @@ def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures:
     Raises:
         InputError: another protocol than the run's, for a training.
     """
-    build = load_build(run)
-    if build is None:
+    if load_build(run) is None:
         return asked
-    own = build[0].protocol
+    own = run_protocol(run)
     if asked is None or asked == own:
         return own
     told = f"built by protocol {own}" if own else "built without a protocol"

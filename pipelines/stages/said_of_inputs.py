@@ -9,6 +9,7 @@ from typing import Any
 
 from avatar.evaluation.input_protocol import EXACT, MIXED, NOT_KNOWN, TRACKED
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTERED_PARAMS
+from pipelines.runs.places import lies_in, same_place
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.register_config import load_register
@@ -67,7 +68,7 @@ class SaidOfInputs:
     def parameters(self, run: Path, path: Path | None) -> tuple[str, str]:
         """The word for parameters in a file or folder, and what the run made them by."""
         for file, stage in MADE_BY.items():
-            if path is not None and path.resolve() == (run / file).resolve():
+            if path is not None and same_place(path, run / file):
                 return self._made_from(run), stage
         return self.given_parameters(path), ""
 
@@ -75,11 +76,11 @@ class SaidOfInputs:
         """The word for parameters that lie in the capture; elsewhere, or None: not known."""
         if path is None:
             return NOT_KNOWN
-        folder = (self.root / "params").resolve()
-        if path.resolve() == folder or path.stem.isdigit():
-            name, inside = OWN_PARAMETERS, folder in (path.resolve(), path.resolve().parent)
+        folder = self.root / "params"
+        if same_place(path, folder) or path.stem.isdigit():
+            name, inside = OWN_PARAMETERS, lies_in(path, folder)
         else:
-            name, inside = path.name, path.resolve() == folder / path.name
+            name, inside = path.name, same_place(path, folder / path.name)
         return self._word("parameters", name, OWN_PARAMETERS) if inside else NOT_KNOWN
 
     def own_parameters(self) -> Path | None:
@@ -109,9 +110,8 @@ class SaidOfInputs:
 
     def labels(self, build: BuildInputs) -> str:
         """The word for the labels that a template was built with."""
-        root = self.root.resolve()
         sources = list(build.label_maps.values()) or [build.labels or build.scan]
-        if not all(path.exists() and path.resolve().is_relative_to(root) for path in sources):
+        if not all(path.exists() and lies_in(path, self.root) for path in sources):
             return NOT_KNOWN
         if build.label_maps:
             return self.of_views("labels", next(iter(build.label_maps.values())).parent.parent.name)

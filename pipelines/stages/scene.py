@@ -12,6 +12,7 @@ import numpy as np
 from avatar.data.views import View, read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.places import lies_in
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
@@ -128,7 +129,8 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             f"capture {capture.name}",
             expected=f"body parameters of frame {frame}",
             received="none",
-            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+            remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
+            "`smplxpp register`",
         )
     capture = replace(capture, splits=Splits(train, held_out, (frame,), ()))
     overlap = silhouette_overlap(
@@ -198,7 +200,7 @@ def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> Tr
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
-    if built is None or inputs.capture.resolve() not in built[0].scan.resolve().parents:
+    if built is None or not lies_in(built[0].scan, inputs.capture):
         return None
     return built[0].frame
 
@@ -298,7 +300,8 @@ def _with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:
             f"capture {capture.name}",
             expected="body parameters of the training frames",
             received=why[splits.train_frames[0]],
-            remedy="name a file with --params, or convert your fit with `smplxpp params convert`",
+            remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
+            "`smplxpp register`",
         )
     if why:
         _warn(f"{len(why)} of {len(known) + len(why)} frames are left out: {next(iter(why.values()))}")

@@ -18,8 +18,9 @@ from smplxpp.core.rotations import matrix_from_rotvec
 _CHUNK = 8192
 _STEPS = 8
 _NEAR = 1e-3  # metres: what lies nearer, or behind, is not seen
+_LEAST_AGREE = 1 / 3  # of the cameras that see a point
 _MAD = 1.4826  # of a normal distribution's median of absolute values
-_RESECTION_STEPS = 24
+_RESECTION_STEPS, _RESECTION_POINTS, _ALMOST = 24, 800, 1.15
 # Residuals that a camera's noise is told from: how many, and how far a point may follow the sighting itself.
 _LEAST_RESIDUALS, _MOST_LEVERAGE = 60, 0.7
 
@@ -69,7 +70,7 @@ class Sightings:
         with np.errstate(invalid="ignore"):
             seen = cam[..., 2] > _NEAR
         plane = cam[..., :2] / np.where(seen, cam[..., 2], 1.0)[..., None]
-        uv = np.einsum("cij,cnj->cni", self.K[:, :2, :2], plane) + self.K[:, None, :2, 2]
+        uv = plane @ self.K[:, :2, :2].transpose(0, 2, 1) + self.K[:, None, :2, 2]
         return np.where(seen[..., None], self.pixels - uv, np.inf)
 
 
@@ -99,15 +100,15 @@ def _consensus(s: Sightings, pairs: Sequence[tuple[int, int]], most_cosine: floa
     count = s.weight.shape[1]
     best, points = np.full(count, np.inf), np.full((count, 3), np.nan)
     inverse = np.linalg.inv(s.K)
-    plane = np.einsum("cij,cnj->cni", inverse[:, :2, :2], s.pixels) + inverse[:, None, :2, 2]
+    plane = s.pixels @ inverse[:, :2, :2].transpose(0, 2, 1) + inverse[:, None, :2, 2]
     rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=2) @ s.cam_from_world[:, :, :3]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     # Rows of A x = b: (u r_3 - r_1) x = t_1 - u t_3, and the same for v.
     R, t = s.cam_from_world[:, :, :3], s.cam_from_world[:, :, 3]
     A = plane[..., None] * R[:, None, 2:] - R[:, None, :2]
     b = t[:, None, :2] - plane * t[:, None, 2:]
-    normal = np.einsum("cnki,cnkj->cnij", A, A)
-    right = np.einsum("cnki,cnk->cni", A, b)
+    normal = A.transpose(0, 1, 3, 2) @ A
+    right = (A.transpose(0, 1, 3, 2) @ b[..., None])[..., 0]
     for one, other in pairs:
         meet = (s.weight[one] > 0) & (s.weight[other] > 0)
         meet &= np.abs(np.einsum("nx,nx->n", rays[one], rays[other])) < most_cosine
@@ -131,7 +132,8 @@ def refine(
 
     Returns:
         The points, their covariances in square metres (inverse of the normal matrix, each sighting with the camera's
-        noise and its weight), and which sightings count. NaN where fewer than two cameras count.
+        noise and its weight), and which sightings count. NaN where fewer than two cameras, or fewer than a third of
+        those that see the point, count.
     """
     parts = [
         _refine(s.of_points(slice(start, start + _CHUNK)), points[start : start + _CHUNK])
@@ -150,94 +152,120 @@ def _refine(s: Sightings, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         length = np.linalg.norm(residual, axis=2)
         # The first steps take all that the consensus took: it stands on two cameras, and is off by their noise.
         inliers = (s.weight > 0) & (length < (s.threshold[:, None] if step < _STEPS // 2 else limit))
-        good = inliers.sum(axis=0) >= 2
+        good = inliers.sum(axis=0) >= np.maximum(2, _LEAST_AGREE * (s.weight > 0).sum(axis=0))
         weight = np.where(inliers & good, s.weight, 0.0) / s.noise[:, None] ** 2
         rows = np.flatnonzero(good)
         J = _slopes(s, points[rows])
-        normal = np.einsum("cn,cnki,cnkj->nij", weight[:, rows], J, J, optimize=True)
         if step == _STEPS - 1:
-            covariance[rows] = np.linalg.inv(normal + 1e-12 * np.eye(3))
+            covariance[rows] = np.linalg.inv(_normal(J, weight[:, rows]) + 1e-12 * np.eye(3))
             points[~good] = np.nan
             return points, covariance, inliers & good
         with np.errstate(invalid="ignore"):
             weight = (weight / (1.0 + (length / (3.0 * s.noise[:, None])) ** 2))[:, rows]
-        normal = np.einsum("cn,cnki,cnkj->nij", weight, J, J, optimize=True) + 1e-9 * np.eye(3)
-        right = np.einsum("cn,cnki,cnk->ni", weight, J, np.where(weight[..., None] > 0, residual[:, rows], 0.0))
-        points[rows] += np.linalg.solve(normal, right[..., None])[..., 0]
+        pull = weight[..., None] * np.where(weight[..., None] > 0, residual[:, rows], 0.0)
+        right = (J.transpose(0, 1, 3, 2) @ pull[..., None]).sum(axis=0)
+        points[rows] += np.linalg.solve(_normal(J, weight) + 1e-9 * np.eye(3), right)[..., 0]
     raise AssertionError("unreachable")
 
 
 def pixel_noise(
-    s: Sightings,
-    points: Float64[np.ndarray, "N 3"],
-    covariance: Float64[np.ndarray, "N 3 3"],
-    inliers: Bool[np.ndarray, "C N"],
+    s: Sightings, points: Float64[np.ndarray, "N 3"], inliers: Bool[np.ndarray, "C N"], *, unit: Float[np.ndarray, " C"]
 ) -> Float64[np.ndarray, " C"]:
     """The standard deviation of a coordinate in each camera's pixels, from the median of absolute residuals.
 
     A residual falls short of the noise because the point follows its sightings, by `sqrt(1 - h)` with the leverage
     `h = w J C J^T / noise^2`; sightings that a point follows altogether say nothing and are left out. A camera's noise
-    is within a factor of two of all cameras', both as shares of their thresholds: that of a close-up, which its points
-    follow most, could else shrink without end.
+    is between a half and four times of all cameras', in each camera's unit: that of a close-up, which its points follow
+    most, could else shrink without end.
+
+    Args:
+        s: with the noise that the points were refined with.
+        points, inliers: as refined.
+        unit: pixels, what cameras' noise is compared in (a share of their images' heights).
     """
-    size = np.abs(s.residuals(points))
     rows = np.flatnonzero(inliers.any(axis=0))
-    J = _slopes(s, points[rows])
-    leverage = np.zeros_like(size)
-    weight = s.weight[:, rows] / s.noise[:, None] ** 2
-    leverage[:, rows] = weight[..., None] * np.einsum("cnki,nij,cnkj->cnk", J, covariance[rows], J, optimize=True)
-    telling = inliers[..., None] & (leverage < _MOST_LEVERAGE)
-    shares = [size[c][telling[c]] / np.sqrt(1.0 - leverage[c][telling[c]]) / s.threshold[c] for c in range(len(s.K))]
-    everything = np.concatenate(shares)
-    common = _MAD * float(np.median(everything)) if len(everything) else 0.25
-    own = [_MAD * np.median(one) if len(one) >= _LEAST_RESIDUALS else common for one in shares]
-    return np.maximum(np.clip(own, 0.5 * common, 2.0 * common), 0.01) * s.threshold
+    J, weight = _slopes(s, points[rows]), np.where(inliers[:, rows], s.weight[:, rows], 0.0) / s.noise[:, None] ** 2
+    covariance = np.linalg.inv(_normal(J, weight) + 1e-12 * np.eye(3))
+    leverage = weight[..., None] * ((J @ covariance) * J).sum(axis=3)
+    size = np.abs(s.residuals(points))[:, rows] / np.sqrt(np.maximum(1.0 - leverage, 1e-3)) / unit[:, None, None]
+    telling = inliers[:, rows, None] & (leverage < _MOST_LEVERAGE)
+    everything = size[telling]
+    common = _MAD * float(np.median(everything)) if len(everything) else 1.0
+    counts = telling.sum(axis=(1, 2))
+    own = [_MAD * np.median(size[c][telling[c]]) if n >= _LEAST_RESIDUALS else common for c, n in enumerate(counts)]
+    return np.maximum(np.clip(own, 0.5 * common, 4.0 * common), 0.04) * unit
 
 
-def resection(
-    s: Sightings, camera: int, points: Float64[np.ndarray, "N 3"]
-) -> tuple[Float64[np.ndarray, "3 4"], Bool[np.ndarray, " N"]]:
+@dataclass(frozen=True, eq=False)
+class Resection:
     """Where a camera would have to stand to see known points where it says that it sees them.
 
-    Gauss-Newton over its six numbers, with Cauchy's weights whose scale falls from thirty thresholds to a half.
-
-    Returns:
-        Its transform, and which of the points it then sees within the threshold.
+    Attributes:
+        pose: its transform, `x_cam = R x_world + t`.
+        median: of the distances that are left, as shares of the camera's threshold.
+        moved: median of the distances by which the points' projections move, as shares of it.
     """
-    own = s.of_cameras(np.array([camera])).of_points(np.isfinite(points).all(axis=1) & (s.weight[camera] > 0))
-    known = points[np.isfinite(points).all(axis=1) & (s.weight[camera] > 0)]
-    for scale in np.geomspace(30.0, 0.5, _RESECTION_STEPS):
-        residual = own.residuals(known)[0]
-        length = np.linalg.norm(residual, axis=1)
-        seen = np.isfinite(length)
-        weight = np.where(
-            seen, own.weight[0] / (1.0 + (np.where(seen, length, 0.0) / (scale * s.threshold[camera])) ** 2), 0
-        )
-        cam = _turned(own.cam_from_world, known)[0]
-        J = _camera_slopes(own.K[0], cam, seen)
-        normal = np.einsum("n,nki,nkj->ij", weight, J, J) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(normal, np.einsum("n,nki,nk->i", weight, J, np.where(seen[:, None], residual, 0.0)))
-        turn = matrix_from_rotvec(step[:3])
-        pose = own.cam_from_world[0]
-        moved = np.concatenate([turn @ pose[:, :3], (turn @ pose[:, 3] + step[3:])[:, None]], axis=1)
-        own = replace(own, cam_from_world=moved[None])
-    agree = np.zeros(len(points), dtype=bool)
+
+    pose: Float64[np.ndarray, "3 4"]
+    median: float
+    moved: float
+
+
+def resection(s: Sightings, camera: int, points: Float64[np.ndarray, "N 3"]) -> Resection:
+    """Find a camera's pose from known points: turned about its own centre, or, where that leaves clearly more, moved as
+    well (from some metres a small turn and a small shift look almost alike)."""
+    turned = _resection(s, camera, points, numbers=3)
+    moved = _resection(s, camera, points, numbers=6)
+    return turned if turned.median < _ALMOST * moved.median else moved
+
+
+def _resection(s: Sightings, camera: int, points: Float64[np.ndarray, "N 3"], *, numbers: int) -> Resection:
+    """Gauss-Newton over a turn, and with six numbers a shift, with Cauchy's weights whose scale falls from thirty
+    thresholds to a half; of many points some, evenly, are enough."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1) & (s.weight[camera] > 0))
-    agree[rows] = np.linalg.norm(own.residuals(known)[0], axis=1) < s.threshold[camera]
-    return own.cam_from_world[0], agree
+    rows = rows[:: max(1, len(rows) // _RESECTION_POINTS)]
+    given, known = s.of_cameras(np.array([camera])).of_points(rows), points[rows]
+    own, threshold = given, float(s.threshold[camera])
+    for scale in np.geomspace(30.0, 0.5, _RESECTION_STEPS) * threshold:
+        residual = own.residuals(known)[0]
+        seen = np.isfinite(residual[:, 0])
+        residual = np.where(seen[:, None], residual, 0.0)
+        weight = own.weight[0] / (1.0 + (residual**2).sum(axis=1) / scale**2)
+        J = _camera_slopes(own.K[0], _turned(own.cam_from_world, known)[0], seen)[..., :numbers]
+        weighted = (J * weight[:, None, None]).reshape(-1, numbers).T
+        normal = weighted @ J.reshape(-1, numbers) + 1e-9 * np.eye(numbers)
+        step = np.concatenate([np.linalg.solve(normal, weighted @ residual.ravel()), np.zeros(6 - numbers)])
+        turn, pose = matrix_from_rotvec(step[:3]), own.cam_from_world[0]
+        shifted = np.concatenate([turn @ pose[:, :3], (turn @ pose[:, 3] + step[3:])[:, None]], axis=1)
+        own = replace(own, cam_from_world=shifted[None])
+    before, after = given.residuals(known)[0], own.residuals(known)[0]
+    both = np.isfinite(before[:, 0]) & np.isfinite(after[:, 0])
+    if not both.any():
+        return Resection(own.cam_from_world[0], np.inf, np.inf)
+    moved = float(np.median(np.linalg.norm((after - before)[both], axis=1)))
+    left = float(np.median(np.linalg.norm(after, axis=1)))
+    return Resection(own.cam_from_world[0], left / threshold, moved / threshold)
 
 
 def _turned(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(C, N, 3) points in the cameras' frames."""
-    return np.einsum("cij,nj->cni", poses[:, :, :3], points) + poses[:, None, :, 3]
+    return points @ poses[:, :, :3].transpose(0, 2, 1) + poses[:, None, :, 3]
 
 
 def _plane_slopes(K: np.ndarray, cam: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """(..., 2, 3) pixels by metres in the camera's frame; 0 for what is not seen."""
-    x, y, z = np.moveaxis(np.where(seen[..., None], cam, 1.0), -1, 0)
-    zero, one = np.zeros_like(z), 1.0 / z
-    slopes = np.stack([np.stack([one, zero, -x * one**2], -1), np.stack([zero, one, -y * one**2], -1)], -2)
-    return np.where(seen[..., None, None], K[..., :2, :2] @ slopes, 0.0)
+    one = np.where(seen, 1.0 / np.where(seen, cam[..., 2], 1.0), 0.0)
+    out = np.empty((*cam.shape[:-1], 2, 3))
+    out[..., :2] = K[..., :2, :2] * one[..., None, None]
+    xy = np.where(seen[..., None], cam[..., :2], 0.0) * one[..., None] ** 2
+    out[..., 2] = -(xy[..., None, :] * K[..., :2, :2]).sum(axis=-1)
+    return out
+
+
+def _normal(J: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) sums over cameras of weighted `J^T J`."""
+    rows = (J * np.sqrt(weight)[..., None, None]).transpose(1, 0, 2, 3).reshape(J.shape[1], -1, 3)
+    return rows.transpose(0, 2, 1) @ rows
 
 
 def _slopes(s: Sightings, points: np.ndarray) -> np.ndarray:

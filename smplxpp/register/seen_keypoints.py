@@ -13,6 +13,7 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.landmarks import LandmarkModel
 from smplxpp.register.observations import Observations
+from smplxpp.register.sides import exchanged, sides_are_exchanged
 from smplxpp.register.triangulate import Reprojection, triangulate
 
 # Of a single camera nothing can be measured: pixels of noise for an image 640 high.
@@ -59,6 +60,11 @@ def see_keypoints(body: BodyModel, observed: Observations, config: RegisterConfi
         nothing = np.full((len(frames), len(names), 3), np.nan)
         return SeenKeypoints(landmarks, keypoints, noise, nothing, problems=tuple(problems))
     found = triangulate(given, observed.cameras, names=names, frames=frames)
+    if sides_are_exchanged(found.names, found.points):
+        problems.append(
+            "left and right are exchanged in all views: feet and face would point backwards; exchanged back"
+        )
+        found = triangulate(exchanged(given), observed.cameras, names=names, frames=frames)
     agreed = {}
     known = np.isfinite(found.points).all(axis=2)
     for k, name in enumerate(found.cameras):

@@ -19,8 +19,9 @@ from smplxpp.register.keypoint_faults import (
     find_swapped,
     in_words,
     mirror_index,
+    pose_difference,
 )
-from smplxpp.register.multiview import Sightings, all_pairs, consensus, pixel_noise, refine
+from smplxpp.register.multiview import Sightings, all_pairs, consensus, pixel_noise, refine, resection
 
 # With fewer cameras nobody can say which of them is wrong.
 _LEAST_TO_JUDGE = 4
@@ -33,6 +34,7 @@ class TriangulationConfig:
 
     Attributes:
         threshold: pixels that a sighting may be off, as a share of the image's height.
+        threshold_metres: the same at the person's distance; the larger counts (a close-up shows errors larger).
         least_confidence: of a sighting that counts.
         least_degrees: between the rays of a pair of cameras that may propose a point.
         most_pairs: of cameras that propose; beyond, so many of them at random.
@@ -41,6 +43,7 @@ class TriangulationConfig:
     """
 
     threshold: float = 0.02
+    threshold_metres: float = 0.035
     least_confidence: float = 0.05
     least_degrees: float = 3.0
     most_pairs: int = 400
@@ -48,7 +51,7 @@ class TriangulationConfig:
     diagnose: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("threshold", "least_degrees"):
+        for name in ("threshold", "threshold_metres", "least_degrees"):
             require_positive(name, getattr(self, name))
         require_at_least("most_pairs", self.most_pairs, 1)
 
@@ -74,7 +77,7 @@ class Triangulation:
 
     Attributes:
         names, frames, cameras: of the tables' axes.
-        points: world, metres; NaN where fewer than two cameras agree.
+        points: world, metres; NaN where fewer than two cameras agree, or fewer than a third of those that see it.
         covariance: square metres, of the pixels' noise alone; NaN where the point is.
         inliers: sightings that agree with the point.
         noise_px: standard deviation of a coordinate in each camera's pixels, estimated from the residuals.
@@ -134,12 +137,15 @@ def triangulate(
     """
     config = config or TriangulationConfig()
     table, problems = _table(keypoints, cameras, names, frames, config)
+    table = _with_thresholds(table, _first(table, config), config)
     table, points, told, left_out = (
         _judged(table, config) if config.diagnose else (table, _first(table, config), [], [])
     )
     s = table.sightings
-    for _ in range(3):
-        s = replace(s, noise=pixel_noise(s, *refine(s, points)))
+    unit = _unit(table, cameras, config)
+    for _ in range(_ROUNDS):
+        refined, _, inliers = refine(s, points)
+        s = replace(s, noise=pixel_noise(s, refined, inliers, unit=unit))
     points, covariance, inliers = refine(s, points)
     return _result(replace(table, sightings=s), points, covariance, inliers, left_out, [*problems, *told])
 
@@ -177,6 +183,24 @@ def _table(
     return Table(sightings, tuple(names), tuple(int(f) for f in frames), used), problems
 
 
+def _unit(table: Table, cameras: Mapping[str, Camera], config: TriangulationConfig) -> Float64[np.ndarray, " C"]:
+    """What a detector's noise is of the order of, in each camera's pixels."""
+    return 0.25 * config.threshold * np.array([float(cameras[name].height) for name in table.cameras])
+
+
+def _with_thresholds(table: Table, points: Float64[np.ndarray, "N 3"], config: TriangulationConfig) -> Table:
+    """The table with what a sighting may be off at the distance of what each camera sees."""
+    s = table.sightings
+    known = (s.weight > 0) & np.isfinite(points).all(axis=1)
+    threshold = s.threshold.copy()
+    for k, pose in enumerate(s.cam_from_world):
+        depth = points[known[k]] @ pose[2, :3] + pose[2, 3]
+        if (depth > 0).any():
+            scale = np.sqrt(abs(np.linalg.det(s.K[k, :2, :2]))) / float(np.median(depth[depth > 0]))
+            threshold[k] = max(threshold[k], config.threshold_metres * scale)
+    return replace(table, sightings=replace(s, threshold=threshold))
+
+
 def _first(table: Table, config: TriangulationConfig) -> Float64[np.ndarray, "N 3"]:
     pairs = all_pairs(len(table.cameras), most=config.most_pairs, seed=config.seed)
     return consensus(table.sightings, pairs, least_degrees=config.least_degrees)
@@ -192,31 +216,37 @@ def _judged(
     elsewhere: list[str] = []
     if len(table.cameras) < _LEAST_TO_JUDGE:
         return table, points, [], []
+    refined = refine(table.sightings, points)[0]
     for _ in range(_ROUNDS):
-        found = find_swapped(table, refine(table.sightings, points)[0])
+        found = find_swapped(table, refined)
         if not found.any():
             break
         swapped ^= found
         table = _exchanged(table, found)
         points = _first(table, config)
+        refined = refine(table.sightings, points)[0]
     problems = [_swap_words(table, k, row) for k, row in enumerate(swapped) if row.any()]
     names = list(table.cameras)
     while len(names) - len(left_out) >= _LEAST_TO_JUDGE:
-        fault = find_camera_fault(table, refine(table.sightings, points)[0])
+        fault = find_camera_fault(table, refined)
         if fault is None:
             break
-        name = names[fault.camera]
-        left_out.append(name)
-        if np.isfinite(fault.turn_degrees):
+        camera, misplaced = fault
+        left_out.append(names[camera])
+        given = table.sightings
+        table = _without(table, np.arange(len(names)) == camera, np.ones(len(table.frames), dtype=bool))
+        points = _first(table, config)
+        refined = refine(table.sightings, points)[0]
+        if misplaced:  # by how much: against points that it has no part in
+            turn, shift = pose_difference(given.cam_from_world[camera], resection(given, camera, refined).pose)
+            move = f" and move by {1e3 * shift:.0f} mm" if shift > 1e-3 else ""
             elsewhere.append(
-                f"camera {name}: its calibration is off: it would have to turn by {fault.turn_degrees:.1f} degrees and "
-                f"move by {1e3 * fault.shift:.0f} mm to agree with the others; left out"
+                f"camera {names[camera]}: its calibration is off: it would have to turn by {turn:.1f} degrees{move} to "
+                "agree with the others; left out"
             )
         else:
-            elsewhere.append(f"camera {name}: its keypoints are of another person; left out")
-        table = _without(table, np.arange(len(names)) == fault.camera, np.ones(len(table.frames), dtype=bool))
-        points = _first(table, config)
-    others = find_other_people(table, refine(table.sightings, points)[0])
+            elsewhere.append(f"camera {names[camera]}: its keypoints are of another person; left out")
+    others = find_other_people(table, refined)
     if others.any():
         for k in np.flatnonzero(others.any(axis=1)):
             numbers = [frame for frame, other in zip(table.frames, others[k], strict=True) if other]

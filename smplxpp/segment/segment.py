@@ -9,10 +9,13 @@ from jaxtyping import Bool, Float64, Int64, Num
 from scipy.sparse import csr_matrix, identity
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, LABELS
+from smplxpp.core.labels import BACKGROUND, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels, face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
+
+_LOOKS_DOWN = -0.3
+"""Height of a unit normal below which a face looks down; +Y is up."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class SegmentConfig:
         rings: of neighbours whose votes speak for a face's confidence where its own are fewer than that: a pixel is
             often larger than a face, and then votes fall on one face of several.
         label_trust: weight of the labels given with the scan, as a share of full votes.
+        underside: cost, over sqrt(M), of any label but skin for a face that no vote fell on and that looks down (+Y is
+            up). A scan closes a skirt from below; that surface is no cloth, and the hem is a fold as the legs are.
         island_area: patches below this fraction of the surface's area take their surroundings' label.
     """
 
@@ -40,6 +45,7 @@ class SegmentConfig:
     full_votes: float = 3.0
     rings: int = 4
     label_trust: float = 0.35
+    underside: float = 6.0
     island_area: float = 1e-4
 
 
@@ -111,7 +117,11 @@ def segment_scan(
     weights = _fold_weights(mesh, pairs, ends, config)
     # A label that nobody voted for anywhere cannot win.
     candidates = np.flatnonzero(votes.any(axis=0))
-    unary = (-np.log(share) * (trust * certainty)[:, None])[:, candidates]
+    unary = -np.log(share) * (trust * certainty)[:, None]
+    below = (total == 0) & (mesh.face_normals[:, 1] < _LOOKS_DOWN)
+    # Borders have about sqrt(faces) edges: so that a finer scan is cut in the same place.
+    unary[below] += config.underside / np.sqrt(mesh.face_count) * (np.arange(len(LABELS)) != SKIN.id)
+    unary = unary[:, candidates]
     problem = PottsProblem.from_costs(unary, pairs, weights)
     before = problem.energy(unary.argmin(axis=1))
     index, after = minimize_potts(problem)

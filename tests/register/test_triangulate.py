@@ -119,7 +119,7 @@ def test_a_view_with_left_and_right_exchanged_is_swapped_back(joints, cameras, n
     found = triangulate(wrong, cameras)
     assert found.problems == ("camera Cam003: left and right are swapped in the whole view; swapped back",)
     assert (found.keypoints["Cam003"].points == noisy["Cam003"].points).all()
-    np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-9)
+    np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-4)
 
 
 def test_frames_with_left_and_right_exchanged_are_named(joints, cameras, noisy):
@@ -130,7 +130,7 @@ def test_frames_with_left_and_right_exchanged_are_named(joints, cameras, noisy):
     assert len(found.problems) == 3
     for words, (name, rows) in zip(found.problems, frames.items(), strict=True):
         assert words.startswith(f"camera {name}: left and right are swapped in frame {in_words(rows)};")
-    np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-9)
+    np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-4)
 
 
 @pytest.mark.parametrize("degrees", [2.0, 1.0])
@@ -143,7 +143,7 @@ def test_a_camera_that_is_turned_is_named_with_the_angle(joints, cameras, noisy,
     found = triangulate(noisy, off)
     assert found.left_out == ("Cam005",) and "Cam005" not in found.keypoints
     said = re.fullmatch(
-        r"camera Cam005: its calibration is off: it would have to turn by ([\d.]+) degrees .*; left out",
+        r"camera Cam005: its calibration is off: .* turn by ([\d.]+) degrees to agree with the others; left out",
         found.problems[0],
     )
     assert said and float(said[1]) == pytest.approx(degrees, abs=0.21) and len(found.problems) == 1
@@ -201,6 +201,39 @@ def test_everything_mirrored_cannot_be_told(joints, cameras, noisy):
     np.testing.assert_allclose(
         found.points[:, mirror_index(found.names)], triangulate(noisy, cameras).points, atol=1e-6
     )
+
+
+def test_what_a_detector_marks_elsewhere_in_every_view_is_no_fault(joints, cameras):
+    """Detectors put a hip centimetres aside, depending on the side that they see: no camera is blamed for that, and
+    those that are at fault are still found."""
+    rng = np.random.default_rng(3)
+    biased = {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        marked = joints + rng.normal(0, 0.012, (1, 55, 3)) + rng.normal(0, 0.006, joints.shape)
+        biased[name] = detected(marked, {name: camera}, seed=k)[name]
+    assert triangulate(biased, cameras).problems == ()
+    pose = cameras["Cam006"].cam_from_world.copy()
+    pose[:3] = matrix_from_rotvec(np.radians([2.0, 0.0, 0.0])) @ pose[:3]
+    off = {**cameras, "Cam006": replace(cameras["Cam006"], cam_from_world=pose)}
+    found = triangulate({**biased, "Cam003": swapped(biased["Cam003"], [1, 2])}, off)
+    assert [words.partition(";")[0] for words in found.problems] == [
+        "camera Cam003: left and right are swapped in frame 1 to 2",
+        "camera Cam006: its calibration is off: it would have to turn by 2.0 degrees to agree with the others",
+    ]
+
+
+def test_a_point_that_few_of_its_cameras_agree_on_is_not_there(joints, cameras):
+    """Two of eight agree on any nonsense."""
+    exact = detected(joints, cameras, EXACT)
+    rng = np.random.default_rng(0)
+    k = SMPLX_JOINTS.index("left_wrist")
+    for name in ("Cam001", "Cam003", "Cam004", "Cam005", "Cam006", "Cam007"):
+        points = exact[name].points.copy()
+        points[:, k] += rng.choice([-1, 1], (FRAMES, 2)) * rng.uniform(60, 120, (FRAMES, 2))
+        exact[name] = replace(exact[name], points=points)
+    found = triangulate(exact, cameras)
+    assert np.isnan(found.points[:, k]).mean() > 0.7
+    assert errors(found, joints)[:, np.arange(55) != k].max() < 1e-6
 
 
 def test_mirrored_names():

@@ -8,6 +8,7 @@ import trimesh
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LOWER, SHOE, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh, view_directions
 from smplxpp.segment import SegmentConfig, segment_scan, vote_on_faces
@@ -88,6 +89,28 @@ def test_faces_smaller_than_a_pixel_are_as_sure_as_their_surroundings(ball):
     votes[hit] = 0.0
     votes[hit, rng.integers(0, 6, int(hit.sum()))] = 1.0  # labels that say nothing make nothing sure
     assert segment_scan(ball, votes=votes).confidence.mean() < 0.5
+
+
+@pytest.mark.parametrize("subdivisions", [4, 5])
+def test_the_surface_that_closes_a_skirt_from_below_is_no_cloth(subdivisions):
+    """Once the fixture's skirt was closed between the legs: no view saw its underside."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    skirt = TriangleMesh(mesh.vertices, mesh.faces)
+    middle = skirt.face_centers
+    truth = np.where(np.hypot(middle[:, 0], middle[:, 2]) < 0.25, SKIN.id, LOWER.id)  # a leg below
+    truth[middle[:, 1] > 0] = LOWER.id
+    votes = np.zeros((skirt.face_count, 6))
+    votes[np.arange(skirt.face_count), truth] = 3.0
+    under = (middle[:, 1] < -0.6) & (truth == LOWER.id)
+    votes[under] = 0.0
+    found = segment_scan(skirt, votes=votes).face_labels
+    assert (found[under] == SKIN.id).mean() > 0.9
+    # A sole has no skin beside it and stays a shoe's.
+    votes = np.zeros((skirt.face_count, 6))
+    ankle = middle[:, 1] > 0.3
+    votes[ankle, SKIN.id] = 3.0
+    votes[~ankle & (middle[:, 1] > -0.8), SHOE.id] = 3.0
+    assert (segment_scan(skirt, votes=votes).face_labels == np.where(ankle, SKIN.id, SHOE.id)).mean() > 0.995
 
 
 def test_given_labels_lose_specks(ball):

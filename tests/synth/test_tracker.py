@@ -115,6 +115,13 @@ def test_the_shipped_fixture_has_what_its_seed_gives():
         assert np.median(off) == pytest.approx(0.6745 * 3 * camera.height / 640, rel=0.25)
 
 
+def test_exact_inputs_have_no_keypoints():
+    assert open_capture(FIXTURE, protocol="exact").keypoints("Cam001") is None
+    tracked = open_capture(FIXTURE, protocol="tracked")
+    assert tracked.keypoints("Cam001") is not None and tracked.normals("Cam001", 0) is None
+    assert (tracked.labels("Cam001", 4) != open_capture(FIXTURE, protocol="exact").labels("Cam001", 4)).any()
+
+
 @pytest.fixture
 def scene_capture(tmp_path) -> Path:
     """Photographs through a lens, without label maps, with a file of parameters a frame."""

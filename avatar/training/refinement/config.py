@@ -39,7 +39,8 @@ class RefineConfig:
         pixel_sigma: difference of colours that a pixel is trusted to.
         pixels_per_error: neighbouring pixels err together: so many full-size pixels count as one.
         rotation_sigma: degrees that a joint of the start is trusted to; translation_sigma: metres;
-            expression_sigma: coefficients. camera_rotation_sigma, camera_translation_sigma: degrees, and metres at the person.
+            expression_sigma: coefficients. camera_rotation_sigma, camera_translation_sigma: degrees, and metres at
+            the person.
         acceleration_sigma: degrees a frame squared that a joint turns unevenly by, at 20 frames a second (it falls
             with the square of the frame rate); translation_acceleration_sigma: metres. Beyond twice as much the
             motion is taken for true (Student-t), so that fast motion stays.

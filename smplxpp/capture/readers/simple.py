@@ -12,6 +12,7 @@ import numpy as np
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfolders
+from smplxpp.capture.keypoint_files import KeypointFiles
 from smplxpp.capture.keypoints import found_keypoints
 from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.params import ParamFiles, find_params
@@ -86,13 +87,21 @@ def _described(
         label_set=str(description.get("label_set", "capture")),
         params=_params(root, options, protocol),
         meshes=PosedTopology(topology, FileSeries.find(topology.parent, frames)) if topology.is_file() else None,
-        keypoints=found_keypoints(root / "keypoints", cameras, format="auto", person=options.person),
+        keypoints=_keypoints(root, cameras, protocol, options),
         fps=None if description.get("fps") is None else float(description["fps"]),
         problems=tuple(problems),
         protocol=protocol.name,
         protocols=tuple(read_protocols(description)),
     )
     return replace(recording, splits=_splits(recording, description)) if description else recording
+
+
+def _keypoints(
+    root: Path, cameras: Mapping[str, Camera], protocol: ProtocolFiles, options: ReaderOptions
+) -> KeypointFiles | None:
+    if protocol.keypoints is None:
+        return None
+    return found_keypoints(root / protocol.keypoints, cameras, format="auto", person=options.person)
 
 
 def stacked_params(root: Path, name: str | Path | None = None) -> Path:

@@ -85,16 +85,14 @@ def registration_of(out, **options) -> RegisterInputs | None:
 def test_a_build_registers_where_the_capture_says_that_its_parameters_are_tracked(tmp_path):
     assert registration_of(tmp_path) is None  # params.npz: exact
     tracked = registration_of(tmp_path, params=Path("params_noisy.npz"))
-    assert tracked == RegisterInputs(
-        capture=FIXTURE, params=TRACKED, labels=FIXTURE / "scans" / "scan_000000_labels.npz", label_set="capture"
-    )
+    assert tracked == RegisterInputs(capture=FIXTURE, params=TRACKED)
     assert registration_of(tmp_path, params=Path("params_noisy.npz"), register="off") is None
-    asked = registration_of(tmp_path, register="on", label_source="views")
-    assert asked.params is None and asked.labels is None
+    asked = registration_of(tmp_path, register="on", label_source="scan")
+    assert asked.params is None and asked.labels == FIXTURE / "scans" / "scan_000000_labels.npz"
 
 
 def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
-    unused = shutil.ignore_patterns("geometry", "normals", "rgbs", "masks", "params")
+    unused = shutil.ignore_patterns("geometry", "normals", "rgbs", "masks", "params", "keypoints")
     capture = shutil.copytree(FIXTURE, tmp_path / "capture", ignore=unused)
     with pytest.raises(InputError, match=r"params/000000\.npz"):
         registration_of(tmp_path, capture=capture)

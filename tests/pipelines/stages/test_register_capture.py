@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.layout import REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, REGISTRATION
+from pipelines.runs.layout import REGISTER_STAGE, REGISTERED_PARAMS, REGISTRATION
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.params_in_use import params_in_use
@@ -190,13 +190,13 @@ def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypa
 
 def test_a_damaged_mask_and_a_damaged_scan_are_named_and_the_rest_goes_on(tmp_path, capture, solver):
     (capture / "masks" / "Cam002" / "Cam002_mask000001.png").write_bytes(b"no picture")
-    (capture / "scans" / "scan_000013.ply").write_bytes(b"no scan")
+    (capture / "scans" / "scan_000001.ply").write_bytes(b"no scan")
     (capture / "masks" / "Cam003" / "Cam003_mask000001.png").unlink()
     record = register_capture(tmp_path / "run", inputs_of(capture))
     problems = json.loads((tmp_path / "run" / REGISTRATION).read_text())["problems"]
     assert record.manifest["numbers"]["problems"] == len(problems) == 2
     assert any("camera Cam002, frame 1: mask left out" in words for words in problems)
-    assert any("frame 13: the scan is left out" in words for words in problems)
+    assert any("frame 1: the scan is left out" in words for words in problems)
     assert set(solver.shown[0].scans) == {0} and solver.shown[0].mask("Cam003", 1) is None
 
 
@@ -260,7 +260,7 @@ def test_neither_keypoints_nor_a_fit(tmp_path, solver, monkeypatch, plain):
 def test_neither_cameras_nor_scans_and_keypoints_without_cameras(tmp_path, capture, solver):
     for name in ("cameras.json", "calibration.csv"):
         (capture / name).unlink()
-    for name in ("rgbs", "scans"):
+    for name in ("rgbs", "scans", "keypoints"):
         shutil.rmtree(capture / name)
     content = json.loads((capture / "manifest.json").read_text())
     plain = {key: content[key] for key in ("fps", "label_set")}
@@ -297,18 +297,8 @@ def test_a_build_whose_reference_frame_failed_says_so(tmp_path, monkeypatch, ask
         build(tmp_path, build_inputs(), BuildConfig(), registration=inputs_of(plain), last="10_body")
 
 
-def test_trainings_take_what_was_given_then_refined_then_registered(tmp_path, solver, plain):
+def test_trainings_take_what_was_given_then_what_was_registered(tmp_path, plain, solver):
     given = tmp_path / "mine.npz"
     assert params_in_use(tmp_path, None) is None and params_in_use(tmp_path, given) == given
     register_capture(tmp_path, inputs_of(plain))
-    assert params_in_use(tmp_path, None) == tmp_path / REGISTERED_PARAMS
-    refined = tmp_path / REFINED_PARAMS
-    refined.parent.mkdir()
-    exact().save(refined)
-    manifest = json.loads((tmp_path / REGISTER_STAGE / "manifest.json").read_text())
-    manifest["numbers"]["finished"] = False
-    (refined.parent / "manifest.json").write_text(json.dumps(manifest))
-    assert params_in_use(tmp_path, None) == tmp_path / REGISTERED_PARAMS  # a refinement that a limit of time stopped
-    manifest["numbers"]["finished"] = True
-    (refined.parent / "manifest.json").write_text(json.dumps(manifest))
-    assert params_in_use(tmp_path, None) == refined and params_in_use(tmp_path, given) == given
+    assert params_in_use(tmp_path, None) == tmp_path / REGISTERED_PARAMS and params_in_use(tmp_path, given) == given
