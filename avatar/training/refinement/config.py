@@ -39,7 +39,8 @@ class RefineConfig:
         pixel_sigma: difference of colours that a pixel is trusted to.
         pixels_per_error: neighbouring pixels err together: so many full-size pixels count as one.
         rotation_sigma: degrees that a joint of the start is trusted to; translation_sigma: metres;
-            expression_sigma: coefficients. camera_rotation_sigma, camera_translation_sigma: degrees and metres.
+            expression_sigma: coefficients. camera_rotation_sigma, camera_translation_sigma: degrees, and metres at
+            the person.
         acceleration_sigma: degrees a frame squared that a joint turns unevenly by, at 20 frames a second (it falls
             with the square of the frame rate); translation_acceleration_sigma: metres. Beyond twice as much the
             motion is taken for true (Student-t), so that fast motion stays.
@@ -50,8 +51,8 @@ class RefineConfig:
     sampling: SamplingConfig = field(
         default_factory=lambda: SamplingConfig(count=30_000, head_share=0.15, sh_degree=0, opacity=0.95)
     )
-    reference_levels: tuple[Level, ...] = (Level(1, 3),)
-    levels: tuple[Level, ...] = (Level(2, 2), Level(1, 3), Level(0, 2))
+    reference_levels: tuple[Level, ...] = (Level(3, 3), Level(2, 2), Level(1, 2))
+    levels: tuple[Level, ...] = (Level(3, 2), Level(2, 2), Level(1, 2), Level(0, 3))
     jaw: bool = True
     expression: bool = True
     hands: bool = False
