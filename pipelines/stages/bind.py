@@ -28,7 +28,7 @@ from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer
-from pipelines.stages.scene import silhouette_overlap
+from pipelines.stages.usable import silhouette_overlap
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 

@@ -9,7 +9,7 @@ from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_build
 from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps, path_of_params
-from pipelines.stages.scene import normal_maps
+from pipelines.stages.usable import normal_maps
 from smplxpp.capture import Capture
 
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from avatar.data.views import View, read_views
+from avatar.data.views import read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.places import lies_in
@@ -18,26 +15,16 @@ from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
+from pipelines.stages.usable import compare_shapes, overlap_of, silhouette_overlap, with_masks, with_params
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.readers.simple import stacked_params
-from smplxpp.capture.recording import Problem
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
-from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
-CHECKED_FRAMES, CHECKED_CAMERAS = 3, 4
-"""Training frames, and cameras of each, in whose images the template has to stand."""
-STANDS_IN_IMAGES = 0.3
-"""Overlap of template and masks below which nothing can be learned."""
 REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
 REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
-OTHER_SHAPE, OTHER_PERSON = 0.005, 0.03
-"""Metres between the template's body and that of the parameters, on average: doubtful, and another person."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +146,8 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
         warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
     inputs = of_protocol(run, inputs, measures=measures)
     inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
-    capture, params = _with_params(_opened(inputs))
-    capture = _with_masks(capture)
+    capture, params = with_params(_opened(inputs))
+    capture = with_masks(capture)
     made: dict[str, str] = {}
     if inputs.params == run / REGISTERED_PARAMS:
         refuse_seen(run, (REGISTER_STAGE,), capture.splits, anew=REGISTER_ANEW)
@@ -175,8 +162,8 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
     for name in capture.splits.train_cameras:
         if capture.file(name, frame) is not None:
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
-    _compare_shapes(template, [params[f] for f in frames])
-    overlap = _overlap(template, capture, params)
+    compare_shapes(template, [params[f] for f in frames])
+    overlap = overlap_of(template, capture, params)
     digests = {TEMPLATE: sha256_file(run / TEMPLATE), **made, **capture_digests(capture, params)}
     template_frame = _template_frame(run, inputs)
     if template_frame in capture.splits.novel_pose_frames:
@@ -239,35 +226,6 @@ def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[s
     return capture, train, tuple(held_out)
 
 
-def normal_maps(capture: Capture) -> tuple[int, int]:
-    """Training views that have a normal map, and all training views."""
-    splits = capture.splits
-    rows = np.isin(list(capture.cameras), splits.train_cameras)
-    views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
-    return int((views & capture.presence("normal")).sum()), int(views.sum())
-
-
-def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:
-    """Mean intersection over union of the posed template's silhouette and the masks.
-
-    Raises:
-        InputError: so little that template and images do not belong together.
-    """
-    values = []
-    for view in views:
-        mask, mesh = view.alpha.numpy() > 127, rasterize_mesh(posed, view.camera).mask
-        values.append((mask & mesh).sum() / max((mask | mesh).sum(), 1))
-    mean = float(np.mean(values))
-    if mean < STANDS_IN_IMAGES:
-        raise InputError(
-            "template in the images",
-            expected="a silhouette on the masks",
-            received=f"a mean overlap (IoU) of {mean:.2f} over {len(views)} views",
-            remedy="check --frame and --params, and that cameras and template share one world",
-        )
-    return mean
-
-
 def _opened(inputs: TrainInputs) -> Capture:
     """The capture with the user's held-out cameras and scale; frames as it splits them."""
     capture, train, held_out = open_cameras(inputs)
@@ -280,102 +238,3 @@ def _opened(inputs: TrainInputs) -> Capture:
             remedy="see docs/captures.md: splits are read from the capture",
         )
     return replace(capture, splits=Splits(train, held_out, old.train_frames, old.novel_pose_frames))
-
-
-def _with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:
-    """Without the frames that have no usable parameters; those of the others."""
-    splits, known, why = capture.splits, {}, {}
-    for frame in (*splits.train_frames, *splits.novel_pose_frames):
-        try:
-            params = capture.params(frame)
-        except InputError as error:
-            why[frame] = str(error)
-            continue
-        if params is None:
-            why[frame] = f"frame {frame}: no body parameters"
-        else:
-            known[frame] = params
-    if not any(frame in known for frame in splits.train_frames):
-        raise InputError(
-            f"capture {capture.name}",
-            expected="body parameters of the training frames",
-            received=why[splits.train_frames[0]],
-            remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
-            "`smplxpp register`",
-        )
-    if why:
-        _warn(f"{len(why)} of {len(known) + len(why)} frames are left out: {next(iter(why.values()))}")
-        capture = capture.without([Problem(text, None, frame) for frame, text in why.items()])
-    return capture, known
-
-
-def _with_masks(capture: Capture) -> Capture:
-    """Without the views that have no mask."""
-    names = list(capture.cameras)
-    images, masks = capture.presence(), capture.presence("mask")
-    wanted = np.isin(names, capture.splits.train_cameras)[:, None] & np.isin(
-        capture.frames, capture.splits.train_frames
-    )
-    lacking = [(names[row], capture.frames[column]) for row, column in np.argwhere(images & ~masks)]
-    if not (images & masks & wanted).any():
-        raise InputError(
-            f"capture {capture.name}",
-            expected="images of training frames and their masks",
-            received="no mask" if (images & wanted).any() else "no image",
-            remedy="give the masks as docs/captures.md says, or make them with your matting model",
-        )
-    if lacking:
-        camera, frame = lacking[0]
-        _warn(f"{len(lacking)} views are left out: no mask of camera {camera}, frame {frame}")
-        capture = capture.without([Problem("no mask", *view) for view in lacking])
-    return capture
-
-
-def _compare_shapes(template: Template, params: Sequence[BodyParams]) -> None:
-    """Refuse parameters of another person: their shape coefficients against those that the template is made of."""
-    size = template.body.num_betas
-    betas = np.mean([_padded(p.betas[0], size) for p in params], axis=0)
-    moved = template.body.shapedirs @ (betas - _padded(template.betas, size))
-    distance = float(np.linalg.norm(moved, axis=-1).mean())
-    if distance > OTHER_PERSON:
-        raise InputError(
-            "body parameters of the training frames",
-            expected="those of the template's person and body model",
-            received=f"shape coefficients that move the body by {1e3 * distance:.0f} mm on average",
-            remedy="build the template from this capture, or name its own parameters with --params (and --body)",
-        )
-    if distance > OTHER_SHAPE:
-        _warn(
-            f"the parameters' body is {1e3 * distance:.0f} mm off the template's on average: another fit of its shape?"
-        )
-
-
-def _padded(betas: np.ndarray, size: int) -> np.ndarray:
-    return np.pad(betas[:size], (0, max(0, size - len(betas))))
-
-
-def _overlap(template: Template, capture: Capture, params: Mapping[int, BodyParams]) -> float:
-    """Mean IoU of the posed template and the masks in some training frames.
-
-    Raises:
-        InputError: nobody in these masks, or a template elsewhere.
-    """
-    values = []
-    for frame in spread(capture.splits.train_frames, CHECKED_FRAMES):
-        seen = [name for name in capture.splits.train_cameras if capture.file(name, frame) is not None]
-        views = read_views(capture, frame, spread(seen, CHECKED_CAMERAS))
-        if views:
-            posed = template.mesh.with_vertices(template.pose(params[frame])[0])
-            values.append(silhouette_overlap(posed, views))
-    if not values:
-        raise InputError(
-            f"masks of capture {capture.name}",
-            expected="a person in them",
-            received=f"masks that are zero in all of {CHECKED_FRAMES} frames",
-            remedy="look at them with `smplxpp capture check`",
-        )
-    return float(np.mean(values))
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, GeometryWarning, stacklevel=3)

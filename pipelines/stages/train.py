@@ -25,8 +25,9 @@ from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import refine
-from pipelines.stages.scene import TrainInputs, TrainScene, normal_maps, open_scene
+from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
 from pipelines.stages.teacher import TeacherStage
+from pipelines.stages.usable import normal_maps
 from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
 
