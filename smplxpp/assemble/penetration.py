@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
-from smplxpp.assemble.layers import Obstacle, face_centers
+from smplxpp.assemble.layers import TOUCHING, Obstacle, face_centers
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_at_least, require_between
 
@@ -51,7 +51,7 @@ _FACING_COSINE = -0.2
 _CENTER_SHARE = 0.5
 # Of the distances of a part's vertices to the body: what it stands off.
 STAND_OFF_PERCENTILE = 95.0
-# Metres nearer than the clearance that need no push.
+# Metres nearer than the clearance that need no push, if they do not lead inside.
 _TOLERANCE = 1e-5
 
 
@@ -169,7 +169,7 @@ class _Wall:
         ask = np.flatnonzero(start - np.sqrt(np.einsum("ij,ij->i", moved, moved)) < clearance)
         distance, gradient = self._obstacle.distance(origin[ask] + moved[ask], normals[ask])
         missing = clearance[ask] - distance
-        near = missing > _TOLERANCE
+        near = (missing > _TOLERANCE) | (distance < -TOUCHING)
         if facing_only:
             near &= np.einsum("ij,ij->i", gradient, normals[ask]) > _FACING_COSINE
         return ask[near], missing[near, None] * gradient[near]

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, Integer
+from jaxtyping import Bool, Float64, Integer
 from scipy.ndimage import distance_transform_edt
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.raster import rasterize_mesh
+from smplxpp.raster import MeshMaps, rasterize_mesh
 
 # A pixel counts fully this far inside the silhouette, and at least by the second number.
 _SILHOUETTE_PX = 4.0
 _LEAST_WEIGHT = 0.1
+# Pixels of depth by which a face smaller than a pixel may lie behind what that pixel shows.
+_SLOPE_PX = 2.0
 
 
 def vote_on_faces(
@@ -25,7 +27,8 @@ def vote_on_faces(
     """Sum `cos(view, normal) clip(d / 4, 0.1, 1)` over the views' pixels that show a face, for each label.
 
     d is the pixel's distance to the silhouette of the labelled foreground, in pixels. Background pixels do not vote;
-    faces that look away from the camera get nothing (the far side of an open sheet).
+    faces that look away from the camera get nothing (the far side of an open sheet). A face that is seen but owns no
+    pixel, as it is smaller than one, has the vote of the pixel that its centre falls into, times its share of it.
 
     Args:
         views: (camera, label map) pairs; a map is (H, W) in our ids, background -1, of its camera's size.
@@ -50,14 +53,17 @@ def vote_on_faces(
                 received=f"{labels.min()} to {labels.max()}",
                 remedy="map them with map_labels first",
             )
-        face = rasterize_mesh(mesh, camera).face_id
+        maps = rasterize_mesh(mesh, camera)
         foreground = labels != BACKGROUND
-        row, col = np.nonzero((face >= 0) & foreground)
+        row, col = np.nonzero(maps.mask & foreground)
+        hit, share = maps.face_id[row, col], np.ones(len(row))
+        small, small_row, small_col, small_share = _smaller_than_a_pixel(mesh, camera, maps, foreground)
+        hit, share = np.concatenate([hit, small]), np.concatenate([share, small_share])
+        row, col = np.concatenate([row, small_row]), np.concatenate([col, small_col])
         # A border of background: the edge of the image cuts the person off like a silhouette.
         inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
-        hit = face[row, col]
         cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
-        weight = np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
+        weight = share * np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
         votes += np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=len(votes))
     if not votes.any():
         raise InputError(
@@ -67,6 +73,27 @@ def vote_on_faces(
             remedy="check the cameras' convention (OpenCV, world to camera), units and the winding of the faces",
         )
     return votes.reshape(mesh.face_count, len(LABELS))
+
+
+def _smaller_than_a_pixel(
+    mesh: TriangleMesh, camera: Camera, maps: MeshMaps, foreground: Bool[np.ndarray, "H W"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Visible faces that own no pixel: their numbers, row and column of their centres, and their share of a pixel."""
+    owns = np.zeros(mesh.face_count, dtype=bool)
+    owns[maps.face_id[maps.mask]] = True
+    face = np.flatnonzero(~owns)
+    x, y, depth = camera.screen_from_world(mesh.face_centers[face]).T[:3]
+    with np.errstate(invalid="ignore"):
+        inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    face, depth = face[inside], depth[inside]
+    row, col = y[inside].astype(np.int64), x[inside].astype(np.int64)
+    focal = np.sqrt(abs(np.linalg.det(camera.K[:2, :2])))
+    pixel = np.full(len(face), 1.0 / focal) if camera.orthographic else depth / focal
+    # In front of all that the pixel shows, but for the pixel's own slope.
+    seen = foreground[row, col] & (depth < maps.depth[row, col] + _SLOPE_PX * pixel)
+    face, row, col = face[seen], row[seen], col[seen]
+    share = mesh.face_areas[face] / pixel[seen] ** 2
+    return face, row, col, np.minimum(share, 1.0)
 
 
 def _rays(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
