@@ -94,3 +94,22 @@ def _cell(cell: Mapping[str, Any]) -> str:
 
 def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
+
+
+def registration_lines(figures: Mapping[str, Any]) -> list[str]:
+    """Return the errors of every kind of input, of training and of held-out frames."""
+    columns = {"body_mm": "body", "bare_mm": "bare skin", "covered_mm": "under cloth", "joints_mm": "joints"}
+    columns["degrees"] = "degrees a joint"
+    heads = ["input", "frames", *columns.values(), *(f"held out: {title}" for title in columns.values()), "CPU s"]
+    rows = []
+    for name, row in figures["rows"].items():
+        parts = [row.get(part, {}) for part in ("training", "held_out")]
+        errors = [part.get(key) for part in parts for key in columns]
+        rows.append((name, row.get("frames"), *errors, row.get("cpu_seconds")))
+    memory = figures["peak_memory_gib"]
+    return [
+        f"Protocol `{figures['protocol']}`, {figures['cameras']} training cameras; mm and degrees, means over frames, "
+        f"nothing aligned; at most {memory:.1f} GiB of memory for all.",
+        "",
+        *table(heads, rows),
+    ]
