@@ -174,10 +174,13 @@ def test_cloth_that_lies_on_the_skin_elsewhere_does_not_follow_the_hand_beside_i
 
 
 def test_what_hangs_about_a_forbidden_limb_alone_has_weights_all_the_same(body):
-    """A loose cuff about the hand, labelled as what cannot follow it and too wide for a confident match."""
-    cuff = tube(0.06, 0.45, 0.65, x=0.26)
+    """A flat ring that touches the hand, labelled as what cannot follow it; no match is confident."""
+    mesh, weights = body
+    inner = mesh.vertices[-5 * 24 : -4 * 24]  # a row of the hand's own
+    outer = inner + 0.5 * (inner - inner.mean(axis=0))
+    ring = TriangleMesh(np.concatenate([inner, outer]), tube(1.0, 0.0, 1.0, along=2).faces)
     config = TransferConfig(allowed_joints=("hips",), joint_names=NAMES)
-    dense = transfer_weights(*body, cuff, config=config).dense()
+    dense = transfer_weights(mesh, weights, ring, config=config).dense()
     assert np.isfinite(dense).all() and np.abs(dense.sum(axis=1) - 1).max() < 1e-12
 
 
