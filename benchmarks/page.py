@@ -252,10 +252,10 @@ PARTS = (
         "Skin-weight transfer on garments that were not seen",
         "26 garments made by procedure on three open bodies; authored weights by stated rules (last table): the "
         "figures of loose garments say how well a method agrees with such a rule, those of close ones how well it "
-        "finds the skin below. Distance in mm of the driven garment from the same garment driven by its authored weights, over four "
-        "hard poses. `published` is our implementation of the published method; `ours, 0.1` the default before, in "
-        "which joints of a label overruled matches. Our settings were chosen on the first person's garments and on the "
-        "two captures above.",
+        "finds the skin below. Distance in mm of the driven garment from the same garment driven by its authored "
+        "weights, over four hard poses. `published` is our implementation of the published method; `ours, 0.1` the "
+        "default before, in which joints of a label overruled matches. Our settings were chosen on the first person's "
+        "garments and on the two captures above.",
     ),
     Part("transfer_speed", "Skin-weight transfer, speed", "Both captures' garments; exact parameters."),
     Part("segmentation", "Labels of scans", "True labels to compare with; label maps as a parser would give them."),

@@ -26,6 +26,8 @@ from smplxpp.transfer.repair import check_placement, check_source, check_target,
 
 _FACING_LENGTH = 0.02  # of the source's extent: what an opposite normal costs in distance, halved
 
+_LEAST_KEPT = 1e-3  # of a row
+
 
 def transfer_weights(
     source: TriangleMesh,
@@ -148,9 +150,11 @@ def _values(
         lean = lean_on_the_lead(at.found.distance, heard, far=(config.far[0] * size, config.far[1] * size))
         lean[at.confident | alone] = 0.0
         values = values + lean[:, None] * (led - values)
-    if reach is not None and alone.any():  # a little of what may not speak comes along with what may
-        values[alone] *= reach[alone] > 0
-        values[alone] /= values[alone].sum(axis=1, keepdims=True)
+    if reach is not None and alone.any():
+        # A little of what may not speak comes along with what may; where nothing else is near it stays.
+        kept = np.where(reach > 0, values, 0.0)
+        total = kept.sum(axis=1, keepdims=True)
+        values = np.where(alone[:, None] & (total > _LEAST_KEPT), kept / np.maximum(total, _LEAST_KEPT), values)
     out = np.zeros((len(values), joint_count))
     out[:, used] = values
     return out

@@ -173,6 +173,17 @@ def test_cloth_that_lies_on_the_skin_elsewhere_does_not_follow_the_hand_beside_i
     assert transfer_weights(near, weights, skirt, config=TransferConfig.restricted()).dense()[:, 3].max() > 0.3
 
 
+def test_what_hangs_about_a_forbidden_limb_alone_has_weights_all_the_same(body):
+    """A flat ring that touches the hand, labelled as what cannot follow it; no match is confident."""
+    mesh, weights = body
+    inner = mesh.vertices[-5 * 24 : -4 * 24]  # a row of the hand's own
+    outer = inner + 0.5 * (inner - inner.mean(axis=0))
+    ring = TriangleMesh(np.concatenate([inner, outer]), tube(1.0, 0.0, 1.0, along=2).faces)
+    config = TransferConfig(allowed_joints=("hips",), joint_names=NAMES)
+    dense = transfer_weights(mesh, weights, ring, config=config).dense()
+    assert np.isfinite(dense).all() and np.abs(dense.sum(axis=1) - 1).max() < 1e-12
+
+
 def test_labels_name_joints_of_the_model_by_their_number():
     config = TransferConfig.for_label("lower")
     mask = config.allowed_mask(55)
