@@ -19,7 +19,7 @@ _FACING = np.pi / 3  # up to this angle a closest point faces as the target does
 
 @dataclass(frozen=True)
 class Correspondence:
-    """The closest point of the source for each of N target vertices.
+    """The closest point of the source, or one near that faces better, for each of N target vertices.
 
     Attributes:
         face: (N,) source face.
@@ -76,10 +76,11 @@ def prefer_facing(
     """Where the closest point faces another way, a near point that faces the same way, if there is one.
 
     What a garment covers lies behind it and faces as it does; a hand beside a skirt, the arm beside a bodice faces
-    against it, however near. For vertices whose closest point faces more than 60 degrees away, the face is
-    taken whose centre y and normal n' minimise `|x - y|^2 + length^2 |n - n'|^2`, and its point nearest to x; so an
-    opposite normal costs as much as `2 length` of distance. A lining, which faces against all that is near,
-    keeps its closest point.
+    against it, however near, and the back of that hand lies before the cloth. For vertices whose closest point faces
+    more than 60 degrees away, the face is taken whose centre y and normal n' minimise
+    `|x - length n / 2 - y|^2 + length^2 |n - n'|^2`, and its point nearest to x, if x is outside of it and it faces
+    better; so an opposite normal costs as much as `2 length` of distance. A lining, which faces against all that is
+    near, keeps its closest point.
 
     Args:
         points, normals: of the target, turned outwards. length: metres.
@@ -89,13 +90,14 @@ def prefer_facing(
         return found
     x, n = points[rows], normals[rows]
     tree = cKDTree(np.hstack([source.face_centers, length * source.face_normals]))
-    face = tree.query(np.hstack([x, length * n]), workers=-1)[1]
+    face = tree.query(np.hstack([x - 0.5 * length * n, length * n]), workers=-1)[1]
     corners = source.faces[face]
     barycentric = _barycentric(x, *(source.vertices[corners[:, k]] for k in range(3)))
     there = Correspondence(face, barycentric, np.empty(len(rows)), np.empty(len(rows)))
-    distance = row_lengths(x - there.interpolate(source, source.vertices))
-    angle = _angles(n, normalize_rows(there.interpolate(source, source.vertex_normals)))
-    better = ~(angle >= found.angle[rows])
+    offset = x - there.interpolate(source, source.vertices)
+    theirs = normalize_rows(there.interpolate(source, source.vertex_normals))
+    distance, angle = row_lengths(offset), _angles(n, theirs)
+    better = ~(angle >= found.angle[rows]) & (np.einsum("ij,ij->i", offset, theirs) >= 0)
     out = {name: getattr(found, name).copy() for name in ("face", "barycentric", "distance", "angle")}
     for name, value in (("face", face), ("barycentric", barycentric), ("distance", distance), ("angle", angle)):
         out[name][rows[better]] = value[better]

@@ -25,7 +25,6 @@ from smplxpp.transfer.regions import restrict_source
 from smplxpp.transfer.repair import check_placement, check_source, check_target, consistent_winding, extent
 
 _FACING_LENGTH = 0.02  # of the source's extent: what an opposite normal costs in distance, halved
-
 _LEAST_KEPT = 1e-3  # of a row
 
 

@@ -10,7 +10,7 @@ from benchmarks.garments.hair import hairstyles
 from benchmarks.garments.loose import loose_garments
 from benchmarks.garments.mannequin import Mannequin, shares
 from benchmarks.garments.trial import Trial
-from benchmarks.garments.wardrobe import scan
+from benchmarks.garments.wardrobe import betas_of, scan
 from smplxpp.body import load_body
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
@@ -79,6 +79,17 @@ def test_cloth_beside_a_hand_does_not_follow_it(mannequin, wardrobe, name):
     assert follows.max() < 0.05
     old = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=TransferConfig.restricted()).dense()
     assert shares(mannequin.body, old[below], ARM).max() > 0.5
+
+
+def test_the_back_of_a_hand_is_no_match_for_the_cloth_before_its_palm():
+    """On a heavy person the back of the hand lay within the reach of a confident match and faced as the dress does."""
+    body = load_body()
+    heavy = Mannequin.of(body, betas_of(body, "heavy and tall"))
+    dress = next(garment for garment in loose_garments(heavy) if garment.name == "dress")
+    case = scan(heavy, dress, "heavy and tall", "hands", seed=0)
+    dense = transfer_weights(case.source, body.weights, case.mesh, config=TransferConfig.for_label("upper")).dense()
+    below = case.mesh.vertices[:, 1] < heavy.joints["spine1"][1]
+    assert shares(body, dense[below], ARM).max() < 0.05
 
 
 def test_a_wide_sleeve_before_the_hip_follows_the_arm(mannequin, wardrobe):
