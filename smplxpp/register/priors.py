@@ -86,8 +86,10 @@ class Priors:
         self, equations: NormalEquations, row: int, vector: Float64[np.ndarray, " n"], inverse: np.ndarray
     ) -> None:
         over = np.maximum(vector - self.highest, 0.0) + np.minimum(vector - self.lowest, 0.0)
-        weight = self.config.pose_prior / self.spread**2 + (over != 0) / _BOUND**2
-        gradient = self.config.pose_prior * vector / self.spread**2 + over / _BOUND**2
+        # A fit that is believed says more of the pose than what poses mostly are.
+        prior = self.config.pose_prior if self.start is None else 0.0
+        weight = prior / self.spread**2 + (over != 0) / _BOUND**2
+        gradient = prior * vector / self.spread**2 + over / _BOUND**2
         for k, jacobian in enumerate(inverse):
             part = slice(3 * k, 3 * k + 3)
             equations.blocks[row, part, part] += jacobian.T @ (weight[part, None] * jacobian)
@@ -122,13 +124,13 @@ class Priors:
             equations.add(row, rows, difference, shape=False)
 
     def _add_shape(self, equations: NormalEquations, betas: Float64[np.ndarray, " B"]) -> None:
-        index = np.arange(len(betas))
-        equations.shape[index, index] += 1.0
-        equations.shape_gradient += betas
+        # Unit betas, or a fit that is believed.
+        mean, spread = np.zeros_like(betas), 1.0
         if self.start is not None and np.isfinite(self.start.shape):
-            weight = 1.0 / self.start.shape**2
-            equations.shape[index, index] += weight
-            equations.shape_gradient += weight * (betas - self.start.state.betas)
+            mean, spread = self.start.state.betas, self.start.shape
+        index = np.arange(len(betas))
+        equations.shape[index, index] += 1.0 / spread**2
+        equations.shape_gradient += (betas - mean) / spread**2
 
     def _add_smoothness(self, equations: NormalEquations, state: BodyState) -> None:
         """Accelerations of rotations and of the translation, Cauchy-weighted so that fast motion is kept."""
