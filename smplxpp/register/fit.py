@@ -31,6 +31,8 @@ from smplxpp.register.start import state_from_points
 Progress = Callable[[str, float], None]
 # Deviations that a fit is believed to have where nothing tells them: radians, metres, betas, expression.
 _START_NOISE = (np.radians(2.0), 0.01, 0.3, 0.1)
+# A fit has slow errors too, which its noise does not show: beside keypoints it counts as so many times as noisy.
+_BESIDE_KEYPOINTS = 2.0
 _LEAST_NOISE = (np.radians(0.5), 0.003)
 _OVERLAP = 10
 # A joint whose place is known to this (metres) has confidence 1/2.
@@ -245,11 +247,11 @@ class _Registration:
         return Terms(priors, self.tells_shape[rows], keypoints)
 
     def _believed(self, given: BodyState, rows: np.ndarray) -> Start | None:
-        """A given fit as a measurement: as good as it is smooth, and not at all where keypoints tell the same."""
-        if self.seen is not None:
-            return None
+        """A given fit as a measurement: as good as it is smooth; beside keypoints what these do not tell, as twists."""
         pose, transl = white_noise(given, self.frames) or _START_NOISE[:2]
         pose, transl = max(pose, _LEAST_NOISE[0]), max(transl, _LEAST_NOISE[1])
+        if self.seen is not None:
+            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, np.inf, np.inf)
         return Start(given.select(rows), pose, transl, *_START_NOISE[2:])
 
     def _silhouettes(self, state: BodyState, rows: np.ndarray) -> SilhouetteTerm | None:

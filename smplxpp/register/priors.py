@@ -13,6 +13,8 @@ from smplxpp.register.config import RegisterConfig
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.normal_equations import Columns, NormalEquations
 
+# Radians: a fit with smaller errors stands for the prior of poses.
+_BELIEVED = np.radians(5.0)
 # Radians over which a bound is soft.
 _BOUND = np.radians(3.0)
 _EXPRESSION_SPREAD = 0.35
@@ -87,7 +89,8 @@ class Priors:
     ) -> None:
         over = np.maximum(vector - self.highest, 0.0) + np.minimum(vector - self.lowest, 0.0)
         # A fit that is believed says more of the pose than what poses mostly are.
-        prior = self.config.pose_prior if self.start is None else 0.0
+        believed = self.start is not None and self.start.pose < _BELIEVED
+        prior = 0.0 if believed else self.config.pose_prior
         weight = prior / self.spread**2 + (over != 0) / _BOUND**2
         gradient = prior * vector / self.spread**2 + over / _BOUND**2
         for k, jacobian in enumerate(inverse):
