@@ -10,6 +10,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.fit import register
 from smplxpp.register.observations import Observations, ScanObservation
@@ -55,6 +56,24 @@ def test_noisy_keypoints_and_masks(person, cameras):
     assert np.nanmean(both.residuals["silhouette_px"]) < np.nanmean(both.start["silhouette_px"])
     assert both.confidence.shape == (FRAMES, BODY.joint_count)
     assert (both.confidence[:, :22] > 0.5).all()
+
+
+def degrees_away(fitted, true):
+    """Mean angle of the body's joints between two fits."""
+    a, b = (BODY.joint_rotations(params)[:, :22] for params in (fitted, true))
+    return np.degrees(np.linalg.norm(rotvec_from_matrix(a.transpose(0, 1, 3, 2) @ b), axis=2)).mean()
+
+
+def test_a_fit_beside_keypoints_tells_the_turns_that_they_do_not(person, cameras):
+    seen = keypoints(BODY, person, cameras, px=2.0)
+    near, far = (disturbed(person, degrees=d, metres=0.01, betas=0.3) for d in (1.0, 15.0))
+    frames = tuple(range(FRAMES))
+    alone, helped, misled = (
+        register(BODY, Observations(frames, cameras, keypoints=seen, initial=start, fps=20.0), SMALL).params
+        for start in (None, near, far)
+    )
+    assert degrees_away(helped, person) < 0.7 * degrees_away(alone, person)
+    assert vertex_error_mm(BODY, misled, person) < 1.5 * vertex_error_mm(BODY, alone, person)
 
 
 def test_windows_join(person, cameras):
