@@ -29,8 +29,8 @@ from smplxpp.register.solver import Terms, gauss_newton
 from smplxpp.register.start import state_from_points
 
 Progress = Callable[[str, float], None]
-# Deviations that a fit is believed to have where nothing tells them: radians, metres, betas, expression.
-_START_NOISE = (np.radians(2.0), 0.01, 0.3, 0.1)
+# Deviations that a fit is believed to have where nothing tells them: radians, metres, betas.
+_START_NOISE = (np.radians(2.0), 0.01, 0.3)
 # A fit has slow errors too, which its noise does not show: beside keypoints it counts as so many times as noisy.
 _BESIDE_KEYPOINTS = 2.0
 _LEAST_NOISE = (np.radians(0.5), 0.003)
@@ -99,7 +99,9 @@ class _Registration:
         before = state
         whole = len(self.frames) <= self.config.window
         if whole:
-            state, equations = self._solve(state, _Window(np.arange(len(self.frames)), self.tells_shape | True), True)
+            state, equations = self._solve(
+                state, _Window(np.arange(len(self.frames)), np.ones(len(self.frames), dtype=bool)), True
+            )
             confidence = self._confidence(state, equations, np.arange(len(self.frames)))
         else:
             state = self._solve_shape(state)
@@ -251,8 +253,8 @@ class _Registration:
         pose, transl = white_noise(given, self.frames) or _START_NOISE[:2]
         pose, transl = max(pose, _LEAST_NOISE[0]), max(transl, _LEAST_NOISE[1])
         if self.seen is not None:
-            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, np.inf, np.inf)
-        return Start(given.select(rows), pose, transl, *_START_NOISE[2:])
+            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, np.inf)
+        return Start(given.select(rows), pose, transl, _START_NOISE[2])
 
     def _silhouettes(self, state: BodyState, rows: np.ndarray) -> SilhouetteTerm | None:
         outlines = {

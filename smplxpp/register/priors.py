@@ -30,14 +30,13 @@ class Start:
 
     Attributes:
         state: what it says. pose: standard deviation of each joint, radians; inf: not believed.
-        transl: in metres. shape: in betas. expression: in its units.
+        transl: in metres. shape: in betas.
     """
 
     state: BodyState
     pose: float
     transl: float
     shape: float
-    expression: float
 
 
 class Priors:
@@ -57,7 +56,6 @@ class Priors:
         *,
         start: Start | None = None,
         fps: float | None = None,
-        mean_expression: Float64[np.ndarray, " E"] | None = None,
     ) -> None:
         self.columns, self.frames, self.config, self.start = columns, np.asarray(frames), config, start
         joints = columns.joints
@@ -65,7 +63,6 @@ class Priors:
             getattr(anatomy, name)[joints].reshape(-1) for name in ("spread", "lowest", "highest")
         )
         self.seconds = 1.0 / (fps or DEFAULT_FPS)
-        self.mean_expression = np.zeros(columns.expression_count) if mean_expression is None else mean_expression
 
     def add(self, equations: NormalEquations, state: BodyState, *, shape: bool) -> None:
         """Add all of them to the equations of a state.
@@ -103,7 +100,7 @@ class Priors:
         index = np.arange(part.start, part.stop)
         if len(index):
             equations.blocks[row, index, index] += 1.0 / _EXPRESSION_SPREAD**2
-            equations.gradient[row, part] += (expression - self.mean_expression) / _EXPRESSION_SPREAD**2
+            equations.gradient[row, part] += expression / _EXPRESSION_SPREAD**2
 
     def _add_start(self, equations: NormalEquations, row: int, state: BodyState) -> None:
         start = self.start

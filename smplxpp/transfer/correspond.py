@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
 
-# Beyond this angle a closest point faces against the target: an arm against the bodice beside it. Short of it the point
-# stays: under an arm, where a scan runs from sleeve to side, cloth faces neither as the arm does nor as the trunk.
-_AGAINST = np.radians(100.0)
+# Beyond this angle a closest point faces against the target: an arm against the bodice beside it.
+_AGAINST = np.radians(70.0)
+# Lengths within which another point may take its place: as far as a confident match goes.
+_NEAR_LENGTHS = 0.75
 
 
 @dataclass(frozen=True)
@@ -79,10 +80,10 @@ def prefer_facing(
 
     What a garment covers lies behind it and faces as it does; a hand beside a skirt, the arm beside a bodice faces
     against it, however near, and the back of that hand lies before the cloth. For vertices whose closest point faces
-    more than 100 degrees away, the face is taken whose centre y and normal n' minimise
-    `|x - length n / 2 - y|^2 + length^2 |n - n'|^2`, and its point nearest to x, if x is outside of it and it faces
-    better; so an opposite normal costs as much as `2 length` of distance. A lining, which faces against all that is
-    near, keeps its closest point.
+    more than 70 degrees away, the face is taken whose centre y and normal n' minimise
+    `|x - length n / 2 - y|^2 + length^2 |n - n'|^2`, and its point nearest to x, if x is outside of it, it is no
+    farther than 3/4 `length` and faces better; so an opposite normal costs as much as `2 length` of distance. A
+    lining, which faces against all that is near, keeps its closest point.
 
     Args:
         points, normals: of the target, turned outwards. length: metres.
@@ -100,6 +101,7 @@ def prefer_facing(
     theirs = normalize_rows(there.interpolate(source, source.vertex_normals))
     distance, angle = row_lengths(offset), _angles(n, theirs)
     better = ~(angle >= found.angle[rows]) & (np.einsum("ij,ij->i", offset, theirs) >= 0)
+    better &= distance <= _NEAR_LENGTHS * length
     out = {name: getattr(found, name).copy() for name in ("face", "barycentric", "distance", "angle")}
     for name, value in (("face", face), ("barycentric", barycentric), ("distance", distance), ("angle", angle)):
         out[name][rows[better]] = value[better]

@@ -89,7 +89,7 @@ def test_the_back_of_a_hand_is_no_match_for_the_cloth_before_its_palm():
     case = scan(heavy, dress, "heavy and tall", "hands", seed=17)
     beside = error(heavy, case, TransferConfig.for_label("upper"))
     away = error(heavy, scan(heavy, dress, "heavy and tall", "A", seed=0), TransferConfig.for_label("upper"))
-    assert beside["mean"] < 1.2 * away["mean"]  # it was twice as much
+    assert beside["mean"] < away["mean"] + 1.0  # mm; it was twice as much
 
 
 def test_a_wide_sleeve_before_the_hip_follows_the_arm(mannequin, wardrobe):
