@@ -46,7 +46,13 @@ VARIANTS = {
     "falloff 4": replace(_DEFAULT, falloff=4.0),
     "confident 0.01": replace(_DEFAULT, confident=0.01),
     "confident 0.02": replace(_DEFAULT, confident=0.02),
-    "far 0.04 to 0.08": replace(_DEFAULT, far=(0.04, 0.08)),
+    "far 0.055 to 0.1": replace(_DEFAULT, far=(0.055, 0.1)),
+    "far 0.03 to 0.06": replace(_DEFAULT, far=(0.03, 0.06)),
+    "lead_length 0.05": replace(_DEFAULT, lead_length=0.05),
+    "lead_length 0.1": replace(_DEFAULT, lead_length=0.1),
+    "lead_length 0.4": replace(_DEFAULT, lead_length=0.4),
+    "turned 0": replace(_DEFAULT, turned=0.0),
+    "turned 0.06": replace(_DEFAULT, turned=0.06),
 }
 Scores = dict[str, dict[str, float]]
 Rows = dict[str, list[dict[str, float]]]

@@ -28,10 +28,14 @@ class TransferConfig:
         smoothing: how strongly a vertex is believed: weights are smoothed over this multiple of its distance to the
             source. None believes matched vertices wholly and the others not at all.
         normal_doubt: how many times wider still where the normals are perpendicular (twice as many where opposite).
+        turned: a vertex that faces away from the nearest skin is smoothed as if it lay this fraction of the source's
+            extent away, however near it lies.
         confident: a matched vertex within this fraction of the source's extent is confident. The others listen to the
             joints that confident ones lead to along the surface. None: no vertex is.
         far: between these fractions of the source's extent a vertex passes from what the body nearby says to what
             confident vertices lead to.
+        lead_length: `l` of the energy by which confident vertices lead, as a fraction of the source's extent: the
+            shorter, the more a skirt keeps of what its waist follows, where a longer one continues the trend.
         allowed_joints: names or indices of the joints that the target may follow; None allows all. They steer what is
             not confident: a confident vertex keeps the joints that it is matched to. Without confident vertices
             (`confident` None) the source is restricted to the faces that these joints own.
@@ -50,8 +54,10 @@ class TransferConfig:
     falloff: float | None = 6.0
     smoothing: float | None = 0.4
     normal_doubt: float = 2.0
+    turned: float = 0.04
     confident: float | None = 0.015
-    far: tuple[float, float] = (0.055, 0.1)
+    far: tuple[float, float] = (0.039, 0.07)
+    lead_length: float = 0.07
     allowed_joints: tuple[str | int, ...] | None = None
     unmatched: str = "extend"
     max_distance: float = 0.05
@@ -63,13 +69,13 @@ class TransferConfig:
     joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("max_distance", "max_angle_deg", "length_scale", "smoothing", "confident"):
+        for name in ("max_distance", "max_angle_deg", "length_scale", "lead_length", "smoothing", "confident"):
             value = getattr(self, name)
             if value is not None:
                 require_positive(f"config {name}", value, finite=False)
         if self.falloff is not None and not self.falloff > 2:
             raise InputError("config falloff", expected="more than 2, or None", received=str(self.falloff))
-        for name in ("normal_doubt", "averaging_steps"):
+        for name in ("normal_doubt", "turned", "averaging_steps"):
             require_at_least(f"config {name}", getattr(self, name), 0)
         if len(self.far) != 2 or not 0 <= self.far[0] < self.far[1]:
             raise InputError("config far", expected="two fractions, none negative, growing", received=str(self.far))
@@ -93,12 +99,14 @@ class TransferConfig:
 
         Components that nothing matches (for which the publication says nothing) copy the closest point.
         """
-        return TransferConfig(falloff=None, smoothing=None, normal_doubt=0.0, confident=None, unmatched="nearest")
+        return TransferConfig(
+            falloff=None, smoothing=None, normal_doubt=0.0, turned=0.0, confident=None, unmatched="nearest"
+        )
 
     @staticmethod
     def restricted() -> TransferConfig:
         """The default of version 0.1, in which a label's joints overrule matches: for comparison."""
-        return TransferConfig(confident=None, normal_doubt=2.0, smoothing=0.4, falloff=6.0)
+        return TransferConfig(confident=None, normal_doubt=2.0, turned=0.0, smoothing=0.4, falloff=6.0)
 
     @staticmethod
     def for_label(name: str, *, base: TransferConfig | None = None) -> TransferConfig:

@@ -13,6 +13,9 @@ _NEIGHBOUR = 0.1  # how far a neighbour of the joint that cloth is led to may sp
 LEAST_REACH = 1e-6  # the whole body speaks where nothing that may speak is near
 _OWN = 0.3  # a joint with this share of the confident cloth's weight is no longer what the label says about it
 _UNHEARD = (0.01, 0.001)  # share of the body nearby that may speak: from the first to the second it loses its say
+_UNHEARD_AWAY = (0.5, 0.1)  # ... for a vertex that faces away from it
+_AWAY = (np.radians(35.0), np.radians(70.0))
+_DOUBTED = (np.radians(15.0), np.radians(45.0))
 
 
 def lead(
@@ -61,14 +64,25 @@ def joint_reach(
 
 
 def lean_on_the_lead(
-    distance: Float[np.ndarray, " N"], heard: Float[np.ndarray, " N"], *, far: tuple[float, float]
+    distance: Float[np.ndarray, " N"],
+    angle: Float[np.ndarray, " N"],
+    heard: Float[np.ndarray, " N"],
+    *,
+    far: tuple[float, float],
 ) -> Float64[np.ndarray, " N"]:
     """How far the lead replaces what the body nearby says: 0 to 1.
 
-    Smoothly from 0 to 1 between the two distances `far` (metres), and where hardly any of the body nearby may speak
-    (`heard`, a share).
+    Smoothly from 0 to 1 between the two distances `far` (metres); where hardly any of the body nearby may speak
+    (`heard`, a share); and, for a vertex that faces away from the skin nearest to it (`angle`, radians), where less
+    than half of it may: hair that lies against a raised arm, a sleeve that hangs beside the chest.
     """
-    return 1.0 - (1.0 - _step(distance, *far)) * (1.0 - _step(heard, *_UNHEARD))
+    away = _step(_angle(angle), *_AWAY) * _step(heard, *_UNHEARD_AWAY)
+    return 1.0 - (1.0 - _step(distance, *far)) * (1.0 - _step(heard, *_UNHEARD)) * (1.0 - away)
+
+
+def turned_away(angle: Float[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    """0 to 1: how far a vertex that faces so (radians) against the nearest skin is doubted, however near it lies."""
+    return _step(_angle(angle), *_DOUBTED)
 
 
 def speaking(reach: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"]) -> Float64[np.ndarray, "N S"]:
@@ -79,6 +93,11 @@ def speaking(reach: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"])
 def components_without(component: Int32[np.ndarray, " N"], confident: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     """The vertices of components that have no confident vertex."""
     return (np.bincount(component, confident) == 0)[component]
+
+
+def _angle(angle: np.ndarray) -> np.ndarray:
+    """Radians; 0 for a vertex without a normal, which faces nowhere."""
+    return np.nan_to_num(angle, nan=0.0)
 
 
 def _step(x: np.ndarray, start: float, end: float) -> np.ndarray:

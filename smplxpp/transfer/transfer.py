@@ -18,6 +18,7 @@ from smplxpp.transfer.evidence import (
     lead,
     lean_on_the_lead,
     neighbouring_joints,
+    turned_away,
 )
 from smplxpp.transfer.extend import extend_weights, sample_surface
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
@@ -94,9 +95,7 @@ def transfer_weights(
     # Joints that nothing uses cost nothing in the solver.
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
-    dense[:, occurring] = _smooth(
-        target, found, values[:, occurring], matched, settled, config.length_scale * size, config
-    )
+    dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, size, config)
     return SkinWeights.from_dense(
         dense,
         max_influences=config.max_influences,
@@ -134,7 +133,7 @@ def _values(
     led = reach = None
     alone = components_without(at.component, at.confident)
     if at.confident.any():
-        led = _lead(at, copied, config.length_scale * size, config)
+        led = _lead(at, copied, config.lead_length * size, config)
         reach = joint_reach(led, neighbouring_joints(weights), None if allowed is None else allowed[used])
         reach[alone] = 1.0 if allowed is None else allowed[used]
     elif allowed is not None and config.confident is not None:
@@ -146,7 +145,8 @@ def _values(
             at.target.vertices, at.normals, at.found, copied, samples, falloff=config.falloff, reach=reach
         )
     if led is not None:
-        lean = lean_on_the_lead(at.found.distance, heard, far=(config.far[0] * size, config.far[1] * size))
+        far = (config.far[0] * size, config.far[1] * size)
+        lean = lean_on_the_lead(at.found.distance, at.found.angle, heard, far=far)
         lean[at.confident | alone] = 0.0
         values = values + lean[:, None] * (led - values)
     if reach is not None and alone.any():
@@ -174,7 +174,7 @@ def _smooth(
     values: np.ndarray,
     matched: np.ndarray,
     settled: np.ndarray,
-    length: float,
+    size: float,
     config: TransferConfig,
 ) -> np.ndarray:
     """The values (N, J) fitted smoothly over the surface; vertices without a face keep theirs."""
@@ -182,8 +182,10 @@ def _smooth(
         width = np.where(matched | settled, 0.0, np.inf)
     else:
         doubt = 1.0 + config.normal_doubt * (1.0 - np.cos(np.nan_to_num(found.angle)))
-        width = np.where(settled, 0.0, config.smoothing * doubt * found.distance)
+        doubted = np.hypot(found.distance, config.turned * size * turned_away(found.angle))
+        width = np.where(settled, 0.0, config.smoothing * doubt * doubted)
     mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))
+    length = config.length_scale * size
     fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
+from smplxpp.transfer.correspond import closest_points
 from smplxpp.transfer.repair import extent
 
 NAMES = ("hips", "left", "right", "hand")
@@ -139,8 +140,8 @@ def test_a_loose_skirt_blends_the_legs_where_the_nearest_point_tears(body, skirt
 
 def test_a_forbidden_limb_is_never_followed(body, skirt):
     mesh, weights = body
-    free = transfer_weights(mesh, weights, skirt).dense()
-    assert free[:, 3].max() > 0.5  # the hand touches the skirt
+    assert closest_points(mesh, skirt).interpolate(mesh, weights)[:, 3].max() > 0.5  # the hand touches the skirt
+    assert transfer_weights(mesh, weights, skirt).dense()[:, 3].max() > 0.1  # without a label it is heard a little
     config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES)
     assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
 
