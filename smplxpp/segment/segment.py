@@ -33,20 +33,26 @@ class SegmentConfig:
         label_trust: weight of the labels given with the scan, as a share of full votes.
         underside: cost, over sqrt(M), of any label but skin for a face that no vote fell on and that looks down (+Y is
             up). A scan closes a skirt from below; that surface is no cloth, and the hem is a fold as the legs are.
-        island_area: patches below this fraction of the surface's area take their surroundings' label.
+        speck_area: patches below this fraction of the surface's area take their surroundings' label.
+        island_area: patches of anything worn do so below this fraction: a label map that is wrong beside a border
+            leaves a bit of skirt on the fingers, and nothing worn is that small (57 of 19,000 square centimetres).
+        doubtful_area, doubtful: so does a patch of any label below this fraction whose mean confidence is lower.
     """
 
-    smoothness: float = 0.8
+    smoothness: float = 1.2
     floor: float = 0.05
     eta_convex: float = 0.15
     eta_concave: float = 1.0
     fold: float = 0.1
-    pseudo_votes: float = 0.02
+    pseudo_votes: float = 0.1
     full_votes: float = 3.0
     rings: int = 4
-    label_trust: float = 0.35
+    label_trust: float = 0.75
     underside: float = 6.0
-    island_area: float = 1e-4
+    speck_area: float = 1e-4
+    island_area: float = 3e-3
+    doubtful_area: float = 5e-3
+    doubtful: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +88,7 @@ def segment_scan(
 
     Minimises `sum_i U_i(l_i) + sum_(i,j) w_ij [l_i != l_j]` by alpha-expansion, with
     `U = -log p min(sum of votes, 3) / 3` and
-    `w = 0.8 (edge length / mean) exp(-eta (1 - cos dihedral) / 0.1) + 0.05`, eta 0.15 at convex edges and 1 at concave
+    `w = 1.2 (edge length / mean) exp(-eta (1 - cos dihedral) / 0.1) + 0.05`, eta 0.15 at convex edges and 1 at concave
     ones, so that seams settle in folds. Labels given are three votes a face (one a corner), weighted by
     `label_trust`; -1 is no vote.
 
@@ -126,7 +132,7 @@ def segment_scan(
     before = problem.energy(unary.argmin(axis=1))
     index, after = minimize_potts(problem)
     cut = candidates[index]
-    labels = _absorb_islands(mesh, cut, pairs, ends, config.island_area)
+    labels = _absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config)
     confidence = _confidence(votes, labels, pairs, config)
     return SegmentedScan(
         labels, confidence, total > 0, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE
@@ -197,16 +203,26 @@ def _fold_weights(mesh: TriangleMesh, pairs: np.ndarray, ends: np.ndarray, confi
 
 
 def _absorb_islands(
-    mesh: TriangleMesh, labels: np.ndarray, pairs: np.ndarray, ends: np.ndarray, area_fraction: float
+    mesh: TriangleMesh,
+    labels: np.ndarray,
+    confidence: np.ndarray,
+    pairs: np.ndarray,
+    ends: np.ndarray,
+    config: SegmentConfig,
 ) -> np.ndarray:
-    """Give patches below `area_fraction` of the surface the label that they share the longest border with.
+    """Give patches that are too small for their label the one that they share the longest border with.
 
     Only patches that are large enough hand on their label; a small one that touches none of them stays.
     """
     same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
     patch = component_labels(pairs[same], len(labels))
     area = np.bincount(patch, mesh.face_areas)
-    small = area < area_fraction * area.sum()
+    label_of_patch = np.empty(len(area), dtype=np.int64)
+    label_of_patch[patch] = labels
+    doubtful = np.bincount(patch, mesh.face_areas * confidence) < config.doubtful * area
+    least = np.where(label_of_patch == SKIN.id, config.speck_area, config.island_area)
+    least = np.where(doubtful, np.maximum(least, config.doubtful_area), least)
+    small = area < least * area.sum()
     if not small.any():
         return labels
     crossing = pairs[~same]
@@ -214,8 +230,6 @@ def _absorb_islands(
     here = np.concatenate([patch[crossing[:, 0]], patch[crossing[:, 1]]])
     there = np.concatenate([patch[crossing[:, 1]], patch[crossing[:, 0]]])
     usable = small[here] & ~small[there]
-    label_of_patch = np.empty(len(area), dtype=np.int64)
-    label_of_patch[patch] = labels
     border = np.zeros((len(area), len(LABELS)))
     np.add.at(border, (here[usable], label_of_patch[there[usable]]), np.concatenate([length, length])[usable])
     absorbed = border.any(axis=1)

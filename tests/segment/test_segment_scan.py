@@ -117,11 +117,45 @@ def test_given_labels_lose_specks(ball):
     truth = halves(ball)
     labels = truth.copy()
     labels[np.random.default_rng(0).choice(ball.face_count, 60, replace=False)] = 1
-    result = segment_scan(ball, face_labels=labels, config=SegmentConfig(island_area=1e-3))
+    result = segment_scan(ball, face_labels=labels, config=SegmentConfig(speck_area=1e-3))
     assert (result.face_labels == truth).mean() > 0.99
     assert not (result.face_labels == 1).any()
     per_vertex = np.where(ball.vertices[:, 1] > 0, 3, 4)
     assert (segment_scan(ball, vertex_labels=per_vertex).face_labels == truth).mean() > 0.97
+
+
+def test_a_bit_of_cloth_on_a_hand_goes_a_strap_and_a_hole_stay():
+    """All of them are voted for clearly: what is worn is never so small, skin that shows is, a strap belongs on."""
+    mesh = trimesh.creation.icosphere(subdivisions=5)
+    ball = TriangleMesh(mesh.vertices, mesh.faces)
+    x, y, z = ball.face_centers.T
+    worn = y < -0.2
+    island = (np.hypot(x - 0.3, z) < 0.07) & (y > 0)
+    strap = (np.abs(x + 0.3) < 0.05) & (z > 0) & ~worn
+    hole = (np.hypot(x, z) < 0.09) & (y < 0)
+    assert island.sum() > 20
+    truth = np.where((worn & ~hole) | strap, LOWER.id, SKIN.id)
+    votes = np.zeros((ball.face_count, 6))
+    votes[np.arange(ball.face_count), np.where(island, LOWER.id, truth)] = 3.0
+    found = segment_scan(ball, votes=votes).face_labels
+    assert (found[island] == SKIN.id).all()
+    assert (found[strap] == LOWER.id).mean() > 0.95
+    assert (found[hole] == SKIN.id).mean() > 0.8
+    assert (found == truth).mean() > 0.99
+
+
+def test_a_patch_that_the_votes_doubt_goes_whatever_its_label(ball):
+    truth = np.full(ball.face_count, LOWER.id)
+    patch = np.hypot(ball.face_centers[:, 0], ball.face_centers[:, 2]) < 0.1
+    patch &= ball.face_centers[:, 1] > 0
+    for clear, expected in ((3.0, SKIN.id), (1.6, LOWER.id)):
+        votes = np.zeros((ball.face_count, 6))
+        votes[np.arange(ball.face_count), truth] = 3.0
+        votes[patch] = 0.0
+        votes[patch, SKIN.id] = clear
+        votes[patch, LOWER.id] = 3.0 - clear
+        config = SegmentConfig(smoothness=0.01, floor=0.0)  # the graph cut leaves the patch
+        assert (segment_scan(ball, votes=votes, config=config).face_labels[patch] == expected).mean() > 0.9
 
 
 def test_same_answer_after_motion_units_and_permutation(ball):
