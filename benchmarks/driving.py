@@ -1,11 +1,12 @@
 """What a user will see: parts driven by transferred weights against the same parts driven by the authored ones.
 
-    python -m benchmarks.driving --captures DIR [--peer CHECKOUT] [--out NAME]
+    python -m benchmarks.driving --captures DIR [--peer CHECKOUT] [--runs DIR] [--out NAME]
 
 The reference scan is cut by its true labels into the default parts; weights are transferred from the posed open body,
 the parts are unposed with them, and posed again: in hard poses and in the capture's own motion. Errors are distances in
 mm to the same part unposed (exact parameters) and posed with the authored weights, which are those of the closest point
-of the true layer. With noisy parameters the body, the unposing and the driving skeleton are a tracker's.
+of the true layer. With noisy parameters the body, the unposing and the driving skeleton are a tracker's, as they are;
+with `--runs`, a folder of runs named as the captures, also those that `smplxpp build --protocol tracked` registered.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scipy.spatial import cKDTree
 from benchmarks.capture_truth import CaptureTruth, TruePart, find_captures, read_capture_truth
 from benchmarks.machine import store_results
 from benchmarks.rin23 import load_peer, run_peer
+from pipelines.runs.artefacts import load_params_of_run
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
@@ -41,11 +43,13 @@ Method = Callable[[TriangleMesh, np.ndarray, TriangleMesh, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Options:
-    """captures: folder of captures with truth. peer: checkout of the reference implementation. out: name of the
-    stored results. motion_frames: frames of the capture's motion, evenly spread."""
+    """captures: folder of captures with truth. peer: checkout of the reference implementation. runs: folder of runs
+    built under the protocol `tracked`, each named as its capture. out: name of the stored results. motion_frames:
+    frames of the capture's motion, evenly spread."""
 
     captures: Path
     peer: Path | None = None
+    runs: Path | None = None
     out: Path = Path("driving")
     motion_frames: int = 8
 
@@ -127,10 +131,15 @@ def _summary(values: np.ndarray) -> dict[str, float]:
     return {"mean": float(values.mean()), "p95": float(p95), "p99": float(p99)}
 
 
-def run_capture(truth: CaptureTruth, table: dict[str, Method], motion_frames: int) -> dict:
+def run_capture(
+    truth: CaptureTruth, table: dict[str, Method], motion_frames: int, registered: BodyParams | None
+) -> dict:
     """figures[params][part][method][quantity] = {mean, p95, p99, (stretch_p999)}."""
     figures: dict = {}
-    for kind, params in (("exact", truth.exact), ("noisy", truth.noisy)):
+    kinds = {"exact": truth.exact, "tracked, registered": registered, "noisy": truth.noisy}
+    for kind, params in kinds.items():
+        if params is None:
+            continue
         source = truth.body.mesh(truth.body.forward(params).vertices[0])
         for label, part in truth.parts.items():
             for name, method in table.items():
@@ -165,10 +174,12 @@ def main(options: Options) -> None:
     console, table, figures = Console(width=190), methods(options.peer), {}
     for folder in find_captures(options.captures):
         truth = read_capture_truth(folder)
-        figures[truth.name] = run_capture(truth, table, options.motion_frames)
+        run = None if options.runs is None else options.runs / truth.name
+        registered = None if run is None or not run.is_dir() else load_params_of_run(run)
+        figures[truth.name] = run_capture(truth, table, options.motion_frames, registered)
         print_tables(console, truth.name, figures[truth.name])
-    peer = " --peer CHECKOUT" if options.peer else ""
-    path = store_results(options.out.stem, f"python -m benchmarks.driving --captures DIR{peer}", figures)
+    said = (" --peer CHECKOUT" if options.peer else "") + (" --runs DIR" if options.runs else "")
+    path = store_results(options.out.stem, f"python -m benchmarks.driving --captures DIR{said}", figures)
     console.print(f"stored in {path}")
 
 
