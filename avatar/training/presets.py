@@ -91,6 +91,15 @@ _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 
 
 @dataclass(frozen=True)
+class _Steps:
+    """A training: its iterations, the networks' rate, and that of the Gaussians' attributes in multiples of `rates`."""
+
+    iterations: int
+    lr: float
+    attributes: float = 1.0
+
+
+@dataclass(frozen=True)
 class _Size:
     """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations."""
 
@@ -104,8 +113,8 @@ class _Size:
     field_lr: float
     fit: int
     rates: LearningRates
-    teacher: int
-    bake: int
+    teacher: _Steps
+    bake: _Steps
     compensate: int
 
 
@@ -127,11 +136,11 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             rates=size.rates,
         ),
         teacher=FitTeacherConfig(
-            iterations=size.teacher,
+            iterations=size.teacher.iterations,
             pretrain=pretrain,
             views=3,
-            lr=2e-3,
-            attributes=1.0,
+            lr=size.teacher.lr,
+            attributes=size.teacher.attributes,
             weights=_LEAN_WEIGHTS,
             track=TrackConfig(
                 levels=size.track,
@@ -141,15 +150,15 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             ),
         ),
         bake=BakeConfig(
-            iterations=size.bake,
+            iterations=size.bake.iterations,
             pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=size.field_lr),
             images="photographs",
             semantic=0.0,
-            attributes=1.0,
+            attributes=size.bake.attributes,
             imagined=48,
             code_lr_factor=5.0,
             views=3,
-            lr=1e-3,
+            lr=size.bake.lr,
             null_share=0.2,
             weights=_LEAN_WEIGHTS,
         ),
@@ -198,8 +207,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             field_lr=5e-3,
             fit=600,
             rates=LearningRates(),
-            teacher=500,
-            bake=900,
+            teacher=_Steps(500, 2e-3),
+            bake=_Steps(900, 1e-3),
             compensate=2000,
         ),
     ),
@@ -220,8 +229,10 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             fit=150,
             # Few steps, of one view each: colours learn fast or not at all.
             rates=LearningRates(dc=6e-3, offset=0.03),
-            teacher=60,
-            bake=60,
+            # Where poses are tracked, networks of few frames learn the poses' errors; colours, which all frames share,
+            # do not. So networks learn slowly after their pretraining, and colours fast.
+            teacher=_Steps(250, 3e-4, 3.5),
+            bake=_Steps(250, 3e-4, 2.0),
             compensate=500,
         ),
     ),

@@ -30,14 +30,14 @@ class RegisterConfig:
     """
 
     keypoint_px: float = 1.0
-    silhouette_px: float = 1.0
+    silhouette_px: float = 2.0
     silhouette_reach_m: float = 0.03
     scan_m: float = 0.003
     scan_reach_m: float = 0.03
     tight_m: float = 0.006
     cloth_share: float = 0.15
-    acceleration: float = 12.0
-    transl_acceleration: float = 3.0
+    acceleration: float = 6.0
+    transl_acceleration: float = 1.5
     pose_prior: float = 1.0
     scan_samples: int = 4000
     rim_samples: int = 4000
