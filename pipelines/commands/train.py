@@ -51,6 +51,9 @@ class Train:
     refine_poses: Literal["auto", "on", "off"] = "auto"
     """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where
     the capture says that its parameters are tracked, or the run has registered or refined some."""
+    refine_cameras: bool = False
+    """With the poses, correct the poses of the training cameras by the photographs; their mean stays where it is, and
+    so do intrinsics and held-out cameras. For calibrations that are a little off, with many cameras."""
     max_minutes: float = math.inf
     """Stop after as many minutes and write what there is; the same command
     then goes on (without --force, which would begin anew)."""
@@ -121,7 +124,15 @@ class Train:
         with join_processes(choose_device(self.device)) as together:
             config = replace(config, preset=with_batch(config.preset, least=together.world_size))
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
-            config = replace(config, refine=RefineConfig(seed=self.seed) if first else None)
+            refinement = RefineConfig(seed=self.seed, cameras=self.refine_cameras)
+            if self.refine_cameras and not first:
+                raise InputError(
+                    "option refine-cameras",
+                    expected="poses that are refined too",
+                    received="parameters that stand as they are",
+                    remedy="add --refine-poses on",
+                )
+            config = replace(config, refine=refinement if first else None)
             again = first and "refine" in self.stages()
             scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not again))
             held_out = bool(scene.capture.splits.novel_view_cameras)

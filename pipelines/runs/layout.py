@@ -59,6 +59,7 @@ STUDENT = f"{COMPENSATE_STAGE}/student.safetensors"
 COMPACT_STUDENT = f"{COMPENSATE_STAGE}/student_compact.safetensors"
 REFINED_PARAMS = f"{REFINE_STAGE}/params.npz"
 REFINED_HELD_OUT_PARAMS = f"{REFINE_STAGE}/params_held_out.npz"
+REFINED_CAMERAS = f"{REFINE_STAGE}/cameras.json"
 EVALUATION = f"{EVALUATE_STAGE}/metrics.json"
 
 BUILD_FILE = "build.json"

@@ -21,6 +21,7 @@ from pipelines.runs import gates
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.layout import (
     REFINE_STAGE,
+    REFINED_CAMERAS,
     REFINED_HELD_OUT_PARAMS,
     REFINED_PARAMS,
     REGISTERED_PARAMS,
@@ -31,6 +32,7 @@ from pipelines.stages.params_in_use import params_in_use, params_to_begin_with, 
 from pipelines.stages.refine_pictures import write_pictures
 from pipelines.stages.said_of_inputs import SaidOfInputs, path_of_params
 from pipelines.stages.scene import TrainInputs, TrainScene, of_protocol, open_cameras, open_scene
+from pipelines.stages.usable import with_cameras
 from smplxpp.capture import Capture
 from smplxpp.capture.writers.cameras import write_plain_cameras_json
 from smplxpp.core.array_file import write_arrays
@@ -82,6 +84,7 @@ def refine(
     """Refine the poses of a run's capture, made in one go; skipped while template, capture, code and choices stand.
 
     `params.npz` has a row for every frame: training frames are refined, all others keep what they had.
+    `cameras.json`, if cameras are corrected too, has the training cameras; all that takes the parameters takes it.
     `params_held_out.npz` has the held-out frames refined, too, on training cameras alone and with everything else as
     the training frames left it. Nothing is trained with it: an evaluation can print both.
 
@@ -118,13 +121,14 @@ def _work(
     capture, template = scene.capture, scene.template
     _write_params(folder / Path(REFINED_PARAMS).name, _rows(capture, template, [found]))
     numbers: dict[str, Any] = {"training": figures(found)}
+    if found.cameras:
+        corrected = {name: replace(capture.cameras[name], cam_from_world=pose) for name, pose in found.cameras.items()}
+        write_plain_cameras_json(folder / Path(REFINED_CAMERAS).name, corrected)
+        sequence.capture = with_cameras(capture, found.cameras)
     if held_out and capture.splits.novel_pose_frames:
         apart = refine_held_out(sequence, found.gaussians, config)
         _write_params(folder / Path(REFINED_HELD_OUT_PARAMS).name, _rows(capture, template, [found, apart]))
         numbers["held_out"] = figures(apart)
-    if found.cameras:
-        corrected = {name: replace(capture.cameras[name], cam_from_world=pose) for name, pose in found.cameras.items()}
-        write_plain_cameras_json(folder / "cameras.json", corrected)
     save_bound(found.gaussians, folder / "gaussians.safetensors")
     atomic_write_text(folder / "refinement.json", json.dumps(jsonable(numbers), indent=1))
     looks = len(found.frames) * len(found.history)

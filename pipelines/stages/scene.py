@@ -8,16 +8,30 @@ from pathlib import Path
 
 from avatar.data.views import read_views
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTER_STAGE, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.layout import (
+    REFINE_STAGE,
+    REFINED_CAMERAS,
+    REFINED_PARAMS,
+    REGISTER_STAGE,
+    REGISTERED_PARAMS,
+    TEMPLATE,
+)
 from pipelines.runs.places import lies_in
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene_digests import capture_digests
-from pipelines.stages.usable import compare_shapes, overlap_of, silhouette_overlap, with_masks, with_params
+from pipelines.stages.usable import (
+    compare_shapes,
+    overlap_of,
+    silhouette_overlap,
+    with_cameras,
+    with_masks,
+    with_params,
+)
 from smplxpp.body import load_body
-from smplxpp.capture import Capture, open_capture
+from smplxpp.capture import Capture, open_capture, read_cameras
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import GeometryWarning, InputError
@@ -103,6 +117,8 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     inputs = of_protocol(run, inputs)
     inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture, train, held_out = open_cameras(inputs)
+    if inputs.params == run / REFINED_PARAMS:
+        capture = _corrected(run, capture)
     if frame not in capture.frames:
         raise InputError(
             f"capture {capture.name}",
@@ -154,6 +170,9 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
     if inputs.params == run / REFINED_PARAMS:
         refuse_seen(run, (REFINE_STAGE,), capture.splits, anew=REFINE_ANEW)
         made = {REFINED_PARAMS: sha256_file(inputs.params)}
+        if (run / REFINED_CAMERAS).is_file():
+            made[REFINED_CAMERAS] = sha256_file(run / REFINED_CAMERAS)
+            capture = _corrected(run, capture)
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)
@@ -182,6 +201,14 @@ def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> Tr
     own_params = inputs.params is not None
     protocol = chosen_protocol(run, inputs.protocol, own_params=own_params, measures=measures)
     return replace(inputs, protocol=protocol)
+
+
+def _corrected(run: Path, capture: Capture) -> Capture:
+    """The capture with the training cameras that the run has corrected, if it has."""
+    file = run / REFINED_CAMERAS
+    if not file.is_file():
+        return capture
+    return with_cameras(capture, {camera.name: camera.cam_from_world for camera in read_cameras(file)})
 
 
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from avatar.data.views import View, read_views
 from smplxpp.capture import Capture
@@ -52,6 +54,15 @@ def silhouette_overlap(posed: TriangleMesh, views: list[View]) -> float:
             remedy="check --frame and --params, and that cameras and template share one world",
         )
     return mean
+
+
+def with_cameras(capture: Capture, poses: Mapping[str, Float[np.ndarray, "4 4"]]) -> Capture:
+    """The capture with other `cam_from_world` of some of its cameras; what is not among them stays."""
+    cameras = {
+        name: replace(camera, cam_from_world=poses[name]) if name in poses else camera
+        for name, camera in capture.recording.cameras.items()
+    }
+    return replace(capture, recording=replace(capture.recording, cameras=cameras))
 
 
 def with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:

@@ -10,23 +10,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar.training.refinement.config import RefineConfig
 from pipelines.cli import main
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
+from pipelines.runs.layout import REFINED_CAMERAS, REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.refine import wants_refinement
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_params
+from smplxpp.capture import read_cameras
 from smplxpp.core.errors import InputError
 from tests.dolls.gesturing import FRAMES, NOVEL_POSES, disturbed, doll, gestures, write_gestures
 from tests.training.refinement.test_refine import QUICK
 
 
+def quick(seed: int = 0, cameras: bool = False) -> RefineConfig:
+    return replace(QUICK, seed=seed, cameras=cameras)
+
+
 @pytest.fixture(autouse=True)
 def few_gaussians(monkeypatch):
-    monkeypatch.setattr("avatar.training.refinement.config.RefineConfig", lambda seed=0: replace(QUICK, seed=seed))
+    monkeypatch.setattr("avatar.training.refinement.config.RefineConfig", quick)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +56,7 @@ def refine(run: Path, capture: Path, *options: str) -> int:
 def refined(capture, tmp_path_factory):
     run = doll().write_run(tmp_path_factory.mktemp("runs") / "gestures")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("avatar.training.refinement.config.RefineConfig", lambda seed=0: replace(QUICK, seed=seed))
+        patch.setattr("avatar.training.refinement.config.RefineConfig", quick)
         assert refine(run, capture) == 0  # the capture says that these are tracked
     return run
 
@@ -89,6 +95,28 @@ def test_what_comes_after_takes_the_refined_ones(refined, capture):
     assert params_in_use(refined, other) == other and params_in_use(refined, noisy) == refined / REFINED_PARAMS
     with pytest.raises(InputError, match="Ring1"):
         open_scene(refined, TrainInputs(capture, noisy, hold_out=("Ring1",)))
+
+
+def test_corrected_cameras_are_taken_with_the_poses(capture, tmp_path, capsys):
+    run, inputs = doll().write_run(tmp_path / "run"), TrainInputs(capture, capture / "params" / "params_noisy.npz")
+    assert refine(run, capture, "--refine-poses", "off", "--refine-cameras") == 2
+    assert "--refine-poses on" in capsys.readouterr().err
+    assert refine(run, capture, "--refine-cameras") == 0
+    scene, before = open_scene(run, inputs), open_scene(run, inputs, refined=False)
+    corrected = {camera.name: camera for camera in read_cameras(run / REFINED_CAMERAS)}
+    splits = scene.capture.splits
+    assert set(corrected) == set(splits.train_cameras) and REFINED_CAMERAS in scene.digests
+    for name, camera in scene.capture.cameras.items():
+        given = before.capture.cameras[name]
+        np.testing.assert_array_equal(camera.K, given.K)
+        if name in corrected:
+            np.testing.assert_allclose(camera.cam_from_world, corrected[name].cam_from_world, atol=1e-12)
+            assert np.abs(camera.cam_from_world - given.cam_from_world).max() > 0
+        else:
+            np.testing.assert_array_equal(camera.cam_from_world, given.cam_from_world)
+    # Without the option they are right again, and nothing stays behind.
+    assert refine(run, capture) == 0
+    assert not (run / REFINED_CAMERAS).exists()
 
 
 def test_registered_parameters_come_before_the_captures_own(tmp_path):
