@@ -53,7 +53,7 @@ class TransferConfig:
 
     falloff: float | None = 6.0
     smoothing: float | None = 0.4
-    normal_doubt: float = 2.0
+    normal_doubt: float = 3.5
     turned: float = 0.04
     confident: float | None = 0.015
     far: tuple[float, float] = (0.039, 0.07)
