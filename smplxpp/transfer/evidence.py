@@ -76,13 +76,13 @@ def lean_on_the_lead(
     (`heard`, a share); and, for a vertex that faces away from the skin nearest to it (`angle`, radians), where less
     than half of it may: hair that lies against a raised arm, a sleeve that hangs beside the chest.
     """
-    away = _step(_angle(angle), *_AWAY) * _step(heard, *_UNHEARD_AWAY)
-    return 1.0 - (1.0 - _step(distance, *far)) * (1.0 - _step(heard, *_UNHEARD)) * (1.0 - away)
+    away = smooth_step(_angle(angle), *_AWAY) * smooth_step(heard, *_UNHEARD_AWAY)
+    return 1.0 - (1.0 - smooth_step(distance, *far)) * (1.0 - smooth_step(heard, *_UNHEARD)) * (1.0 - away)
 
 
 def turned_away(angle: Float[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
     """0 to 1: how far a vertex that faces so (radians) against the nearest skin is doubted, however near it lies."""
-    return _step(_angle(angle), *_DOUBTED)
+    return smooth_step(_angle(angle), *_DOUBTED)
 
 
 def speaking(reach: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"]) -> Float64[np.ndarray, "N S"]:
@@ -100,7 +100,7 @@ def _angle(angle: np.ndarray) -> np.ndarray:
     return np.nan_to_num(angle, nan=0.0)
 
 
-def _step(x: np.ndarray, start: float, end: float) -> np.ndarray:
+def smooth_step(x: np.ndarray, start: float, end: float) -> np.ndarray:
     """A smooth step from 0 at `start` to 1 at `end` (either order)."""
     t = np.clip((x - start) / (end - start), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

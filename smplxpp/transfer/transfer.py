@@ -18,6 +18,7 @@ from smplxpp.transfer.evidence import (
     lead,
     lean_on_the_lead,
     neighbouring_joints,
+    smooth_step,
     turned_away,
 )
 from smplxpp.transfer.extend import extend_weights, sample_surface
@@ -27,6 +28,7 @@ from smplxpp.transfer.repair import check_placement, check_source, check_target,
 
 _FACING_LENGTH = 0.02  # of the source's extent: what an opposite normal costs in distance, halved
 _LEAST_KEPT = 1e-3  # of a row
+_OFF_THE_SKIN = (0.01, 0.025)  # of the source's extent: between these the published method comes to have its share
 
 
 def transfer_weights(
@@ -96,6 +98,11 @@ def transfer_weights(
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
     dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, size, config)
+    if config.published:
+        answer = _published(_Matches(target, normals, found, component, matched), source, weights, size, config)
+        share = config.published * smooth_step(found.distance, *(k * size for k in _OFF_THE_SKIN))
+        share[settled | components_without(component, matched)] = 0.0
+        dense += share[:, None] * (answer - dense)
     return SkinWeights.from_dense(
         dense,
         max_influences=config.max_influences,
@@ -156,6 +163,16 @@ def _values(
         values = np.where(alone[:, None] & (total > _LEAST_KEPT), kept / np.maximum(total, _LEAST_KEPT), values)
     out = np.zeros((len(values), joint_count))
     out[:, used] = values
+    return out
+
+
+def _published(
+    at: _Matches, source: TriangleMesh, weights: np.ndarray, size: float, config: TransferConfig
+) -> np.ndarray:
+    """The published method's answer (N, J), with `at.confident` all that is matched."""
+    used = np.flatnonzero(weights.any(axis=0))
+    out = np.zeros((at.target.vertex_count, weights.shape[1]))
+    out[:, used] = _lead(at, at.found.interpolate(source, weights[:, used]), config.length_scale * size, config)
     return out
 
 
