@@ -146,6 +146,24 @@ def test_a_forbidden_limb_is_never_followed(body, skirt):
     assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
 
 
+def test_the_published_answer_has_its_share_off_the_skin_alone(body, skirt):
+    mesh, weights = body
+    near = closest_points(mesh, skirt).distance < 0.01 * extent(mesh)
+    far = closest_points(mesh, skirt).distance > 0.025 * extent(mesh)
+    assert near.any() and far.any()
+    none, half, whole = (
+        transfer_weights(mesh, weights, skirt, config=TransferConfig(published=share, max_influences=None)).dense()
+        for share in (0.0, 0.5, 1.0)
+    )
+    published = transfer_weights(mesh, weights, skirt, config=replace(TransferConfig.paper(), max_influences=None))
+    np.testing.assert_allclose(whole[near], none[near], atol=1e-12)
+    np.testing.assert_allclose(half, 0.5 * (none + whole), atol=1e-9)
+    apart = np.abs(whole - published.dense())[far]
+    assert apart.mean() < 0.1 * np.abs(none - published.dense())[far].mean() + 1e-3
+    with pytest.raises(InputError, match="published"):
+        TransferConfig(published=1.5)
+
+
 def test_a_confident_match_keeps_its_joints_whatever_is_allowed(body):
     """A close stocking on the left leg keeps `left`, although only hips and the other leg are allowed."""
     mesh, weights = body
