@@ -59,7 +59,7 @@ class TransferConfig:
     turned: float = 0.04
     confident: float | None = 0.015
     far: tuple[float, float] = (0.045, 0.08)
-    lead_length: float = 0.07
+    lead_length: float = 0.06
     published: float = 0.35
     allowed_joints: tuple[str | int, ...] | None = None
     unmatched: str = "extend"
