@@ -102,6 +102,12 @@ def transfer_weights(
         answer = _published(_Matches(target, normals, found, component, matched), source, weights, size, config)
         share = config.published * smooth_step(found.distance, *(k * size for k in _OFF_THE_SKIN))
         share[settled | components_without(component, matched)] = 0.0
+        if allowed is not None:
+            # What the label excludes and nothing here follows stays out: a skirt does not take a third of the hand.
+            answer = np.where(allowed | (dense > _LEAST_KEPT), answer, 0.0)
+            total = answer.sum(axis=1)
+            share[total <= _LEAST_KEPT] = 0.0
+            answer /= np.maximum(total, _LEAST_KEPT)[:, None]
         dense += share[:, None] * (answer - dense)
     return SkinWeights.from_dense(
         dense,

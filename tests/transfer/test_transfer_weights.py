@@ -164,6 +164,18 @@ def test_the_published_answer_has_its_share_off_the_skin_alone(body, skirt):
         TransferConfig(published=1.5)
 
 
+def test_the_published_share_follows_no_forbidden_limb(body):
+    """A wide skirt has the hand inside, which faces as it does: the published answer alone follows it."""
+    mesh, weights = body
+    wide = tube(0.33, 0.1, 0.95, around=48)
+    free = transfer_weights(mesh, weights, wide, config=TransferConfig.paper()).dense()
+    assert free[:, 3].max() > 0.5
+    config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES, published=1.0)
+    dense = transfer_weights(mesh, weights, wide, config=config).dense()
+    assert dense[:, 3].max() < 1e-3
+    np.testing.assert_allclose(dense.sum(axis=1), 1, atol=1e-12)
+
+
 def test_a_confident_match_keeps_its_joints_whatever_is_allowed(body):
     """A close stocking on the left leg keeps `left`, although only hips and the other leg are allowed."""
     mesh, weights = body
