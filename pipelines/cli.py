@@ -17,6 +17,7 @@ from rich.logging import RichHandler
 from rich.table import Table
 from rich.text import Text
 
+from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.json_values import jsonable
 
@@ -87,9 +88,26 @@ USER_ERROR, INTERRUPTED = 2, 130
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one subcommand; return the exit status (0, 2 for the user's errors, 1 for failed gates)."""
+    """Run one subcommand.
+
+    Returns:
+        The exit status: 0, 1 for failed gates, 2 for the user's errors and the system's, 130 after an interrupt, 141
+        when nobody reads the output any more.
+    """
     args = list(sys.argv[1:] if argv is None else argv)
-    console = Console(stderr=True)
+    with standard_streams():
+        console = Console(stderr=True)
+        try:
+            try:
+                return _answer(args, console)
+            finally:
+                sys.stdout.flush()  # what it refuses is told here, not at the interpreter's end
+        except OutputError as error:
+            return end_of_output(error, console)
+
+
+def _answer(args: list[str], console: Console) -> int:
+    """Find the command that is meant and run it; errors come out in words."""
     if not args or args[0] in (*HELP, "help"):
         _print_help()
         return 0
@@ -113,10 +131,12 @@ def main(argv: list[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _run(name, rest)
+    except OutputError:
+        raise
     except (InputError, MissingExtraError, OSError) as error:
+        print_error(error, console)
         if "--json" in rest:
             sys.stdout.write(json.dumps({"error": _error_fields(error)}, indent=1) + "\n")
-        console.print(Text("error: ", style="red") + Text(_in_words(error)), soft_wrap=True)
         return USER_ERROR
     except KeyboardInterrupt:
         console.print("interrupted; every finished stage is kept")
@@ -144,14 +164,7 @@ def _error_fields(error: Exception) -> dict[str, str]:
     fields = {
         name: getattr(error, name) for name in ("subject", "expected", "received", "remedy") if hasattr(error, name)
     }
-    return {"type": type(error).__name__, "message": _in_words(error), **fields}
-
-
-def _in_words(error: Exception) -> str:
-    """Word an error; what the system refused (a full disk, no permission) with the file that it is about."""
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return str(error)
+    return {"type": type(error).__name__, "message": error_in_words(error), **fields}
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipelines.captures.convert_views import ViewWriter
+from pipelines.captures.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture import Capture
 from smplxpp.capture.meshes import PosedTopology
 from smplxpp.capture.writers.arrays import save_params_by_row
@@ -93,22 +93,55 @@ def convert_capture(
 
     Raises:
         InputError: cameras or frames that the capture does not have, or a folder with something else in it.
+        OSError: the system refused a file, as on a full disk; its notes say how far the conversion came.
     """
     config = config or ConvertConfig()
     cameras, frames = _chosen(capture, config)
     out = Path(out).absolute()
     _claim(capture, out, config)
     source = capture if config.scale == 1.0 else capture.resized(config.scale)
-    root = out if config.layout == "simple" else out / "1x"
-    writer = ViewWriter(source, root, config.layout, config.quality)
     views = source.views(cameras, frames)
-    outcomes = []
+    outcomes: list[ViewOutcome] = []
+    try:
+        _write_views(source, views, outcomes, out, config, progress)
+        left_out = [outcome.problem for outcome in outcomes if outcome.problem]
+        left_out += _write_rest(capture, source, out, (cameras, frames), config)
+    except OSError as error:
+        error.add_note(
+            f"{out} holds {len(outcomes)} of {len(views)} views and is no capture yet: the same command goes on there."
+        )
+        raise
+    copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))
+    done = sum(not outcome.problem for outcome in outcomes)
+    return Conversion(out, done, copied, encoded, kept, tuple(left_out))
+
+
+def _write_views(
+    source: Capture,
+    views: Sequence[tuple[str, int]],
+    outcomes: list[ViewOutcome],
+    out: Path,
+    config: ConvertConfig,
+    progress: Progress,
+) -> None:
+    """Write the views in parallel; `outcomes` takes what was done, also before an error ends it."""
+    writer = ViewWriter(source, _root(out, config), config.layout, config.quality)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for outcome in pool.map(writer.write, *zip(*views, strict=True)) if views else ():
-            outcomes.append(outcome)
-            progress(len(outcomes), len(views))
-    left_out = [outcome.problem for outcome in outcomes if outcome.problem]
-    left_out += _write_params(capture, out, frames, config)
+        try:
+            for outcome in pool.map(writer.write, *zip(*views, strict=True)) if views else ():
+                outcomes.append(outcome)
+                progress(len(outcomes), len(views))
+        except OSError:
+            pool.shutdown(cancel_futures=True)  # a full disk stays full
+            raise
+
+
+def _write_rest(
+    capture: Capture, source: Capture, out: Path, chosen: tuple[list[str], list[int]], config: ConvertConfig
+) -> list[str]:
+    """Write what is no view, cameras and description last; return words about what cannot be read."""
+    cameras, frames = chosen
+    left_out = _write_params(capture, out, frames, config)
     if config.layout == "simple":
         _write_geometry(capture, out, frames)
         left_out += _write_keypoints(source, out, cameras, frames)
@@ -116,10 +149,14 @@ def convert_capture(
         splits = source.splits.restricted(cameras, frames)
         write_description(out / "capture.json", source.recording, splits, frames)
     else:
-        write_calibration_csv(root / "calibration.csv", [RigCamera(source.cameras[c], "body", False) for c in cameras])
-    copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))
-    done = sum(not outcome.problem for outcome in outcomes)
-    return Conversion(out, done, copied, encoded, kept, tuple(left_out))
+        rig = [RigCamera(source.cameras[c], "body", False) for c in cameras]
+        write_calibration_csv(_root(out, config) / "calibration.csv", rig)
+    return left_out
+
+
+def _root(out: Path, config: ConvertConfig) -> Path:
+    """Return the folder of the views' files."""
+    return out if config.layout == "simple" else out / "1x"
 
 
 def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[int]]:

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import signal
+import subprocess
+import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +18,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import encode_png
-from smplxpp.core.atomic import atomic_folder, atomic_path
+from smplxpp.core.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from smplxpp.core.errors import MissingExtraError
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
@@ -25,6 +33,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps:
 
     Raises:
         MissingExtraError: MP4 without imageio-ffmpeg.
+        OSError: the film could not be written whole.
     """
     writer = {".mp4": _write_mp4, ".gif": _write_gif, FRAME_FOLDER: _write_folder}[path.suffix.lower()]
     writer(path, frames, fps, size)
@@ -35,31 +44,55 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple
         import imageio_ffmpeg
     except ImportError:
         raise MissingExtraError("imageio-ffmpeg", extra="video", purpose="writing MP4") from None
-    with atomic_path(path) as temporary:
-        encoder = imageio_ffmpeg.write_frames(
-            str(temporary),
-            size,
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            pix_fmt_out="yuv420p",
-            output_params=["-crf", "18", "-preset", "medium", "-movflags", "+faststart"],
-        )
-        encoder.send(None)
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    with atomic_path(path) as temporary, tempfile.TemporaryFile() as said:
+        encoder = subprocess.Popen(_encoding(program, temporary, fps, size), stdin=subprocess.PIPE, stderr=said)
+        count = 0
+        assert encoder.stdin is not None  # a pipe was asked for
         try:
             for frame in frames:
-                encoder.send(np.ascontiguousarray(frame))
+                encoder.stdin.write(np.ascontiguousarray(frame).data)
+                count += 1
+            encoder.stdin.close()
+        except BrokenPipeError:  # it ended: its status and words say why
+            with suppress(BrokenPipeError):
+                encoder.stdin.close()  # of what it had not taken yet
+        except BaseException:
+            encoder.kill()
+            raise
         finally:
-            encoder.close()
+            encoder.wait()
+        said.seek(0)
+        words = said.read().decode(errors="replace")
+        # An encoder whose disk is full may end with 0: what counts is the film.
+        if encoder.returncode or imageio_ffmpeg.count_frames_and_secs(str(temporary))[0] != count:
+            raise _encoder_error(encoder.returncode, words)
+
+
+def _encoding(program: str, path: Path, fps: float, size: tuple[int, int]) -> list[str]:
+    """Return the command that reads RGB frames and writes H.264 with 4:2:0 colour, which every player takes."""
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}"]
+    raw += ["-r", str(Fraction(fps).limit_denominator())]
+    codec = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "medium", "-movflags", "+faststart"]
+    return [program, "-nostdin", "-y", "-v", "error", *raw, "-i", "pipe:0", "-an", *codec, str(path)]
+
+
+def _encoder_error(status: int, words: str) -> OSError:
+    """Make the error of an encoder that did not write its film, with the system's number where its words tell it."""
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
+        if os.strerror(number) in words or (number == errno.EFBIG and status == -signal.SIGXFSZ):
+            return OSError(number, os.strerror(number))
+    last = (words.strip().splitlines() or ["it says nothing"])[-1]
+    return OSError(f"ffmpeg did not write the whole film (status {status}): {last}")
 
 
 def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple[int, int]) -> None:
     images = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
-    with atomic_path(path) as temporary:
-        # GIF counts in hundredths of a second, and viewers slow down below two of them.
-        duration = max(20, 10 * round(100 / fps))
-        images[0].save(temporary, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
+    # GIF counts in hundredths of a second, and viewers slow down below two of them.
+    duration = max(20, 10 * round(100 / fps))
+    film = io.BytesIO()  # Pillow does not see when a disk takes a part of what it writes
+    images[0].save(film, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
+    atomic_write_bytes(path, film.getvalue())
 
 
 def _write_folder(path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple[int, int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -26,6 +27,7 @@ from tests.capture.writers import (
     write_neus2,
     write_simple,
 )
+from tests.full_disk import file_size_limit
 
 
 def rays(capture: Capture) -> np.ndarray:
@@ -278,3 +280,31 @@ def test_folders_that_hold_something_else_are_refused(tmp_path):
     with pytest.raises(InputError, match="with other cameras, scale stands"):
         convert_capture(source, tmp_path / "new", ConvertConfig(scale=0.5))
     shutil.rmtree(tmp_path / "new")
+
+
+def test_a_disk_that_fills_is_told_with_what_there_is_and_the_conversion_goes_on(tmp_path, capsys):
+    rig = write_simple(make_scene(), tmp_path / "rig")
+    sizes = sorted(path.stat().st_size for path in (rig / "rgbs").rglob("*.jpg"))
+    command = ["capture", "convert", str(rig), "--out", str(tmp_path / "new"), "--json"]
+    with file_size_limit(sizes[-1] - 1):
+        assert main(command) == 2
+    error = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "File too large" in error and str(tmp_path / "new" / "rgbs") in error and "the same command goes on" in error
+    assert not (tmp_path / "new" / "cameras.json").exists() and not list((tmp_path / "new").rglob(".*"))
+    assert main(command) == 0
+    assert open_capture(tmp_path / "new").views() == open_capture(rig).views()
+
+
+def test_a_file_that_the_system_does_not_give_spoils_its_view_alone(tmp_path, monkeypatch):
+    source = open_capture(write_simple(make_scene(), tmp_path / "rig"))
+    spoilt, read = source.file("A", 1), Path.read_bytes
+
+    def refused(path: Path) -> bytes:
+        if path == spoilt:
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return read(path)
+
+    source.image("A", 1)  # decoded and kept: what fails is the copy
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    done = convert_capture(source, tmp_path / "new")
+    assert done.views == 5 and len(done.left_out) == 1 and "Input/output error" in done.left_out[0]

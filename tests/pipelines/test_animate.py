@@ -16,6 +16,7 @@ from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.template.template import Template
+from tests.full_disk import file_size_limit
 
 FRAMES = 4
 LEFT_SHOULDER = 15  # index among the 21 joints of body_pose
@@ -123,6 +124,30 @@ def test_gif_has_the_time_of_the_parameters(run, tmp_path):
     with Image.open(tmp_path / "wave.gif") as film:
         assert film.n_frames == 2 and film.info["duration"] == 200
     assert result["fps"] == 5
+
+
+@pytest.mark.parametrize("name", ["wave.mp4", "wave.gif", "wave.glb", "pictures"])
+def test_a_film_that_the_disk_does_not_take_is_no_film(name, run, params, tmp_path, capsys):
+    if name.endswith(".mp4"):
+        pytest.importorskip("imageio_ffmpeg")
+    before = set(tmp_path.rglob("*"))
+    with file_size_limit(1000):
+        status = main(
+            ["animate", str(run), "--params", str(params), "-o", str(tmp_path / name), "--height", "120", "--json"]
+        )
+    captured = capsys.readouterr()
+    assert status == 2 and "File too large" in captured.err and "ulimit" in captured.err and name in captured.err
+    assert json.loads(captured.out)["error"]["type"] == "OSError"
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_an_encoder_that_loses_frames_is_found_out(run, params, tmp_path, monkeypatch):
+    """As one whose disk is full may do, and end with 0."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr(ffmpeg, "count_frames_and_secs", lambda path: (FRAMES - 1, 0.0))
+    with pytest.raises(OSError, match="whole film"):
+        Animate(run, params, tmp_path / "wave.mp4", height=60, json=True).run()
+    assert not (tmp_path / "wave.mp4").exists()
 
 
 def test_mp4_without_its_extra(run, params, tmp_path, monkeypatch):

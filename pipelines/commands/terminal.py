@@ -1,0 +1,137 @@
+"""The standard streams of a command, and errors of the operating system in words."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.console import Console
+from rich.text import Text
+
+STDOUT = "standard output"
+CLOSED_PIPE = 128 + 13
+"""Status of a command whose output nobody reads any more, as the shell gives it to one that SIGPIPE ended."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_REMEDIES = {
+    errno.ENOSPC: "free some space or name a place on another disk; nothing half-written was kept",
+    errno.EDQUOT: "your quota is used up: delete something or name another place; nothing half-written was kept",
+    errno.EFBIG: "files may not grow as large here: see `ulimit -f` and the kind of file system; nothing half-written "
+    "was kept",
+    errno.EROFS: "name a place that can be written",
+    errno.EACCES: "see its permissions and those of its folder, or name another place",
+    errno.EPERM: "see its permissions and those of its folder, or name another place",
+    errno.ENAMETOOLONG: "shorten the name",
+    errno.EIO: "the disk or the network does not answer as it should: see the system's log, try another disk",
+    errno.ESTALE: "the network's file system has lost it: open the folder anew",
+    errno.EMFILE: "raise the number of open files: `ulimit -n 4096`",
+    errno.ENFILE: "end other programs: the system has too many files open",
+    errno.ELOOP: "a link points to itself: name the file that is meant",
+    errno.EEXIST: "name another place",
+    errno.ENOTDIR: "a part of the path is a file: name another place",
+    errno.EISDIR: "name a file",
+}
+
+
+class OutputError(OSError):
+    """Standard output takes no more; a type of its own, so that nobody takes it for the trouble of a file."""
+
+
+class _Stream:
+    """A text stream whose failures are `OutputError`; or which swallows them, where there is nobody to tell."""
+
+    def __init__(self, stream: TextIO, *, silent: bool) -> None:
+        self._stream, self._silent = stream, silent
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with self._named():
+            self._stream.write(text)
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        with self._named():
+            self._stream.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            _redirect_to_nothing(self._stream)
+            if not self._silent:
+                raise OutputError(error.errno, error.strerror, STDOUT) from None
+
+
+@contextmanager
+def standard_streams() -> Iterator[None]:
+    """Guard the standard streams of a command.
+
+    Letters that their encoding lacks are written as escapes. A stream that fails is given up: standard output with an
+    `OutputError`, standard error silently, as its failing cannot be told. What is not open takes everything.
+    """
+    with open(os.devnull, "w") as nothing:
+        out, err = sys.stdout or nothing, sys.stderr or nothing
+        for stream in (out, err):
+            with suppress(AttributeError, ValueError, OSError):  # a stream of its own kind, or one already detached
+                stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+        with (
+            redirect_stdout(_Stream(out, silent=False)),
+            redirect_stderr(_Stream(err, silent=True)),
+        ):
+            yield
+
+
+def end_of_output(error: OutputError, console: Console) -> int:
+    """Say that standard output takes no more, unless nobody reads it; return the exit status."""
+    if error.errno == errno.EPIPE:
+        return CLOSED_PIPE
+    print_error(error, console)
+    return 2
+
+
+def print_error(error: Exception, console: Console) -> None:
+    """Print an error in words, on one line however long."""
+    line = " ".join(error_in_words(error).split())
+    console.print(Text("error: ", style="red") + Text(line), soft_wrap=True)
+
+
+def error_in_words(error: Exception) -> str:
+    """Word an error; what the system refused with the file that it is about, what is free there and what helps."""
+    words = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        place = "" if error.filename is None else os.fsdecode(error.filename)
+        words = f"{place}: {error.strerror}" if place else error.strerror
+        if error.errno in _FULL and place != STDOUT:
+            words += _free_space(Path(place))
+        remedy = "" if place == STDOUT else _REMEDIES.get(error.errno or 0, "")
+        words += f". {remedy[:1].upper()}{remedy[1:]}." if remedy else ""
+    return " ".join([words, *getattr(error, "__notes__", ())])
+
+
+def _free_space(path: Path) -> str:
+    folder = next((p for p in (path, *path.parents) if p.is_dir()), Path())
+    try:
+        return f" ({shutil.disk_usage(folder).free / 1e6:.1f} MB are free there)"
+    except OSError:
+        return ""
+
+
+def _redirect_to_nothing(stream: TextIO) -> None:
+    """Let the file of a stream take everything: what it still holds would fail again at the interpreter's end."""
+    with suppress(OSError, ValueError, AttributeError):  # one without a file has nothing to lose
+        descriptor = stream.fileno()
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, descriptor)
+        os.close(nothing)

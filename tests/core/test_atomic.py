@@ -1,0 +1,42 @@
+"""Files and folders that appear whole or not at all: what the system's errors name."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from smplxpp.core.atomic import atomic_folder, atomic_path, atomic_write_bytes
+from tests.full_disk import file_size_limit
+
+
+def test_an_error_names_the_file_that_was_wanted_and_leaves_the_old(tmp_path):
+    path = tmp_path / "result.bin"
+    path.write_bytes(b"old")
+    with file_size_limit(1000), pytest.raises(OSError) as caught:
+        atomic_write_bytes(path, b"x" * 5000)
+    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["result.bin"]
+
+
+def test_a_file_in_a_folder_is_named_where_it_would_have_been(tmp_path):
+    with file_size_limit(1000), pytest.raises(OSError) as caught, atomic_folder(tmp_path / "stage") as folder:
+        atomic_write_bytes(folder / "weights.npz", b"x" * 5000)
+    assert caught.value.filename == str(tmp_path / "stage" / "weights.npz") and os.listdir(tmp_path) == []
+
+
+def test_a_name_that_is_too_long_is_the_wanted_one(tmp_path):
+    path = tmp_path / f"{'n' * 250}.npz"
+    with pytest.raises(OSError) as caught:
+        atomic_write_bytes(path, b"")
+    assert caught.value.filename == str(path)
+
+
+def test_errors_about_other_files_keep_their_names(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, atomic_path(tmp_path / "a"):
+        (tmp_path / "other").read_bytes()
+    assert caught.value.filename == str(tmp_path / "other")
+    with pytest.raises(OSError) as nameless, atomic_path(tmp_path / "a"):
+        raise OSError(errno.ECONNRESET, "reset")
+    assert nameless.value.filename is None
