@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from dataclasses import replace
@@ -15,6 +14,7 @@ from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise
 from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.safe_pickle import safe_load, safe_npz
@@ -160,12 +160,7 @@ def _content(path: Path) -> Any:
         return safe_load(path)
     if suffix != ".json":
         raise InputError(f"file {path}", expected=f"one of {', '.join(_SUFFIXES)}", received=f"suffix {suffix!r}")
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"file {path}", expected="a readable file", received=error.strerror or str(error)) from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"file {path}", expected="JSON", received=str(error)) from error
+    return read_json(path)
 
 
 def _frame_files(path: Path) -> list[Path]:

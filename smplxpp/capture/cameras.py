@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.readers.common import inverted, pinhole
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.rotations import matrix_from_rotvec
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
@@ -59,7 +59,7 @@ def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
 
 
 def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
-    content = json.loads(path.read_text())
+    content = read_json(path)
     lenses = []
     for entry in content["cameras"] if isinstance(content, dict) else content:
         name = str(entry["name"])

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smplxpp.core.array_file import read_array
 from smplxpp.core.errors import InputError
+from smplxpp.core.image_file import open_image
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -17,13 +19,13 @@ _REMEDY = "copy the file anew from its source, or remove it: the frame is then l
 
 def read_color(path: Path) -> Image:
     """An RGB image of 8 bits a channel; an alpha channel is dropped, not applied."""
-    image = _read(path)
+    image = open_image(path, remedy=_REMEDY)
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
 def read_alpha(path: Path) -> Image:
     """An 8-bit mask ("L"): the alpha channel where the file has one (mattes, cut-outs), else its brightness."""
-    image = _read(path)
+    image = open_image(path, remedy=_REMEDY)
     if image.mode in ("RGBA", "LA", "PA"):
         return image.getchannel("A")
     if image.mode.startswith("I"):
@@ -36,7 +38,7 @@ def read_labels(path: Path) -> Image:
     """An index map ("L"): the values of a grey or palette image, or of an integer `.npy`."""
     if path.suffix.lower() == ".npy":
         return _from_array(_read_npy_labels(path))
-    image = _read(path)
+    image = open_image(path, remedy=_REMEDY)
     if image.mode not in ("L", "P", "1"):
         raise InputError(
             f"label map {path}",
@@ -48,7 +50,7 @@ def read_labels(path: Path) -> Image:
 
 def read_normals(path: Path) -> tuple[Image, bool]:
     """An RGB image of encoded normals, and whether the file has 16 bits a channel (Pillow gives the upper 8)."""
-    image = _read(path)
+    image = open_image(path, remedy=_REMEDY)
     return image.convert("RGB"), "16" in image.info["raw_mode"]
 
 
@@ -68,25 +70,8 @@ def check_size(image: Image, path: Path, size: tuple[int, int], *, of: str) -> I
     return image
 
 
-def _read(path: Path) -> Image:
-    import PIL.Image
-
-    try:
-        with PIL.Image.open(path) as image:
-            image.info["raw_mode"] = str(image.tile[0][3]) if image.tile else ""
-            image.load()
-            return image
-    except FileNotFoundError:
-        raise InputError(f"image file {path}", expected="an existing file", received="none") from None
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
-        raise InputError(f"image file {path}", expected="a whole image", received=f"{error}", remedy=_REMEDY) from None
-
-
 def _read_npy_labels(path: Path) -> np.ndarray:
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"label map {path}", expected="an integer array", received=str(error)) from None
+    values = read_array(path, subject="label map", remedy=_REMEDY)
     if values.ndim != 2 or values.dtype.kind not in "iub" or values.min(initial=0) < 0 or values.max(initial=0) > 255:
         raise InputError(
             f"label map {path}",

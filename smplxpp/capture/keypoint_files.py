@@ -5,7 +5,6 @@ One file of all frames or a folder with a file a frame; docs/captures.md says wh
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from smplxpp.capture.keypoint_people import (
     openpose_people,
 )
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.safe_pickle import safe_npz
 from smplxpp.core.validation import require_choice
@@ -147,9 +147,9 @@ def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
         frames = {}
         files = {_last_number(p): p for p in sorted(path.iterdir()) if p.suffix.lower() == ".json"}
         for number in sorted(files):
-            frames.update(_frames(_json(files[number]), number, options, source=f"file {files[number]}"))
+            frames.update(_frames(read_json(files[number]), number, options, source=f"file {files[number]}"))
     elif path.is_file():
-        frames = dict(_frames(_json(path), 0, options, source=f"file {path}"))
+        frames = dict(_frames(read_json(path), 0, options, source=f"file {path}"))
     else:
         frames = {}
     if not frames:
@@ -264,13 +264,6 @@ def _mediapipe_arrays(
         own = {name: values[row] for name, values in have.items()}
         person = mediapipe_person(own, size=options.size, normalised=normalised, source=f"file {path}")
         yield int(number), [person]
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"file {path}", expected="JSON", received=str(error)) from None
 
 
 def _last_number(path: Path) -> int:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from smplxpp.capture.readers.common import read_json
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 
 DESCRIPTIONS = ("capture.json", "manifest.json")
 """Files that describe a capture of our layout: written by hand, or by the tool that made it. The first counts."""

@@ -17,7 +17,6 @@ Where their classes are finer or other than ours:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ import numpy as np
 from jaxtyping import Int64, Num
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
 
 _OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
@@ -166,7 +166,7 @@ def find_label_set(name: str | Path | LabelSet) -> LabelSet:
         )
     expected = f"a mapping of integers to names among {', '.join(_OURS)}"
     try:
-        mapping = json.loads(path.read_text())
+        mapping = read_json(path)
         classes = tuple(sorted((int(number), str(ours), ours) for number, ours in mapping.items()))
     except (ValueError, AttributeError) as error:
         raise InputError(f"label set {path}", expected=expected, received=str(error)) from None

@@ -1,8 +1,7 @@
-"""What readers share: JSON, cameras from their numbers, image files of a camera."""
+"""What readers share: cameras from their numbers, image files of a camera."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,23 +15,14 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import ParamSource
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.image_file import image_size
+from smplxpp.core.json_file import as_integer, as_numbers
+from smplxpp.core.paths import check_name
 
 # Largest deviation of R R^T from the identity: calibrations are written with six digits and more.
 _ROTATION_TOLERANCE = 1e-3
-
-
-def read_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        InputError: missing or broken.
-    """
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"file {path}", expected="a readable file", received=error.strerror or str(error)) from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"file {path}", expected="JSON", received=str(error)) from None
+# Pixels; the largest sensors have 20,000.
+_LONGEST_SIDE = 1 << 16
 
 
 def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_pixels: bool = False) -> Camera:
@@ -46,22 +36,35 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
             so that the principal point moves by half a pixel.
 
     Raises:
-        InputError: wrong counts, not finite, or R not a rotation.
+        InputError: wrong counts, anything but finite numbers, R not a rotation, no focal length, a size no image has,
+            or a name no file can have.
     """
-    try:
-        intrinsics = np.asarray(K, dtype=np.float64)
-        intrinsics = intrinsics[:3, :3] if intrinsics.shape == (4, 4) else intrinsics.reshape(3, 3)
-        rotation, shift = np.asarray(R, np.float64).reshape(3, 3), np.asarray(T, np.float64).reshape(3)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"camera {name!r}", expected="K and R of 9 numbers, T of 3", received=str(error)) from None
-    if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0):
-        raise InputError(f"camera {name!r}: R", expected="a rotation matrix", received=f"{rotation.round(4).tolist()}")
+    subject = f"camera {name[:80]!r}"
+    check_name(name, subject=f"{subject}: name")
+    intrinsics, rotation = as_numbers(K, subject=f"{subject}: K"), as_numbers(R, subject=f"{subject}: R")
+    shift = as_numbers(T, subject=f"{subject}: T")
+    intrinsics = intrinsics[:3, :3] if intrinsics.shape == (4, 4) else intrinsics
+    if (intrinsics.size, rotation.size, shift.size) != (9, 9, 3):
+        received = f"shapes {intrinsics.shape}, {rotation.shape}, {shift.shape}"
+        raise InputError(subject, expected="K and R of 9 numbers, T of 3", received=received)
+    intrinsics, rotation = intrinsics.reshape(3, 3), rotation.reshape(3, 3)
+    if np.abs(rotation).max() > 2 or not (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    ):
+        raise InputError(f"{subject}: R", expected="a rotation matrix", received=f"{rotation.round(4).tolist()}")
+    if not (intrinsics[2, 2] and intrinsics[[0, 1], [0, 1]].min() > 0 and not intrinsics[2, :2].any()):
+        raise InputError(
+            f"{subject}: K",
+            expected="focal lengths above 0 and a last row 0, 0, 1",
+            received=f"{intrinsics.tolist()}",
+        )
+    width, height = (as_integer(side, subject=f"{subject}: size", least=1, most=_LONGEST_SIDE) for side in size)
     K = intrinsics / intrinsics[2, 2]
     if opencv_pixels:
         K[:2, 2] += 0.5
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, shift
-    return Camera(K, pose, int(size[0]), int(size[1]), name=name)
+    pose[:3, :3], pose[:3, 3] = rotation, shift.ravel()
+    return Camera(K, pose, width, height, name=name)
 
 
 def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSource | None:
@@ -72,7 +75,9 @@ def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSourc
 
 def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
     """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix."""
-    matrix = np.asarray(world_from_cam, dtype=np.float64)
+    matrix = as_numbers(world_from_cam, subject="camera-to-world matrix")
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise InputError("camera-to-world matrix", expected="shape (4, 4) or (3, 4)", received=f"{matrix.shape}")
     rotation = matrix[:3, :3].T
     return rotation, -rotation @ matrix[:3, 3]
 
@@ -81,21 +86,6 @@ def numbered_images(folders: Mapping[str, Path]) -> dict[str, FileSeries]:
     """Find each camera's images in its folder whose names are numbers; cameras without any are left out."""
     found = {name: FileSeries.find(folder, image_name()) for name, folder in folders.items()}
     return {name: series for name, series in found.items() if len(series)}
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, from its header.
-
-    Raises:
-        InputError: not an image.
-    """
-    import PIL.Image
-
-    try:
-        with PIL.Image.open(path) as image:
-            return image.size
-    except OSError as error:
-        raise InputError(f"image file {path}", expected="an image", received=str(error)) from None
 
 
 def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int, int]:

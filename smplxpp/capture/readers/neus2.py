@@ -13,12 +13,13 @@ import numpy as np
 
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
-from smplxpp.capture.readers.common import chosen_params, inverted, pinhole, read_json, required
+from smplxpp.capture.readers.common import chosen_params, inverted, pinhole, required
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 
 NAME = "neus2"
 LOOKS_FOR = "transform*.json, there or in train/ and test/"

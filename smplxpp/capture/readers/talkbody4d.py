@@ -9,11 +9,12 @@ from typing import Any
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries, subfolders
 from smplxpp.capture.params import ParamFiles
-from smplxpp.capture.readers.common import chosen_params, numbered_images, pinhole, read_json, required
+from smplxpp.capture.readers.common import chosen_params, numbered_images, pinhole, required
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 
 NAME = "talkbody4d"
 LOOKS_FOR = "a JSON file with `cameras` and `camera_poses`, beside a folder with a folder of images for each camera"

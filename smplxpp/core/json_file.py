@@ -1,0 +1,197 @@
+"""The one door for JSON: files and texts of bounded size and depth, and their values by type."""
+
+from __future__ import annotations
+
+import json
+import math
+import numbers
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.paths import regular_file
+
+# Keypoints of a long film in one file have some hundred megabytes; nothing that we read nests deeper than ten levels.
+_MOST_BYTES, _MOST_LEVELS = 1 << 30, 64
+# Escapes that can stand for no character of a file's name: NUL, and halves of a surrogate pair.
+_DOUBTFUL_ESCAPE = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])")
+
+
+def read_json(path: str | Path, *, subject: str = "file", remedy: str = "") -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: missing, no regular file, too large, or what `parse_json` refuses.
+    """
+    path = regular_file(path, subject=subject, remedy=remedy)
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= _MOST_BYTES else b""
+    except OSError as error:
+        raise InputError(
+            f"{subject} {path}", expected="a readable file", received=error.strerror or str(error), remedy=remedy
+        ) from None
+    if size > _MOST_BYTES:
+        raise InputError(
+            f"{subject} {path}", expected=f"at most {_MOST_BYTES} bytes", received=f"{size}", remedy=remedy
+        )
+    return parse_json(data, subject=f"{subject} {path}", remedy=remedy)
+
+
+def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        InputError: broken JSON, more than 64 levels, integers of thousands of digits, or texts with a NUL or half a
+            character in them, which no file can be called by.
+    """
+    try:
+        value = json.loads(data)
+    except RecursionError:
+        raise InputError(
+            subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy
+        ) from None
+    except ValueError as error:  # broken JSON, broken UTF-8, and integers beyond Python's limit of digits
+        raise InputError(subject, expected="JSON", received=str(error)[:200], remedy=remedy) from None
+    if _levels(value) > _MOST_LEVELS:
+        raise InputError(subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy)
+    raw = data if isinstance(data, bytes) else data.encode(errors="surrogatepass")
+    if (_DOUBTFUL_ESCAPE.search(raw) or b"\0" in raw) and not _all_text_usable(value):
+        raise InputError(
+            subject, expected="text of whole characters", received="a NUL or half a character", remedy=remedy
+        )
+    return value
+
+
+def as_object(value: Any, *, subject: str) -> dict[str, Any]:
+    """The value, if it is a JSON object."""
+    return _of_type(value, dict, "an object {...}", subject)
+
+
+def as_list(value: Any, *, subject: str) -> list[Any]:
+    """The value, if it is a JSON list."""
+    return _of_type(value, list, "a list [...]", subject)
+
+
+def as_text(value: Any, *, subject: str) -> str:
+    """The value, if it is a text."""
+    return _of_type(value, str, "a text", subject)
+
+
+def as_number(value: Any, *, subject: str, least: float = -math.inf, most: float = math.inf) -> float:
+    """The value as a float, if it is a finite number within bounds; true and false are no numbers.
+
+    Raises:
+        InputError: anything else.
+    """
+    try:
+        number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not (math.isfinite(number) and least <= number <= most):
+        bounds = "" if (least, most) == (-math.inf, math.inf) else f" from {least:g} to {most:g}"
+        raise InputError(subject, expected=f"a finite number{bounds}", received=shown(value))
+    return number
+
+
+def as_integer(value: Any, *, subject: str, least: int = -(2**53), most: int = 2**53) -> int:
+    """The value as an int, if it is a whole number within bounds; 3.0 is one.
+
+    Raises:
+        InputError: anything else.
+    """
+    whole = (isinstance(value, int) and not isinstance(value, bool)) or (
+        isinstance(value, float) and value.is_integer()
+    )
+    if not (whole and least <= value <= most):
+        raise InputError(subject, expected=f"a whole number from {least} to {most}", received=shown(value))
+    return int(value)
+
+
+def as_numbers(
+    value: Any, shape: tuple[int | None, ...] | None = None, *, subject: str, finite: bool = True
+) -> Float64[np.ndarray, "*n"]:
+    """Nested lists of numbers, or an array of them, as float64.
+
+    Args:
+        value: the lists.
+        shape: that it must have, None for any length; without one any shape passes.
+        subject: what it is, for messages.
+        finite: refuse NaN and infinity.
+
+    Raises:
+        InputError: anything but numbers, lists of unequal lengths, another shape.
+    """
+    array = _number_array(value)
+    wanted = "" if shape is None else f" of shape ({', '.join('any' if n is None else str(n) for n in shape)})"
+    if array is None or (finite and not np.isfinite(array).all()):
+        raise InputError(subject, expected=f"{'finite ' if finite else ''}numbers{wanted}", received=shown(value))
+    if shape is not None and not (
+        array.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
+    ):
+        raise InputError(subject, expected=f"numbers{wanted}", received=f"shape {array.shape}")
+    return array
+
+
+def shown(value: Any) -> str:
+    """A value in a message: its kind, and its beginning where it is short enough to help."""
+    if isinstance(value, dict | list):
+        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
+    if isinstance(value, int) and value.bit_length() > 200:
+        return "an integer of many digits"
+    return repr(value[:80] if isinstance(value, str) else value)[:80]
+
+
+def _of_type(value: Any, kind: type, expected: str, subject: str) -> Any:
+    if not isinstance(value, kind):
+        raise InputError(subject, expected=expected, received=shown(value))
+    return value
+
+
+def _levels(value: Any) -> int:
+    """How many containers lie in each other, up to one more than allowed."""
+    layer = [value] if isinstance(value, dict | list) else []
+    for level in range(_MOST_LEVELS + 1):
+        if not layer:
+            return level
+        layer = [
+            child
+            for container in layer
+            for child in (container.values() if isinstance(container, dict) else container)
+            if isinstance(child, dict | list)
+        ]
+    return _MOST_LEVELS + 1
+
+
+def _all_text_usable(value: Any) -> bool:
+    pending = [value]
+    while pending:
+        item = pending.pop()
+        if isinstance(item, dict):
+            pending += [*item.keys(), *item.values()]
+        elif isinstance(item, list):
+            pending += item
+        elif isinstance(item, str) and ("\0" in item or any("\ud800" <= c <= "\udfff" for c in item)):
+            return False
+    return True
+
+
+def _number_array(value: Any) -> np.ndarray | None:
+    """Nested lists as float64; None where they hold anything but numbers: numpy would read "1" and true as numbers."""
+    pending = [value]
+    while pending:
+        item = pending.pop()
+        if isinstance(item, list | tuple):
+            pending += item
+        elif isinstance(item, np.ndarray):
+            pending += [] if item.dtype.kind in "iuf" else [None]
+        elif isinstance(item, bool) or not isinstance(item, numbers.Real):
+            return None
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # unequal lengths, integers beyond a float
+        return None

@@ -1,0 +1,163 @@
+"""Runs the opcodes of a pickle with a vocabulary of its own: arrays, plain containers, records.
+
+The names in a pickle never become Python objects. They become `Name`s, and what is called is looked up in the table of
+`smplxpp.core.pickle_values`. Containers are only changed by what can stand in a file's data.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from smplxpp.core.pickle_values import (
+    BUILDERS,
+    KNOWN_NAMES,
+    Budget,
+    Dtype,
+    InertObject,
+    Memo,
+    Name,
+    RefusedName,
+    Unbuilt,
+    array_of_state,
+    as_key,
+    broken,
+    exactly,
+    is_recorded,
+)
+from smplxpp.core.unfolding import check_unfolding
+
+# What a file may unfold to, all references followed, beyond so many times its size.
+_FREELY_UNFOLDED, _MOST_UNFOLDING = 1 << 26, 16
+_REFUSED_OPCODES = (
+    pickle.EXT1,
+    pickle.EXT2,
+    pickle.EXT4,
+    pickle.PERSID,
+    pickle.BINPERSID,
+    pickle.NEXT_BUFFER,
+    pickle.READONLY_BUFFER,
+)
+
+
+class PickleMachine(pickle._Unpickler):
+    """Reads one pickle; `load` returns its value.
+
+    Raises (from `load`):
+        RefusedName: a name outside of the table.
+        pickle.UnpicklingError and other standard errors: a broken file.
+    """
+
+    # What the parent, which is private in the standard library's types, keeps.
+    stack: list[Any]
+    append: Callable[[Any], None]
+    pop_mark: Callable[[], list[Any]]
+    memo: dict[int, Any]
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin1")
+        self.memo = Memo()
+        self._budget = Budget(_FREELY_UNFOLDED + _MOST_UNFOLDING * len(data))
+
+    def load(self) -> Any:
+        """The pickle's value."""
+        value = super().load()
+        check_unfolding([value], self._budget.most)
+        return value
+
+    def find_class(self, module: str, name: str) -> Any:
+        """A token for a name: it is never imported."""
+        token = Name(module, name)
+        if token not in KNOWN_NAMES and not is_recorded(token):
+            raise RefusedName(str(token))
+        return token
+
+    def _call(self, token: Any, arguments: Any) -> Any:
+        if not isinstance(token, Name) or not isinstance(arguments, tuple):
+            broken("a call of no name")
+        if is_recorded(token):
+            return InertObject(str(token), arguments)
+        builder = BUILDERS.get(token)
+        if builder is None:
+            raise RefusedName(str(token))
+        return builder(self._budget, *arguments)
+
+    # Opcodes that call something, or change what lies on the stack.
+
+    def load_reduce(self) -> None:
+        arguments = self.stack.pop()
+        self.stack[-1] = self._call(self.stack[-1], arguments)
+
+    def load_newobj_ex(self) -> None:
+        keywords = self.stack.pop()
+        if keywords != {}:
+            broken("a call with keywords")
+        self.load_reduce()
+
+    def _instantiate(self, token: Any, arguments: list[Any]) -> None:
+        """INST and OBJ of old protocols."""
+        self.append(self._call(token, tuple(arguments)))
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        top = self.stack[-1]
+        if isinstance(top, Unbuilt) and top.value is None:
+            top.value = self.stack[-1] = array_of_state(self._budget, state)
+        elif isinstance(top, Dtype):
+            top.order = exactly(exactly(state, tuple)[1], str)
+        elif isinstance(top, InertObject):
+            top.state = state
+        else:
+            broken(f"a state for {type(top).__name__}")
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        self._set_items(items)
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set_items([key, value])
+
+    def load_setitems(self) -> None:
+        self._set_items(self.pop_mark())
+
+    def _set_items(self, items: list[Any]) -> None:
+        target = exactly(self.stack[-1], dict)
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            target[as_key(key)] = value
+
+    def load_append(self) -> None:
+        value = self.stack.pop()
+        exactly(self.stack[-1], list).append(value)
+
+    def load_appends(self) -> None:
+        items = self.pop_mark()
+        exactly(self.stack[-1], list).extend(items)
+
+    def load_additems(self) -> None:
+        items = self.pop_mark()
+        exactly(self.stack[-1], set).update(map(as_key, items))
+
+    def load_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.append(frozenset(map(as_key, items)))
+
+    # The parent's methods by opcode, without those that reach outside: extensions, persistent objects, buffers.
+    dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
+        code: method for code, method in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
+    } | {
+        pickle.REDUCE[0]: load_reduce,
+        pickle.NEWOBJ[0]: load_reduce,
+        pickle.NEWOBJ_EX[0]: load_newobj_ex,
+        pickle.BUILD[0]: load_build,
+        pickle.DICT[0]: load_dict,
+        pickle.SETITEM[0]: load_setitem,
+        pickle.SETITEMS[0]: load_setitems,
+        pickle.APPEND[0]: load_append,
+        pickle.APPENDS[0]: load_appends,
+        pickle.ADDITEMS[0]: load_additems,
+        pickle.FROZENSET[0]: load_frozenset,
+    }
