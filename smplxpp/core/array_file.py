@@ -185,7 +185,7 @@ def _check_unpacking(unpacked: int, packed: int) -> None:
 
 def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectReader | None) -> Any:
     """An array in npy format from a stream of so many bytes."""
-    with _errors_said(subject, "a readable npy array", remedy):
+    with _errors_said(subject, "plain arrays of numbers or texts", remedy):
         descr, fortran_order, shape, start = _header(stream)
         count = check_shape(shape)
         if descr in ("|O", "O"):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 # Formats of pixels alone: Pillow also knows ones that start other programs (PostScript).
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF")
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF")
 # Twice what Pillow warns of; the largest cameras have 150 million.
 _MOST_PIXELS = 178_956_970
 

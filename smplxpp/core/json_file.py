@@ -104,9 +104,8 @@ def as_integer(value: Any, *, subject: str, least: int = -(2**53), most: int = 2
     Raises:
         InputError: anything else.
     """
-    whole = (isinstance(value, int) and not isinstance(value, bool)) or (
-        isinstance(value, float) and value.is_integer()
-    )
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    whole = whole or (isinstance(value, float) and value.is_integer())
     if not (whole and least <= value <= most):
         raise InputError(subject, expected=f"a whole number from {least} to {most}", received=shown(value))
     return int(value)

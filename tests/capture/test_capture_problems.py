@@ -149,7 +149,7 @@ def test_images_named_in_a_transform_file_but_missing(tmp_path):
     ("write", "file", "old", "new", "words"),
     [
         (write_simple, "cameras.json", '"h": 256', '"h": 0', "image size"),
-        (write_simple, "cameras.json", '"R": [[', '"R": [[7, ', "K and R of 9 numbers"),
+        (write_simple, "cameras.json", '"R": [[', '"R": [[7, ', "R: expected finite numbers"),
         (write_simple, "cameras.json", '"dist"', '"dust"', None),
         (write_avatarrex, "calibration_full.json", '"imgSize"', '"size"', "entry 'imgSize'"),
         (write_avatarrex, "calibration_full.json", '"distCoeff": [0.0', '"distCoeff": [0.0, 1.0', "4, 5 or 8"),

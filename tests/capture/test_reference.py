@@ -80,7 +80,7 @@ def test_ground_truth_capture_has_the_same_cameras_in_both_files(captures):
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("c.json", "{", "JSON cameras with name"),
+        ("c.json", "{", "expected JSON"),
         ("c.json", '{"cameras": [{"name": "A"}]}', "KeyError"),
         ("c.csv", "name,w\nA,3\n", "KeyError"),
         ("c.txt", "", r"\.json or \.csv"),

@@ -146,3 +146,138 @@ def test_damaged_and_missing_files_are_input_errors(tmp_path):
     (tmp_path / "x.npz").write_bytes(bytes(data))
     with pytest.raises(InputError, match=r"x\.npz"):
         safe_npz(tmp_path / "x.npz")
+
+
+def state_of(dtype: str, shape, content) -> bytes:
+    """A pickle of an array with this state, as numpy writes them."""
+    return pickle.dumps(Parts(dtype, shape, content), protocol=2)
+
+
+class Parts:
+    """Pickles as an array whose state is given, right or wrong."""
+
+    def __init__(self, dtype, shape, content):
+        self.state = (1, shape, Kind(dtype), False, content)
+
+    def __reduce__(self):
+        return np.zeros(1).__reduce__()[0], (np.ndarray, (0,), b"b"), self.state
+
+
+class Kind:
+    """Pickles as a call of numpy.dtype that numpy itself may refuse."""
+
+    def __init__(self, text):
+        self.text = text
+
+    def __reduce__(self):
+        return np.dtype, (self.text, False, True)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "shape", "content"),
+    [
+        ("O8", (4,), b"\x41" * 32),  # pointers from the file
+        ("O", (2,), [1]),
+        ("V8", (1,), bytes(8)),
+        ("f8", (1 << 42,), bytes(8)),
+        ("f8", (0, 1 << 62), b""),
+        ("f8", (-1,), bytes(8)),
+        ("f8", (2.0,), bytes(16)),
+        ("U0", (10**12,), b""),
+        ("f8", (2,), bytes(15)),
+        ("f8", (2,), [1.0, 2.0]),
+        ("M8", (1,), bytes(8)),
+        ("i8,O", (1,), bytes(16)),
+    ],
+)
+def test_arrays_whose_content_does_not_fit_are_refused_before_they_are_made(tmp_path, dtype, shape, content):
+    (tmp_path / "x.pkl").write_bytes(state_of(dtype, shape, content))
+    with pytest.raises(InputError, match=r"x\.pkl: expected a readable pickle"):
+        safe_load(tmp_path / "x.pkl")
+
+
+def test_the_same_way_of_writing_gives_arrays_that_do_fit(tmp_path):
+    (tmp_path / "x.pkl").write_bytes(state_of("f8", (2,), np.arange(2.0).tobytes()))
+    np.testing.assert_array_equal(safe_load(tmp_path / "x.pkl"), [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("code", "what"),
+    [
+        (b"\x80\x04]\x94h\x00a.", "within itself"),
+        (b"\x80\x04" + b"]" * 300 + b"a" * 299 + b".", "unfold"),
+        (b"r\xff\xff\xff\x7f.", "pickle"),
+        (b"\x80\x02\x8b\xff\xff\xff\x7f\x01.", "pickle"),
+        (b"\x80\x04\x8e" + b"\xff" * 7 + b"\x7f.", "pickle"),
+        (b"\x80\x04\x82\x01.", "pickle"),
+        (b"Pabc\n.", "pickle"),
+        (b"\x80\x05\x97.", "pickle"),
+    ],
+)
+def test_opcodes_that_ask_for_too_much_or_reach_outside(tmp_path, code, what):
+    (tmp_path / "x.pkl").write_bytes(code)
+    with pytest.raises(InputError, match=what):
+        safe_load(tmp_path / "x.pkl")
+
+
+def test_a_list_of_the_same_list_again_and_again_is_refused(tmp_path):
+    value: list = [1.0]
+    for _ in range(40):
+        value = [value, value]
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(value))
+    assert (tmp_path / "x.pkl").stat().st_size < 1000
+    with pytest.raises(InputError, match="unfold"):
+        safe_load(tmp_path / "x.pkl")
+
+
+def test_one_content_for_thousands_of_arrays_is_refused(tmp_path):
+    content = np.zeros(1 << 20)
+    parts = [Parts("f8", content.shape, b"") for _ in range(2000)]
+    raw = content.tobytes()
+    for part in parts:
+        part.state = (*part.state[:4], raw)
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(parts, protocol=4))
+    with pytest.raises(InputError, match="many times the file's size"):
+        safe_load(tmp_path / "x.pkl")
+
+
+def test_keys_whose_hashes_a_file_could_choose_are_refused(tmp_path):
+    modulus = (1 << 61) - 1
+    for value in ({modulus * 3: 1}, {(1, 2): 1}, {1.5: 1}, {modulus * 5}):
+        path = write_pickle(tmp_path / "x.pkl", value, protocol=4)
+        with pytest.raises(InputError, match="a key of type"):
+            safe_load(path)
+    assert safe_load(write_pickle(tmp_path / "x.pkl", {np.int64(3): "a", None: 1, b"k": 2, True: 3})) == {
+        3: "a",
+        None: 1,
+        b"k": 2,
+        True: 3,
+    }
+
+
+def test_containers_alone_are_changed(tmp_path):
+    array = pickle.dumps(np.arange(3), protocol=4)[:-1]
+    for code in (b"K\x00K\x07s.", b"K\x07a.", b"(K\x07e.", b"}b."):
+        (tmp_path / "x.pkl").write_bytes(array + code)
+        with pytest.raises(InputError, match="readable pickle"):
+            safe_load(tmp_path / "x.pkl")
+
+
+def test_shared_and_interned_values_stay_shared(tmp_path):
+    array = np.arange(4)
+    back = safe_load(write_pickle(tmp_path / "x.pkl", {"a": array, "b": [array, array.T]}, 4))
+    assert back["a"] is back["b"][0]
+
+
+def test_records_that_disagree_with_themselves_are_input_errors():
+    sparse = {"data": np.ones(1), "indices": np.zeros(1, int), "indptr": np.array([0, 1])}
+    for record in (
+        InertObject("scipy.sparse.csc_matrix", (), sparse | {"_shape": (10**9, 10**9)}),
+        InertObject("scipy.sparse.csc_matrix", (), sparse | {"_shape": "ab"}),
+        InertObject("scipy.sparse.csc_matrix", (), sparse | {"_shape": (7, 7)}),
+        InertObject("chumpy.reordering.Select", (), {"a": np.arange(3), "idxs": np.array([9])}),
+        InertObject("chumpy.reordering.Select", (), {"a": np.arange(3), "idxs": "x"}),
+        InertObject("chumpy.ch.Ch", (), {"x": [[1, 2], [3]]}),
+    ):
+        with pytest.raises(InputError, match="regressor"):
+            dense_array(record, subject="regressor")

@@ -58,7 +58,7 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
             expected="focal lengths above 0 and a last row 0, 0, 1",
             received=f"{intrinsics.tolist()}",
         )
-    width, height = (as_integer(side, subject=f"{subject}: size", least=1, most=_LONGEST_SIDE) for side in size)
+    width, height = (as_integer(side, subject=f"{subject}: image size", least=1, most=_LONGEST_SIDE) for side in size)
     K = intrinsics / intrinsics[2, 2]
     if opencv_pixels:
         K[:2, 2] += 0.5
