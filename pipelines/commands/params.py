@@ -34,8 +34,10 @@ class ParamsConvert:
     """Frames to keep, as START:STOP or START:STOP:STEP (None: all)."""
     person: OptionalInt = None
     """Id of the person, for files with several."""
-    up: Literal["y", "z"] = "y"
-    """Axis that points up in the input (AMASS: z); the output has y up."""
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
+    """Axis that points up in the input (AMASS: z); the output has y up. None: -y for TalkBody4D, y for all others."""
+    betas: OptionalInt = None
+    """Keep the first so many betas, for a body that has no more; says what share of their length is lost (None: all)."""
     flat_hand_mean: bool | None = None
     """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
     json: bool = False
@@ -54,6 +56,7 @@ class ParamsConvert:
             person=self.person,
             up=self.up,
             flat_hand_mean=self.flat_hand_mean,
+            max_betas=self.betas,
         ).select(kept)
         if not len(params):
             raise InputError("--frames", expected="a range that holds frames", received=str(self.frames))
@@ -85,5 +88,6 @@ def _summary(command: ParamsConvert, layout: str, params: BodyParams) -> dict:
         "betas": params.betas.shape[1],
         "expressions": params.expression.shape[1],
         "hand_numbers": params.left_hand_pose.shape[1],
+        "v_shape": params.v_shape is not None,
         "flat_hand_mean": params.flat_hand_mean,
     }

@@ -58,7 +58,7 @@ def pose_errors(captures: Mapping[str, Capture], exact: ParamSource, template: T
             there = [frame for frame in frames if frame in known and capture.params(frame) is not None]
             errors = [
                 pose_error(
-                    replace(_params(capture, frame), betas=np.zeros((1, 0))),
+                    _params(capture, frame).without_shape(),
                     _from_template(exact.read(frame), template),
                     template.body,
                     covered,
@@ -76,7 +76,7 @@ def _from_template(params: BodyParams, template: Template) -> BodyParams:
     betas = np.zeros((len(params), size))
     betas[:, : params.betas.shape[1]] += params.betas[:, :size]
     betas[:, : len(template.betas)] -= template.betas[:size]
-    return replace(params, betas=betas)
+    return replace(params, betas=betas, v_shape=None)
 
 
 def covered_vertices(template: Template) -> Bool[np.ndarray, " V"]:

@@ -52,3 +52,5 @@ def _add_frame(numbers: hashlib._Hash, frame: int, row: BodyParams) -> None:
     numbers.update(str(frame).encode())
     for array in ARRAY_NAMES:
         numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())
+    if row.v_shape is not None:
+        numbers.update(row.v_shape.tobytes())

@@ -160,7 +160,7 @@ def assemble_template(
         raise InputError("parameters", expected="one frame", received=f"{len(params)}", remedy="choose it with frame()")
     for name, part in parts.items():
         _check_part(name, part, body, config)
-    neutral = BodyParams.rest(betas=params.betas[0], expressions=0)
+    neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
     # Without the mean hand: its pose correctives are none of the T-pose's.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
     body_mesh = body.mesh(rest)

@@ -21,8 +21,17 @@ from smplxpp.core.safe_pickle import safe_load, safe_npz
 
 LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
 _SUFFIXES = (".npz", ".json", ".pkl")
-# Turns z up into y up: (x, y, z) -> (x, z, -y).
-_Y_UP_FROM_Z_UP = np.array([-np.pi / 2, 0.0, 0.0])
+UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
+# Axis-angle of the turn that brings an axis to +y, about x or z; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
+_Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
+    "x": (0.0, 0.0, np.pi / 2),
+    "-x": (0.0, 0.0, -np.pi / 2),
+    "-y": (np.pi, 0.0, 0.0),
+    "z": (-np.pi / 2, 0.0, 0.0),
+    "-z": (np.pi / 2, 0.0, 0.0),
+}
+# What a layout's own files have up, where that is always the same and not y.
+_OWN_UP: dict[str, UpAxis] = {"talkbody4d": "-y"}
 
 
 def load_params(
@@ -31,8 +40,9 @@ def load_params(
     layout: LayoutName = "auto",
     body: BodyModel | None = None,
     person: int | None = None,
-    up: Literal["y", "z"] = "y",
+    up: UpAxis | None = None,
     flat_hand_mean: bool | None = None,
+    max_betas: int | None = None,
 ) -> BodyParams:
     """Read body parameters of any known layout.
 
@@ -48,14 +58,18 @@ def load_params(
         layout: name of the layout, or "auto".
         body: the body that the parameters will pose; gives J0 where it is needed. None: the open body.
         person: id of the person, for files with several.
-        up: the axis that points up in the file; "z" is turned to our y.
+        up: the axis that points up in the file, which is turned to our y. None: that of the layout, -y for TalkBody4D
+            and y for all others (AMASS has z up, its layout's other users have not).
         flat_hand_mean: overrides what the layout implies (see `BodyParams`).
+        max_betas: keep the first so many betas, for a body that has no more.
 
     Raises:
-        InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes.
+        InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes, or
+            what the body refuses that is needed.
 
     Warns:
-        GeometryWarning: frames without the chosen person, which are left out.
+        GeometryWarning: frames without the chosen person, which are left out; betas that are cut and not zero, with
+            their share; what a layout has that is not read.
     """
     path = Path(path)
     files = _frame_files(path)
@@ -78,7 +92,7 @@ def load_params(
             GeometryWarning,
             stacklevel=2,
         )
-    params = _joined(parts, body, up)
+    params = _joined(_cut(parts, max_betas), body, up or _OWN_UP.get(name, "y"))
     return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
 
 
@@ -98,19 +112,42 @@ def params_from_content(
     frames = _read_content(content, name, None, source)
     if frames is None:
         raise InputError(source, expected="frames of a person", received="none")
-    return _joined([frames], body, "y")
+    return _joined([frames], body, _OWN_UP.get(name, "y"))
 
 
-def _joined(parts: list[Frames], body: BodyModel | None, up: str) -> BodyParams:
+def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
+    """The first betas alone. Millimetres only a body could say that has all directions; their share can be said here."""
+    if max_betas is None:
+        return parts
+    if max_betas < 0:
+        raise InputError("number of betas to keep", expected="0 or more", received=str(max_betas))
+    kept, dropped = (
+        sum(float(np.square(part.params.betas[:, columns]).sum()) for part in parts)
+        for columns in (slice(max_betas), slice(max_betas, None))
+    )
+    if dropped > 0:
+        most = max(part.params.betas.shape[1] for part in parts)
+        warnings.warn(
+            f"{most} betas are cut to {max_betas}: {100 * np.sqrt(dropped / (kept + dropped)):.1f} % of their length is "
+            "lost (root of the squares; a body with all of them would say how many millimetres)",
+            GeometryWarning,
+            stacklevel=3,
+        )
+    return [replace(part, params=replace(part.params, betas=part.params.betas[:, :max_betas])) for part in parts]
+
+
+def _joined(parts: list[Frames], body: BodyModel | None, up: UpAxis) -> BodyParams:
     params = BodyParams.concatenate([part.params for part in parts])
     outer = [part.outer for part in parts if part.outer]
-    if not outer and up != "z":
+    if up != "y" and up not in _Y_UP_FROM:
+        raise InputError("axis that points up", expected=f"y, {', '.join(_Y_UP_FROM)}", received=str(up))
+    if not outer and up == "y":
         return params
     body = body or load_body()
     if outer:
         params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
-    if up == "z":
-        params = _moved(params, body, _Y_UP_FROM_Z_UP, np.zeros(3))
+    if up != "y":
+        params = _moved(params, body, np.array(_Y_UP_FROM[up]), np.zeros(3))
     return params
 
 
@@ -143,7 +180,7 @@ def _read_content(content: Any, layout: str, person: int | None, source: str) ->
         raise InputError(
             f"{source}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
         ) from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError(
             source,
             expected=f"the layout {layout}",

@@ -164,14 +164,15 @@ class BodyModel:
     def forward(self, params: BodyParams | Mapping[str, Array], *, flat_hand_mean: bool | None = None) -> PosedBody:
         """Pose the body.
 
-        `v = v_template + shapedirs betas + exprdirs expression`, `J = joint_regressor v`,
+        `v = v_template + shapedirs betas + v_shape + exprdirs expression`, `J = joint_regressor v`,
         `rest = v + posedirs vec(R_1.. - I)`, `x = sum_j w_j G_j(J, R) rest + transl`; the root turns about `J_0`.
         Hands narrower than 45 numbers are PCA coefficients of the first components. Parameters of joints that the
         model lacks are ignored (face for SMPL-H; face and fingers for SMPL).
 
         Args:
             params: T frames (numpy, float64), or a mapping of torch tensors (T, width) or (1, width) with the same
-                names, missing ones zero; the result has their dtype and device and is differentiable.
+                names, missing ones zero (`v_shape` is taken of BodyParams alone); the result has their dtype and device
+                and is differentiable.
             flat_hand_mean: do not add the model's mean hand. None: as the parameters say (`flat_hand_mean` of
                 BodyParams; the key of a mapping; otherwise False).
 
@@ -179,7 +180,8 @@ class BodyModel:
             The posed body of T frames.
 
         Raises:
-            InputError: more betas or expressions than the model has, hand PCA for a model without it, wrong shapes.
+            InputError: more betas or expressions than the model has, `v_shape` of another number of vertices, hand PCA
+                for a model without it, wrong shapes.
         """
         if flat_hand_mean is None:
             flat_hand_mean = (
@@ -207,7 +209,19 @@ class BodyModel:
         vertices = self._constant("v_template", betas) + self._blend("shapedirs", betas, "betas")
         if self.num_expressions:
             vertices = vertices + self._blend("exprdirs", expression, "expression")
+        if "v_shape" in arrays:
+            vertices = vertices + self._checked_offsets(arrays["v_shape"])
         return vertices, self._constant("joint_regressor", vertices) @ vertices
+
+    def _checked_offsets(self, offsets: Array) -> Array:
+        if offsets.shape[1] != self.vertex_count:
+            raise InputError(
+                "parameter v_shape",
+                expected=f"{self.vertex_count} vertices, as the body {self.name!r} has",
+                received=f"{offsets.shape[1]}",
+                remedy="use the body that the parameters were fitted with",
+            )
+        return offsets
 
     def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
         """Offsets (T, V, 3) of the first n directions by (T, n) coefficients."""
@@ -218,7 +232,8 @@ class BodyModel:
                 f"parameter {subject}",
                 expected=f"at most {known} numbers for the body {self.name!r}",
                 received=f"{used}",
-                remedy="use the body that the parameters were fitted with, or cut the parameters",
+                remedy="use the body that the parameters were fitted with, or cut the parameters "
+                "(smplxpp params convert --betas, load_params(max_betas=))",
             )
         flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
         return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
@@ -276,7 +291,8 @@ class BodyModel:
 def _checked_arrays(params: BodyParams | Mapping[str, Array]) -> dict[str, Array]:
     """Every array by name with T rows, missing ones zero."""
     if isinstance(params, BodyParams):
-        return {name: getattr(params, name) for name in ARRAY_NAMES}
+        arrays = {name: getattr(params, name) for name in ARRAY_NAMES}
+        return arrays if params.v_shape is None else {**arrays, "v_shape": params.v_shape}
     given = {name: params[name] for name in ARRAY_NAMES if name in params}
     if not given:
         raise InputError(

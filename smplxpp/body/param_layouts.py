@@ -19,6 +19,8 @@ from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 
 _JOINTS = dict(POSE_BLOCKS)
 _EASYMOCAP_HAND_PCA = 6
+# Poses with all fingers: of SMPL-H and of SMPL-X. VPoser's numbers, which some of its models write instead.
+_EASYMOCAP_COMPLETE, _EASYMOCAP_EMBEDDING = (156, 165), 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class Layout:
 def _read_smplx(content: Mapping[str, Any], person: int | None) -> Frames:
     """SMPL-X names: our own files, per-frame files, 4D-Dress."""
     values = {name: _flat_joints(name, content[name]) for name in ARRAY_NAMES if name in content}
-    extras = {name: content[name] for name in ("fps", "flat_hand_mean") if name in content}
+    extras = {name: content[name] for name in ("fps", "flat_hand_mean", "v_shape") if content.get(name) is not None}
     return Frames(BodyParams.from_mapping(values | extras))
 
 
@@ -63,7 +65,13 @@ def _read_avatarrex(content: Mapping[str, Any], person: int | None) -> Frames:
 
 
 def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
-    """TalkBody4D: SMPL-X names, then `verts R(Rh)^T + Th` about the origin; its readers take the hands as complete."""
+    """TalkBody4D: SMPL-X names, then `verts R(Rh)^T + Th` about the origin; its readers take the hands as complete.
+
+    `v_shape` is added to the shaped template, by its authors' own version of SMPL-X; what their `v_pose` is added to is
+    not published.
+    """
+    if content.get("v_pose") is not None and np.any(content["v_pose"]):
+        warnings.warn("TalkBody4D: `v_pose` is not read", GeometryWarning, stacklevel=2)
     return Frames(_read_avatarrex(content, person).params, _outer(content))
 
 
@@ -82,7 +90,12 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
 
 
 def _read_easymocap(content: Any, person: int | None) -> Frames | None:
-    """EasyMocap: one record a person, `V = R(Rh) X + Th` about the origin, hands as 6 PCA numbers before the face."""
+    """EasyMocap: one record a person, `V = R(Rh) X + Th` about the origin, where X is posed with `poses`.
+
+    Numbers of `poses`, as its `bodymodel` and its older `smplmodel` write them: 63 (body alone; SMPL-H, hands in
+    `handl` and `handr`, PCA or complete), 69 (SMPL), 156 (SMPL-H, complete) without or with a root of zeros; 66, 72, 78,
+    87 (SMPL-X, hands as 6 PCA numbers before the face) and 165 with it.
+    """
     records = content if isinstance(content, list) else content.get("annots", [content])
     ids = [record.get("id", 0) for record in records]
     if person is None and len(records) != 1:
@@ -93,27 +106,36 @@ def _read_easymocap(content: Any, person: int | None) -> Frames | None:
         return None
     record = records[0 if person is None else ids.index(person)]
     poses = np.asarray(record["poses"], dtype=np.float64).reshape(1, -1)
-    full = poses.shape[1] == 165
-    if full:
-        blocks = _split(poses, face_first=True)
-    elif poses.shape[1] == 72:
-        # SMPL: its two hand joints have no counterpart.
-        if poses[:, 66:].any():
-            warnings.warn(
-                "EasyMocap: the rotations of SMPL's two hand joints are dropped", GeometryWarning, stacklevel=2
-            )
-        blocks = _split(poses[:, :66], face_first=False)
-    elif poses.shape[1] in (66 + 2 * _EASYMOCAP_HAND_PCA, 75 + 2 * _EASYMOCAP_HAND_PCA):
-        blocks = _split(poses, face_first=False)
-    else:
-        raise InputError("poses", expected="72, 78, 87 or 165 numbers", received=f"{poses.shape[1]}")
+    full = poses.shape[1] in _EASYMOCAP_COMPLETE
+    blocks = _split(_easymocap_poses(poses), face_first=full)
     for name, key in (("left_hand_pose", "handl"), ("right_hand_pose", "handr")):
-        if key in record:
+        # Its models take complete poses as they are, whatever else the record has.
+        if key in record and not full:
             blocks[name] = record[key]
     values = {**blocks, "betas": record["shapes"], "transl": np.zeros(3), "flat_hand_mean": full}
     if "expression" in record:
         values["expression"] = record["expression"]
     return Frames(BodyParams.from_mapping(values), _outer(record))
+
+
+def _easymocap_poses(poses: np.ndarray) -> np.ndarray:
+    """Poses with their root, as `_split` takes them."""
+    width = poses.shape[1]
+    if width in (63, 69):
+        poses = np.pad(poses, ((0, 0), (3, 0)))
+    elif width not in (66, 72, 66 + 2 * _EASYMOCAP_HAND_PCA, 75 + 2 * _EASYMOCAP_HAND_PCA, *_EASYMOCAP_COMPLETE):
+        raise InputError(
+            "poses",
+            expected="63, 66, 69, 72, 78, 87, 156 or 165 numbers",
+            received=f"{width}",
+            remedy="decode the pose embedding first" if width == _EASYMOCAP_EMBEDDING else "",
+        )
+    if poses.shape[1] != 72:
+        return poses
+    # SMPL: its two hand joints have no counterpart.
+    if poses[:, 66:].any():
+        warnings.warn("EasyMocap: the rotations of SMPL's two hand joints are dropped", GeometryWarning, stacklevel=3)
+    return poses[:, :66]
 
 
 LAYOUTS: dict[str, Layout] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,8 @@ class BodyParams:
         jaw_pose, leye_pose, reye_pose: (T, 3).
         left_hand_pose, right_hand_pose: (T, 45) axis-angle, or (T, P) PCA coefficients with P < 45.
         betas: (T, B) shape. expression: (T, E). transl: (T, 3), added last.
+        v_shape: (1, V, 3) for all frames or (T, V, 3): metres added to the vertices of the shaped template, before its
+            joints are taken and it is posed: shape that no betas express (TalkBody4D). None: nothing is added.
         fps: frames a second where the source says so.
         flat_hand_mean: the hands are complete as they stand; a body model does not add its mean hand to them
             (AMASS, AvatarReX). False: the mean hand of the model is added, after the PCA, as SMPL-X does by default.
@@ -56,6 +58,7 @@ class BodyParams:
     transl: Float64[np.ndarray, "T 3"]
     fps: float | None = None
     flat_hand_mean: bool = False
+    v_shape: Float64[np.ndarray, "S V 3"] | None = None
 
     def __post_init__(self) -> None:
         width = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
@@ -85,6 +88,8 @@ class BodyParams:
                 )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        if self.v_shape is not None:
+            object.__setattr__(self, "v_shape", _vertex_offsets(self.v_shape, frames))
 
     def __len__(self) -> int:
         return len(self.global_orient)
@@ -113,11 +118,24 @@ class BodyParams:
 
     def select(self, indices: slice | Sequence[int] | np.ndarray) -> BodyParams:
         """The frames named by indices, a mask or a slice."""
-        return self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES})
+        offsets = self.v_shape if self.v_shape is None or len(self.v_shape) == 1 else self.v_shape[indices]
+        return self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES}, offsets)
+
+    def without_shape(self) -> BodyParams:
+        """The poses alone, for a body that has the person's shape already: no betas, nothing added to the vertices."""
+        return replace(self, betas=np.zeros((len(self), 0)), v_shape=None)
+
+    def offsets_by_row(self, frames: Sequence[int] | np.ndarray) -> Float64[np.ndarray, "R V 3"] | None:
+        """`v_shape` for a file whose row is the frame's number, NaN where there is no frame; one row if that does."""
+        if self.v_shape is None or len(self.v_shape) == 1:
+            return self.v_shape
+        rows = np.full((int(max(frames)) + 1, *self.v_shape.shape[1:]), np.nan)
+        rows[np.asarray(frames)] = self.v_shape
+        return rows
 
     @staticmethod
     def concatenate(parts: Sequence[BodyParams]) -> BodyParams:
-        """Frames of several BodyParams in order; widths, `fps` and `flat_hand_mean` must agree.
+        """Frames of several BodyParams in order; widths, `fps`, `flat_hand_mean` and having `v_shape` must agree.
 
         Raises:
             InputError: nothing to join, or parts that do not fit.
@@ -134,15 +152,19 @@ class BodyParams:
                         f"parameter {name} of part {index}", expected=f"{first}, as in part 0", received=str(other)
                     )
         joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAY_NAMES}
-        return parts[0]._with_arrays(joined)
+        return parts[0]._with_arrays(joined, _joined_offsets(parts))
 
     @staticmethod
-    def rest(*, betas: Float[np.ndarray, " B"] | int = 10, expressions: int = 10) -> BodyParams:
+    def rest(
+        *,
+        betas: Float[np.ndarray, " B"] | int = 10,
+        expressions: int = 10,
+        v_shape: Float[np.ndarray, "S V 3"] | None = None,
+    ) -> BodyParams:
         """The zero pose (T-pose) of one frame; `betas` as values (B,) or as their number."""
         values = np.zeros(betas) if isinstance(betas, int) else np.asarray(betas)
-        return _from_arrays(
-            _zero_pose() | {"betas": values, "expression": np.zeros(expressions), "transl": np.zeros(3)}
-        )
+        arrays = _zero_pose() | {"betas": values, "expression": np.zeros(expressions), "transl": np.zeros(3)}
+        return _from_arrays(arrays if v_shape is None else arrays | {"v_shape": v_shape})
 
     @staticmethod
     def from_full_pose(
@@ -162,17 +184,19 @@ class BodyParams:
         return _from_arrays(blocks | others, fps=fps, flat_hand_mean=flat_hand_mean)
 
     def as_dict(self) -> dict[str, np.ndarray]:
-        """Arrays by name, with `fps` where known and `flat_hand_mean` where true."""
+        """Arrays by name, with `fps` and `v_shape` where there are any and `flat_hand_mean` where true."""
         out: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAY_NAMES}
         if self.fps is not None:
             out["fps"] = np.asarray(np.float64(self.fps))
         if self.flat_hand_mean:
             out["flat_hand_mean"] = np.asarray(np.bool_(True))
+        if self.v_shape is not None:
+            out["v_shape"] = self.v_shape
         return out
 
     @staticmethod
     def from_mapping(values: Mapping[str, np.ndarray], *, source: str = "parameters") -> BodyParams:
-        """Read arrays by SMPL-X name; face, hands and expression may be missing (zero)."""
+        """Read arrays by SMPL-X name; face, hands and expression may be missing (zero), `v_shape` too (none)."""
         required = ("global_orient", "body_pose", "betas", "transl")
         missing = [name for name in required if name not in values]
         if missing:
@@ -183,7 +207,7 @@ class BodyParams:
                 remedy="see `smplxpp params convert --help` for the layouts that are read",
             )
         zeros = _zero_pose() | {"expression": np.zeros(10)}
-        arrays = zeros | {name: values[name] for name in ARRAY_NAMES if name in values}
+        arrays = zeros | {name: values[name] for name in (*ARRAY_NAMES, "v_shape") if name in values}
         fps = float(values["fps"]) if "fps" in values else None
         return _from_arrays(arrays, fps=fps, flat_hand_mean=bool(values.get("flat_hand_mean", False)))
 
@@ -193,8 +217,9 @@ class BodyParams:
             # numpy's signature lists options of its own among the arrays' names.
             np.savez_compressed(stream, **self.as_dict())  # type: ignore[arg-type]
 
-    def _with_arrays(self, arrays: Mapping[str, np.ndarray]) -> BodyParams:
-        return _from_arrays(arrays, fps=self.fps, flat_hand_mean=self.flat_hand_mean)
+    def _with_arrays(self, arrays: Mapping[str, np.ndarray], offsets: np.ndarray | None) -> BodyParams:
+        whole = arrays if offsets is None else {**arrays, "v_shape": offsets}
+        return _from_arrays(whole, fps=self.fps, flat_hand_mean=self.flat_hand_mean)
 
 
 def _from_arrays(
@@ -213,6 +238,7 @@ def _from_arrays(
         transl=arrays["transl"],
         fps=fps,
         flat_hand_mean=flat_hand_mean,
+        v_shape=arrays.get("v_shape"),
     )
 
 
@@ -226,3 +252,38 @@ def _numbers(name: str, value: object) -> np.ndarray:
         return np.array(np.atleast_2d(np.asarray(value)), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"parameter {name}", expected="numbers of shape (T, width)", received=str(error)) from error
+
+
+def _vertex_offsets(value: object, frames: int) -> np.ndarray:
+    """A read-only (1, V, 3) or (frames, V, 3) float64 copy."""
+    subject = "parameter v_shape"
+    try:
+        offsets = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(subject, expected="numbers of shape (V, 3) or (T, V, 3)", received=str(error)) from error
+    offsets = offsets[None] if offsets.ndim == 2 else offsets
+    if offsets.ndim != 3 or offsets.shape[2] != 3 or len(offsets) not in (1, frames):
+        raise InputError(
+            subject, expected=f"shape (V, 3), (1, V, 3) or ({frames}, V, 3)", received=f"shape {offsets.shape}"
+        )
+    if not np.isfinite(offsets).all():
+        raise InputError(subject, expected="finite values", received="NaN or infinity")
+    offsets.setflags(write=False)
+    return offsets
+
+
+def _joined_offsets(parts: Sequence[BodyParams]) -> np.ndarray | None:
+    """What parts add to the vertices: once if it is the same in all, else a row a frame."""
+    given = [part.v_shape for part in parts if part.v_shape is not None]
+    shapes = {None if part.v_shape is None else part.v_shape.shape[1] for part in parts}
+    if len(shapes) > 1:
+        raise InputError(
+            "parameter v_shape of parts to join",
+            expected="offsets of the same vertices in all parts, or in none",
+            received=" and ".join("none" if count is None else f"{count} vertices" for count in shapes),
+        )
+    if not given or (all(len(one) == 1 for one in given) and all(np.array_equal(one, given[0]) for one in given)):
+        return given[0] if given else None
+    return np.concatenate(
+        [np.broadcast_to(one, (len(part), *one.shape[1:])) for part, one in zip(parts, given, strict=True)]
+    )

@@ -35,7 +35,7 @@ def joint_motion(
 
     Args:
         template: J joints.
-        params: T frames; betas are not looked at, as in `Template.pose`.
+        params: T frames; betas and `v_shape` are not looked at, as in `Template.pose`.
 
     Returns:
         (T, J, 3, 3) rotations and (T, J, 3) translations in metres.
@@ -51,7 +51,7 @@ def joint_motion(
             received=f"{template.body.joint_count} joints",
             remedy="write the file without an animation",
         )
-    posed = _joints_alone(template).forward(replace(params, betas=np.zeros((len(params), 0))))
+    posed = _joints_alone(template).forward(params.without_shape())
     global_rotations = posed.posed_from_rest[..., :3, :3]
     parents = template.body.parents
     above = np.where((parents >= 0)[:, None, None], global_rotations[:, parents], np.eye(3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 from smplxpp.register.anatomy import Anatomy
@@ -339,6 +340,12 @@ def _check(body: BodyModel, observed: Observations) -> None:
 def _check_initial(body: BodyModel, initial: BodyParams, frames: int) -> None:
     if len(initial) != frames:
         raise InputError("fit to start from", expected=f"{frames} frames", received=f"{len(initial)} frames")
+    if initial.v_shape is not None:
+        warnings.warn(
+            "fit to start from: its v_shape is left aside, the shape is fitted in betas alone",
+            GeometryWarning,
+            stacklevel=3,
+        )
     for name, have, known in (
         ("betas", initial.betas.shape[1], body.num_betas),
         ("expression", initial.expression.shape[1], body.num_expressions),

@@ -220,7 +220,7 @@ class Template:
 
     def posed_body(self, params: BodyParams) -> PosedBody:
         """The naked body of this identity in T poses: what `pose` skins the parts with."""
-        return self.body.forward(replace(params, betas=np.zeros((len(params), 0))))
+        return self.body.forward(params.without_shape())
 
     def save(self, path: str | Path) -> None:
         """Write an npz without pickled objects, whole or not at all; the same template gives the same bytes."""

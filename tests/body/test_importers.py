@@ -123,6 +123,18 @@ def test_z_up_becomes_y_up(tmp_path, params, pca_body):
     np.testing.assert_allclose(up_y, np.stack([up_z[..., 0], up_z[..., 2], -up_z[..., 1]], axis=-1), atol=1e-11)
 
 
+@pytest.mark.parametrize(("up", "axis"), [("x", 0), ("-x", 0), ("y", 1), ("-y", 1), ("z", 2), ("-z", 2)])
+def test_every_axis_can_be_turned_up(tmp_path, params, pca_body, up, axis):
+    params.save(tmp_path / "a.npz")
+    before = pca_body.forward(params).vertices[0]
+    after = pca_body.forward(load_params(tmp_path / "a.npz", body=pca_body, up=up)).vertices[0]
+    np.testing.assert_allclose(after[:, 1], (-1 if up[0] == "-" else 1) * before[:, axis], atol=1e-11)
+    turn = np.linalg.lstsq(before - before[0], after - after[0], rcond=None)[0]
+    np.testing.assert_allclose([turn @ turn.T, np.eye(3) * np.linalg.det(turn)], [np.eye(3)] * 2, atol=1e-9)
+    with pytest.raises(InputError, match="axis that points up"):
+        load_params(tmp_path / "a.npz", body=pca_body, up="w")
+
+
 def test_avatarrex(tmp_path, params, pca_body):
     arrays = {name: value for name, value in params.as_dict().items() if name not in ("leye_pose", "reye_pose")}
     np.savez(tmp_path / "smpl_params.npz", **arrays | {"betas": params.betas[:1]})
@@ -149,7 +161,52 @@ def test_talkbody4d(tmp_path, params, outer, pca_body, as_folder):
         read = load_params(tmp_path, body=pca_body)
     else:
         read, expected = load_params(tmp_path / "000001.json", body=pca_body), expected[1:2]
+    # Its world has y down.
+    np.testing.assert_allclose(pca_body.forward(read).vertices, expected * [1, -1, -1], atol=1e-11)
+    as_it_is = load_params(tmp_path / "000001.json", body=pca_body, up="y")
+    np.testing.assert_allclose(pca_body.forward(as_it_is).vertices, moved(inner, *outer)[1:2], atol=1e-11)
+
+
+def test_v_shape_is_added_to_the_shaped_template_and_moves_the_joints(tmp_path, params, outer, pca_body):
+    """As TalkBody4D's (1, V, 3); the order is its authors': template, betas, v_shape, then joints and pose."""
+    rng = np.random.default_rng(2)
+    offsets = rng.normal(size=(1, pca_body.vertex_count, 3)) * 0.003
+    for index in range(FRAMES):
+        record = params.frame(index).as_dict() | {"v_shape": offsets}
+        record |= {"Rh": outer[0][index : index + 1], "Th": outer[1][index : index + 1]}
+        write_json(tmp_path / f"{index:06d}.json", record)
+    read = load_params(tmp_path, body=pca_body)
+    assert read.v_shape.shape == offsets.shape, "what is the same in all frames is kept once"
+    person = replace(pca_body, v_template=pca_body.v_template + offsets[0])
+    expected = moved(person.forward(params, flat_hand_mean=True).vertices, *outer) * [1, -1, -1]
     np.testing.assert_allclose(pca_body.forward(read).vertices, expected, atol=1e-11)
+    assert np.abs(pca_body.forward(replace(read, v_shape=None)).vertices - expected).max() > 0.005
+    with pytest.raises(InputError, match=r"v_shape: expected \d+ vertices.*received 7"):
+        pca_body.forward(replace(read, v_shape=np.zeros((7, 3))))
+    read.save(tmp_path / "params.npz")
+    np.testing.assert_array_equal(load_params(tmp_path / "params.npz").v_shape, offsets)
+
+
+def test_what_talkbody4d_adds_in_an_unknown_place_is_said(tmp_path, params, outer, pca_body):
+    record = params.frame(0).as_dict() | {"Rh": outer[0][:1], "Th": outer[1][:1], "v_pose": np.ones((1, 9, 3))}
+    with pytest.warns(GeometryWarning, match="`v_pose` is not read"):
+        load_params(write_json(tmp_path / "0.json", record), body=pca_body)
+
+
+def test_more_betas_than_the_body_has_can_be_cut(tmp_path, params, outer, pca_body):
+    betas = np.r_[np.full(pca_body.num_betas, 3.0), np.full(80, 1.5)][None]
+    record = params.frame(0).as_dict() | {"betas": betas, "Rh": outer[0][:1], "Th": outer[1][:1]}
+    path = write_json(tmp_path / "000000.json", record)
+    with pytest.raises(InputError, match="betas: expected at most .*--betas"):
+        load_params(path, body=pca_body)
+    kept = pca_body.num_betas
+    lost = 100 * np.sqrt(80 * 1.5**2 / (80 * 1.5**2 + kept * 9))
+    with pytest.warns(GeometryWarning, match=rf"{kept + 80} betas are cut to {kept}: {lost:.1f} % of their length"):
+        cut = load_params(path, body=pca_body, max_betas=kept)
+    assert cut.betas.shape == (1, kept)
+    pca_body.forward(cut)
+    with pytest.raises(InputError, match="betas to keep"):
+        load_params(path, body=pca_body, max_betas=-1)
 
 
 def easymocap_record(params: BodyParams, outer, index: int, *, person: int = 0) -> dict:
@@ -212,6 +269,49 @@ def test_easymocap_of_smpl_and_of_smplh(tmp_path, params, outer, pca_body):
     record["poses"] = full[:, :70]
     with pytest.raises(InputError, match=r"s\.json: poses.*70"):
         load_params(write_json(tmp_path / "s.json", [record]), body=pca_body)
+    record["poses"] = full[:, :32]
+    with pytest.raises(InputError, match=r"poses.*received 32.*embedding"):
+        load_params(write_json(tmp_path / "s.json", [record]), body=pca_body)
+
+
+@pytest.mark.parametrize("hand", [6, 12, 45])
+def test_easymocap_with_the_root_apart_and_hands_of_their_own(tmp_path, params, outer, pca_body, hand):
+    """SMPL-H as `easymocap.bodymodel` writes it: 63 numbers, `handl`, `handr`; mean hands are added to either kind."""
+    frame = params.frame(1)
+    record = {"id": 0, "Rh": outer[0][1:2], "Th": outer[1][1:2], "poses": frame.body_pose, "shapes": frame.betas}
+    record |= {"handl": frame.left_hand_pose[:, :hand], "handr": frame.right_hand_pose[:, :hand]}
+    read = load_params(write_json(tmp_path / "0.json", [record]), body=pca_body)
+    inner = BodyParams.rest(betas=frame.betas[0])
+    inner = replace(inner, body_pose=frame.body_pose, left_hand_pose=record["handl"], right_hand_pose=record["handr"])
+    expected = moved(pca_body.forward(inner, flat_hand_mean=False).vertices, outer[0][1:2], outer[1][1:2])
+    np.testing.assert_allclose(pca_body.forward(read).vertices, expected, atol=1e-11)
+    del record["handl"], record["handr"]
+    bare = load_params(write_json(tmp_path / "0.json", [record]), body=pca_body)
+    assert not bare.left_hand_pose.any() and not bare.flat_hand_mean
+    record["poses"] = np.pad(frame.body_pose, ((0, 0), (0, 6)))  # SMPL's 69
+    np.testing.assert_array_equal(
+        load_params(write_json(tmp_path / "0.json", [record]), body=pca_body).body_pose, bare.body_pose
+    )
+    record["poses"] = np.full((1, 69), 0.1)
+    with pytest.warns(GeometryWarning, match="two hand joints"):
+        load_params(write_json(tmp_path / "0.json", [record]), body=pca_body)
+
+
+def test_easymocap_complete_poses_of_smplh(tmp_path, params, outer, pca_body):
+    """156 numbers hold a root of zeros and hands with their mean; `handl` beside them counts no more."""
+    frame = params.frame(1)
+    poses = np.concatenate([np.zeros((1, 3)), frame.body_pose, frame.left_hand_pose, frame.right_hand_pose], axis=1)
+    record = {"id": 0, "Rh": outer[0][1:2], "Th": outer[1][1:2], "poses": poses, "shapes": frame.betas}
+    record |= {"handl": np.ones((1, 6)), "handr": np.ones((1, 6))}
+    read = load_params(write_json(tmp_path / "0.json", [record]), body=pca_body)
+    inner = replace(
+        BodyParams.rest(betas=frame.betas[0]),
+        body_pose=frame.body_pose,
+        left_hand_pose=frame.left_hand_pose,
+        right_hand_pose=frame.right_hand_pose,
+    )
+    expected = moved(pca_body.forward(inner, flat_hand_mean=True).vertices, outer[0][1:2], outer[1][1:2])
+    np.testing.assert_allclose(pca_body.forward(read).vertices, expected, atol=1e-11)
 
 
 def test_easymocap_with_several_people(tmp_path, params, outer, pca_body):

@@ -45,6 +45,26 @@ def test_frames_selected_and_joined_again_are_the_same():
         np.testing.assert_array_equal(getattr(joined, name), getattr(params, name))
 
 
+def test_offsets_of_vertices_follow_the_frames(tmp_path):
+    rng = np.random.default_rng(1)
+    own, shared = rng.normal(size=(3, 5, 3)), rng.normal(size=(5, 3))
+    by_frame, once = random_params(v_shape=own), random_params(v_shape=shared)
+    np.testing.assert_array_equal(by_frame.frame(1).v_shape, own[1:2])
+    np.testing.assert_array_equal(once.frame(2).v_shape, shared[None])
+    assert once.without_shape().v_shape is None and once.without_shape().betas.shape == (3, 0)
+    np.testing.assert_array_equal(BodyParams.concatenate([once, once]).v_shape, shared[None])
+    mixed = BodyParams.concatenate([once, by_frame])
+    np.testing.assert_array_equal(mixed.v_shape, np.concatenate([np.tile(shared, (3, 1, 1)), own]))
+    rows = by_frame.offsets_by_row([4, 0, 2])
+    np.testing.assert_array_equal(rows[[4, 0, 2]], own)
+    assert len(rows) == 5 and np.isnan(rows[[1, 3]]).all()
+    by_frame.save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as file:
+        np.testing.assert_array_equal(BodyParams.from_mapping(file).v_shape, own)
+    with pytest.raises(InputError, match="v_shape of parts to join.*none"):
+        BodyParams.concatenate([once, random_params()])
+
+
 def test_one_row_stands_for_all_frames():
     params = random_params(betas=np.arange(10.0))
     np.testing.assert_array_equal(params.betas, np.tile(np.arange(10.0), (3, 1)))
@@ -64,6 +84,9 @@ def test_the_rest_pose_is_zero():
         ({"betas": np.array([[0, np.nan]])}, "betas.*first in frame 0"),
         ({"left_hand_pose": np.zeros((3, 46))}, "left_hand_pose"),
         ({"expression": "smile"}, "expression: expected numbers"),
+        ({"v_shape": np.zeros((2, 5, 3))}, r"v_shape: expected shape .*\(3, V, 3\), received shape \(2, 5, 3\)"),
+        ({"v_shape": np.full((5, 3), np.nan)}, "v_shape: expected finite"),
+        ({"v_shape": [[1, 2, 3], "x"]}, "v_shape: expected numbers"),
         ({"jaw_pose": [[1, 2, 3], [1, 2]]}, "jaw_pose: expected numbers"),
     ],
 )
