@@ -45,6 +45,14 @@ class Capture:
     cache: ArrayCache
     excluded: frozenset[tuple[str | None, int | None]] = field(default=frozenset())
 
+    def __repr__(self) -> str:
+        """One paragraph: the recording, what is shown of it and what it is split into."""
+        splits, full = self.splits, self.recording.cameras
+        whole = all(window == Window.full(full[name]) for name, window in self.windows.items() if name in full)
+        held_out = f"{len(splits.novel_view_cameras)} cameras and {len(splits.novel_pose_frames)} frames held out"
+        changed = ["resized or cropped"] * (not whole) + [f"{len(self.excluded)} left out"] * bool(self.excluded)
+        return f"Capture({'; '.join([self.recording.summary(), held_out, *changed])})"
+
     @property
     def name(self) -> str:
         """The folder's name."""

@@ -53,6 +53,11 @@ class FileSeries:
                         found.setdefault(int(match["frame"]), name)
         return FileSeries.from_names(folder, found)
 
+    def __repr__(self) -> str:
+        """A line: a series may have a million files."""
+        span = f" {self.numbers[0]} to {self.numbers[-1]}" if len(self.numbers) else ""
+        return f"FileSeries({len(self.numbers)} files{span} in {str(self.folder)!r})"
+
     def __len__(self) -> int:
         return len(self.numbers)
 

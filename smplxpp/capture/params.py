@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.body import BodyModel, LayoutName, load_params, params_from_content
+from smplxpp.body import BodyModel, LayoutName, UpAxis, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
@@ -70,11 +70,12 @@ class StackedParams:
 
 @dataclass(frozen=True, eq=False)
 class ParamFiles:
-    """A file of parameters for each frame; see `StackedParams`."""
+    """A file of parameters for each frame; see `StackedParams`. `up` as `load_params` takes it."""
 
     files: FileSeries
     layout: LayoutName = "auto"
     body: BodyModel | None = None
+    up: UpAxis | None = None
 
     def frames(self) -> Int64[np.ndarray, " F"]:
         """The frames that there are, ascending."""
@@ -82,7 +83,7 @@ class ParamFiles:
 
     def read(self, frame: int) -> BodyParams:
         """Read the parameters of one frame."""
-        return load_params(self.files.required(frame), layout=self.layout, body=self.body)
+        return load_params(self.files.required(frame), layout=self.layout, body=self.body, up=self.up)
 
 
 def find_params(path: Path, *, body: BodyModel | None, layout: LayoutName = "auto") -> StackedParams | ParamFiles:

@@ -18,6 +18,7 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 
+_SHOWN_SIZES = 3
 KINDS = ("image", "mask", "label", "normal")
 
 
@@ -99,6 +100,30 @@ class Recording:
     problems: tuple[Problem, ...] = field(default=())
     protocol: str | None = None
     protocols: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """One paragraph: a recording has millions of files."""
+        return f"Recording({self.summary()})"
+
+    def summary(self) -> str:
+        """What there is, in a sentence: name, layout, folder, cameras, sizes, frames, and how many files of a kind."""
+        frames = self.frames()
+        sizes = sorted({(camera.width, camera.height) for camera in self.cameras.values()})
+        shown = [f"{width} x {height}" for width, height in sizes[:_SHOWN_SIZES]]
+        shown += [f"and {len(sizes) - len(shown)} other sizes"] if len(sizes) > len(shown) else []
+        there = [
+            f"{sum(map(len, series.values()))} {kind}s" for kind, series in self.files.items() if any(series.values())
+        ]
+        there += [name for name in ("params", "meshes", "keypoints") if getattr(self, name) is not None]
+        there += [f"protocol {self.protocol}"] if self.protocol else []
+        there += [f"{len(self.problems)} problems"] if self.problems else []
+        said = [
+            f"{self.name!r}, {self.format}, {str(self.root)!r}",
+            f"{len(self.cameras)} cameras" + (f" of {', '.join(shown)} pixels" if shown else ""),
+            f"{len(frames)} frames" + (f" {frames[0]} to {frames[-1]}" if frames else ""),
+            ", ".join(there) or "nothing else",
+        ]
+        return "; ".join(said)
 
     def series(self, kind: str, camera: str) -> FileSeries | None:
         """The files of a kind for a camera."""

@@ -49,6 +49,18 @@ def test_body_first_then_parts(body):
     assert apart.max() < 0.0041
 
 
+def test_what_no_betas_express_is_in_the_canonical_body(body):
+    """`v_shape` of the reference frame: in the T-pose, its joints, and not a second time when the template is posed."""
+    own = np.random.default_rng(4).normal(size=(1, body.vertex_count, 3)) * 0.002
+    reference = replace(params(), v_shape=own)
+    template, _ = assemble_template(body, reference, {})
+    rest = body.forward(reference)
+    np.testing.assert_array_equal(template.vertices, rest.rest_vertices[0])
+    assert np.allclose(template.joints, rest.rest_joints[0])
+    assert np.abs(template.vertices - body.forward(params()).rest_vertices[0]).max() > 0.005
+    np.testing.assert_allclose(template.pose(reference), template.pose(params()), atol=1e-12)
+
+
 def test_a_part_within_the_body_comes_out(body):
     parts = worn_parts(body, offset=-0.003)
     template, report = assemble_template(body, params(), parts, config=AssemblyConfig(clearance=0.0015))

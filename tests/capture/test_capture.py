@@ -56,6 +56,20 @@ def test_everything_of_a_view_is_there(tmp_path):
         capture.image("A", 0)[0] = 1
 
 
+def test_a_capture_says_itself_in_a_paragraph(tmp_path):
+    capture = open_capture(write_capture(tmp_path / "disc", description={"novel_views": ["C"]}))
+    text = repr(capture)
+    assert len(text) < 400 and "array" not in text
+    for part in ("'disc', simple,", str(tmp_path / "disc"), "3 cameras of 40 x 60 pixels", "4 frames 0 to 3"):
+        assert part in text
+    assert "11 images, 11 masks, 11 labels, params" in text and "1 cameras and 0 frames held out" in text
+    assert "resized" not in text and "resized or cropped" in repr(capture.resized(0.5))
+    assert "1 left out" in repr(capture.without([Problem("bad", "A", 0)]))
+    assert repr(capture.recording) in text.replace("Capture(", "Recording(", 1).replace("; 1 cameras and", ")")
+    series = capture.recording.series("image", "B")
+    assert repr(series) == f"FileSeries(3 files 0 to 3 in '{tmp_path}/disc/rgbs/B')"
+
+
 def test_presence_is_known_without_opening_files(tmp_path):
     root = write_capture(tmp_path / "disc")
     for path in root.glob("rgbs/*/*"):

@@ -29,7 +29,7 @@ def written(request, tmp_path):
         lens=lens, square_pixels=name == "colmap-binary", names=CAMERA_NAMES.get(name, ("Cam1", "Cam2", "Cam3"))
     )
     root = write(scene, tmp_path / "set")
-    return name, scene, open_capture(root, masks=tmp_path / "mattes" if name == "talkbody4d" else None)
+    return name, scene, open_capture(root)
 
 
 def test_the_format_is_told_by_the_files(written):

@@ -124,7 +124,7 @@ def write_thuman4(scene: Scene, root: Path) -> Path:
 
 
 def write_talkbody4d(scene: Scene, root: Path) -> Path:
-    """TalkBody4D: multi-camera calibration in JSON, distorted photographs, parameters with Rh and Th, no masks."""
+    """TalkBody4D: calibration in JSON, distorted images on black, mattes in `mattings/`, Rh and Th; its y is down."""
     cameras, poses = {}, {}
     for k, (name, camera) in enumerate(scene.cameras.items()):
         size = [camera.width, camera.height]
@@ -134,14 +134,13 @@ def write_talkbody4d(scene: Scene, root: Path) -> Path:
             "K": _opencv_K(camera).tolist(),
             "dist": [[*scene.lens]],
         }
-        pose = camera.cam_from_world
+        pose = camera.cam_from_world @ np.diag([1.0, -1, -1, 1])
         first = next(iter(scene.cameras))
         poses[name if k == 0 else f"{name}_to_{first}"] = {"R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
     _json(root / "calibration.json", {"cameras": cameras, "camera_poses": poses})
-    for (name, frame), image in scene.photographs.items():
-        _save(root / "images" / name / f"{frame:06d}.jpg", image)
-        # The user's own mattes, outside of the recording.
-        _save(root.parent / "mattes" / name / f"{frame:06d}.png", scene.masks[name, frame])
+    for name, frame in scene.photographs:
+        _save(root / "images" / name / f"{frame:06d}.jpg", scene.on_black(name, frame))
+        _save(root / "mattings" / name / f"{frame:06d}.png", scene.masks[name, frame])
     p, joint = scene.params, load_body().rest_joints(scene.params)[:, 0]
     outer = Rotation.from_rotvec([0.3, -0.8, 0.2])
     for frame in range(len(p)):
@@ -150,12 +149,13 @@ def write_talkbody4d(scene: Scene, root: Path) -> Path:
         values = {name: getattr(p, name)[frame : frame + 1].tolist() for name in _BLOCKS if name != "global_orient"}
         values |= {"betas": p.betas[:1].tolist(), "expression": p.expression[frame : frame + 1].tolist()}
         values |= {"global_orient": [inner.as_rotvec().tolist()], "transl": [shift.tolist()]}
-        values |= {"Rh": [outer.as_rotvec().tolist()]}
-        values |= {"Th": [(joint[frame] + p.transl[frame] - outer.apply(joint[frame] + shift)).tolist()]}
+        values |= {"Rh": [(_Y_DOWN * outer).as_rotvec().tolist()]}
+        values |= {"Th": [_Y_DOWN.apply(joint[frame] + p.transl[frame] - outer.apply(joint[frame] + shift)).tolist()]}
         _json(root / "smplx" / f"{frame:06d}.json", values)
     return root
 
 
+_Y_DOWN = Rotation.from_matrix(np.diag([1.0, -1, -1]))
 _BLOCKS = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "left_hand_pose", "right_hand_pose")
 
 

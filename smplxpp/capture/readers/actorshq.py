@@ -26,8 +26,8 @@ def detect(root: Path) -> bool:
 def read(root: Path, options: ReaderOptions) -> Recording:
     """Find a sequence; the images have their background removed (black), cameras are camera-to-world on disk.
 
-    Fitted SMPL-X parameters of others (`smpl_params.npz` beside the scales, in AvatarReX's layout) are taken where
-    they are.
+    Fitted SMPL-X parameters of others (`smpl_params.npz` in AvatarReX's layout, beside `calibration.csv` or beside the
+    scales) are taken where they are.
 
     Raises:
         InputError: several scales, no camera, a broken calibration.
@@ -47,6 +47,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         kind: {name: FileSeries.find(folder / place / name, image_name(f"{name}_{tag}")) for name in cameras}
         for kind, place, tag in (("image", "rgbs", "rgb"), ("mask", "masks", "mask"))
     }
+    fits = [place / "smpl_params.npz" for place in (folder, sequence)]
     return Recording(
         name=f"{sequence.parent.name}_{sequence.name}" if folder != sequence else sequence.name,
         root=root,
@@ -54,7 +55,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         cameras=cameras,
         files=files,
         background=(0.0, 0.0, 0.0),
-        params=chosen_params(options, sequence / "smpl_params.npz"),
+        params=chosen_params(options, next((path for path in fits if path.is_file()), None)),
     )
 
 

@@ -21,12 +21,14 @@ from smplxpp.capture.readers.common import (
 )
 from smplxpp.capture.readers.opencv_yaml import read_opencv_yaml
 from smplxpp.capture.readers.options import ReaderOptions
-from smplxpp.capture.recording import Recording
+from smplxpp.capture.recording import Problem, Recording
 from smplxpp.core.errors import InputError
 from smplxpp.core.rotations import matrix_from_rotvec
 
 NAME = "easymocap"
 LOOKS_FOR = "intri.yml and extri.yml"
+# What its FileStorage.read drops from a list of names.
+_NO_CAMERA = "none"
 # Where its programs put fitted parameters, in the order of their worth to us.
 _PARAMS = ("output/smplx/smpl", "output/smplx", "output/smpl/smpl", "output/smpl", "smplx", "smpl")
 
@@ -41,13 +43,16 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     `annots/`.
 
     OpenCV's calibration, with pixel centres at whole numbers. The images' size is `H_CAM`, `W_CAM`, or that of the
-    camera's first image.
+    camera's first image. A camera that is called `none` is left out, as EasyMocap itself does when it reads names.
 
     Raises:
         InputError: a broken camera file, a camera in one of the two alone.
     """
     intri, extri = read_opencv_yaml(root / "intri.yml"), read_opencv_yaml(root / "extri.yml")
-    names = required(intri, "names", source=f"file {root / 'intri.yml'}")
+    listed = required(intri, "names", source=f"file {root / 'intri.yml'}")
+    if not isinstance(listed, list):
+        raise InputError(f"file {root / 'intri.yml'}: names", expected="a list", received=type(listed).__name__)
+    names = [name for name in listed if name != _NO_CAMERA]
     images = numbered_images({name: root / "images" / name for name in names})
     masks = first_folder(root, ("masks", "mask"))
     cameras, distortions = {}, {}
@@ -76,6 +81,9 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             "mask": {} if masks is None else numbered_images({name: masks / name for name in names}),
         },
         params=_params(root, options),
+        problems=()
+        if len(names) == len(listed)
+        else (Problem(f"camera {_NO_CAMERA}: left out, as EasyMocap itself does"),),
         keypoints=found_keypoints(root / "annots", cameras, format="easymocap", person=options.person),
     )
 

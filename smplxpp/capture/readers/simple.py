@@ -44,9 +44,20 @@ _BLACK = (0.0, 0.0, 0.0)
 
 def detect(root: Path) -> bool:
     """Tell whether a folder is in this layout. A calibration.csv without anything of ours is ActorsHQ's."""
-    if (root / "capture.json").is_file() or ((root / "cameras.json").is_file() and (root / "rgbs").is_dir()):
+    described = (root / "capture.json").is_file()
+    if described and _declared_format(root) != NAME:
+        return False
+    if described or ((root / "cameras.json").is_file() and (root / "rgbs").is_dir()):
         return True
     return (root / "scans").is_dir() and (root / "params").is_dir()
+
+
+def _declared_format(root: Path) -> str:
+    """The layout that a description speaks of: ours, unless it names another one, which it adds to."""
+    try:
+        return str(read_description(root).get("format", NAME))
+    except InputError:  # broken: our reader says so
+        return NAME
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:

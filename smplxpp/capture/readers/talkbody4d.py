@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from smplxpp.body import BodyModel, UpAxis, load_body
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries, subfolders
 from smplxpp.capture.params import ParamFiles
-from smplxpp.capture.readers.common import chosen_params, numbered_images, pinhole, required
+from smplxpp.capture.readers.common import chosen_params, first_folder, numbered_images, pinhole, required
 from smplxpp.capture.readers.options import ReaderOptions
-from smplxpp.capture.recording import Recording
+from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import read_json
+from smplxpp.core.validation import require_choice
 
 NAME = "talkbody4d"
 LOOKS_FOR = "a JSON file with `cameras` and `camera_poses`, beside a folder with a folder of images for each camera"
 _FPS = 20.0
 _CALIBRATION_KEYS = ("cameras", "camera_poses")
 _PARAM_KEYS = {"body_pose", "betas", "Rh", "Th"}
+# Folders of mattes, in the order in which they are taken; never images.
+_MATTES = ("mattings", "matting", "mattes", "masks", "mask", "alphas", "alpha", "mask_images")
+_TRIED_FILES = 3
+# y down, as OpenCV's cameras have it, to y up.
+_TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
+# Cosine from which on cameras stand on their heads: rigs of cameras on their sides are not judged.
+_UPSIDE_DOWN = 0.5
 
 
 def detect(root: Path) -> bool:
@@ -29,10 +41,11 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a recording: distorted photographs (undistorted on reading); masks only if the user made a `masks/`.
+    """Find a recording: distorted images of the person on black (undistorted on reading), mattes, parameters.
 
     The calibration is of OpenCV, with pixel centres at whole numbers; a pose is stored under the camera's own name or
-    as `CAM_to_REFERENCE`.
+    as `CAM_to_REFERENCE`. The set's world has y down: cameras and parameters are turned about x. A `capture.json` with
+    `"format": "talkbody4d"` says what differs: `"background": null` for photographs, `"up": "y"`.
 
     Raises:
         InputError: a broken calibration, no images.
@@ -40,15 +53,14 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     path = _calibration(root)
     if path is None:
         raise InputError(f"capture {root}", expected=LOOKS_FOR, received="none")
+    declared = _declared(root)
+    up: UpAxis = declared.get("up", "-y")
+    require_choice("up in capture.json of a TalkBody4D folder", up, ("y", "-y"))
     cameras, distortions = _read_calibration(path)
-    places = [root / "images", root, *(root / name for name in subfolders(root) if name != "masks")]
-    images = next((folder for folder in places if _has(folder, cameras)), None)
-    if images is None:
-        raise InputError(
-            f"capture {root}",
-            expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ...",
-            received=", ".join(subfolders(root)) or "no folder",
-        )
+    if up == "-y":
+        cameras = {name: replace(c, cam_from_world=c.cam_from_world @ _TURNED) for name, c in cameras.items()}
+    params, problems = _params(root, options, up)
+    masks = first_folder(root, _MATTES)
     return Recording(
         name=root.name,
         root=root,
@@ -56,12 +68,34 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         cameras=cameras,
         distortions=distortions,
         files={
-            "image": numbered_images({name: images / name for name in cameras}),
-            "mask": numbered_images({name: root / "masks" / name for name in cameras}),
+            "image": numbered_images(_images(root, cameras)),
+            "mask": {} if masks is None else numbered_images({name: masks / name for name in cameras}),
         },
-        params=_params(root, options),
+        background=_background(declared),
+        params=params,
         fps=_FPS,
+        problems=(*problems, *_standing(cameras)),
     )
+
+
+def _declared(root: Path) -> Mapping[str, Any]:
+    path = root / "capture.json"
+    content = read_json(path) if path.is_file() else {}
+    if not isinstance(content, Mapping):
+        raise InputError(f"file {path}", expected="an object", received=type(content).__name__)
+    return content
+
+
+def _background(declared: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """What images are on: the set's are on black already, so that their edges are not multiplied by the matte again."""
+    value = declared.get("background", [0.0, 0.0, 0.0])
+    if value not in (None, [0.0, 0.0, 0.0]):
+        raise InputError(
+            "background in capture.json of a TalkBody4D folder",
+            expected="[0, 0, 0] as the set has it, or null for photographs",
+            received=str(value)[:80],
+        )
+    return None if value is None else (0.0, 0.0, 0.0)
 
 
 def _calibration(root: Path) -> Path | None:
@@ -95,17 +129,76 @@ def _read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distorti
     return cameras, distortions
 
 
-def _has(folder: Path, cameras: Mapping[str, Any]) -> bool:
-    return any(numbered_images({name: folder / name for name in cameras if (folder / name).is_dir()}))
+def _images(root: Path, cameras: Mapping[str, Any]) -> dict[str, Path]:
+    """The folder of images of each camera: in `images/`, in the folder itself, or in any folder that is not of mattes.
+
+    Raises:
+        InputError: nowhere.
+    """
+    others = [name for name in subfolders(root) if name not in _MATTES]
+    for folder in (root / "images", root, *(root / name for name in others)):
+        if numbered_images({name: folder / name for name in cameras if (folder / name).is_dir()}):
+            return {name: folder / name for name in cameras}
+    raise InputError(
+        f"capture {root}",
+        expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ..., such as images/",
+        received=", ".join(name + (" (mattes)" if name in _MATTES else "") for name in subfolders(root)) or "no folder",
+    )
 
 
-def _params(root: Path, options: ReaderOptions) -> Any:
+def _standing(cameras: Mapping[str, Camera]) -> list[Problem]:
+    """Say it if most cameras stand on their heads: then the world was turned, or left, that should not have been."""
+    image_up = np.mean([-camera.cam_from_world[1, 1] for camera in cameras.values()]) if cameras else 1.0
+    if image_up > -_UPSIDE_DOWN:
+        return []
+    return [
+        Problem(
+            "the cameras stand upside down: TalkBody4D's world has y down and is turned; say in capture.json "
+            f'what points up in this one, {{"format": "{NAME}", "up": "y"}} or "-y"'
+        )
+    ]
+
+
+def _params(root: Path, options: ReaderOptions, up: UpAxis) -> tuple[ParamSource | None, list[Problem]]:
     if options.params is not None:
-        return chosen_params(options)
+        return chosen_params(options), []
     for name in subfolders(root):
         series = FileSeries.find(root / name, r"\D*(?P<frame>\d+)\.json")
-        if len(series):
-            content = read_json(series.required(int(series.numbers[0])))
-            if isinstance(content, Mapping) and content.keys() >= _PARAM_KEYS:
-                return ParamFiles(series, "talkbody4d", options.body)
-    return None
+        content = _first_readable(series)
+        if content.keys() >= _PARAM_KEYS:
+            reason = _unfitting(content, options.body or load_body())
+            if reason is None:
+                return ParamFiles(series, NAME, options.body, up), []
+            given = "the body given" if options.body is not None else "the open body, taken because none is given,"
+            message = f"parameters in {root / name} are left out: {given} has {reason}. Rh and Th move the posed body "
+            message += (
+                "about the origin, so its root joint is needed: name the model that they were fitted with (body=, "
+            )
+            message += (
+                "--body), or convert them for another one (smplxpp params convert --betas) and give these (params=)"
+            )
+            return None, [Problem(message)]
+    return None, []
+
+
+def _first_readable(series: FileSeries) -> Mapping[str, Any]:
+    for frame in series.numbers[:_TRIED_FILES].tolist():
+        try:
+            content = read_json(series.required(frame))
+        except InputError:  # the frame's own problem, told when it is read
+            continue
+        if isinstance(content, Mapping):
+            return content
+    return {}
+
+
+def _unfitting(content: Mapping[str, Any], body: BodyModel) -> str | None:
+    """What a body lacks of parameters, None if nothing."""
+    widths = [("betas", "betas", body.num_betas), ("expression", "expressions", body.num_expressions)]
+    for key, word, known in widths:
+        count = np.size(np.asarray(content.get(key, []), dtype=object))
+        if count > known:
+            return f"{known} {word}, not {count}"
+    offsets = content.get("v_shape")
+    count = body.vertex_count if offsets is None else np.size(np.asarray(offsets, dtype=object)) // 3
+    return None if count == body.vertex_count else f"{body.vertex_count} vertices, where v_shape has {count}"
