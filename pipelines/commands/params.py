@@ -35,9 +35,9 @@ class ParamsConvert:
     person: OptionalInt = None
     """Id of the person, for files with several."""
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
-    """Axis that points up in the input (AMASS: z); the output has y up. None: -y for TalkBody4D, y for all others."""
+    """Axis that points up in the input (AMASS: z); the output has y up. None: -y for TalkBody4D, else y."""
     betas: OptionalInt = None
-    """Keep the first so many betas, for a body that has no more; says what share of their length is lost (None: all)."""
+    """Keep the first so many betas, for a body that has no more; says which share is lost (None: all)."""
     flat_hand_mean: bool | None = None
     """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
     json: bool = False

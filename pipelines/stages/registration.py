@@ -54,9 +54,7 @@ def stacked_rows(frames: Sequence[int], params: BodyParams) -> dict[str, Any]:
         stacked = np.full((rows, arrays[name].shape[1]), np.nan)
         stacked[list(frames)] = arrays[name]
         arrays[name] = stacked
-    if params.v_shape is not None:
-        arrays["v_shape"] = params.offsets_by_row(frames)
-    return arrays
+    return arrays | params.offsets_by_row(frames)
 
 
 def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str, dict[str, Any]]:

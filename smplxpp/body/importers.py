@@ -116,7 +116,7 @@ def params_from_content(
 
 
 def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
-    """The first betas alone. Millimetres only a body could say that has all directions; their share can be said here."""
+    """The first betas alone. Only a body with all directions could say millimetres; their share can be said here."""
     if max_betas is None:
         return parts
     if max_betas < 0:
@@ -128,8 +128,8 @@ def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
     if dropped > 0:
         most = max(part.params.betas.shape[1] for part in parts)
         warnings.warn(
-            f"{most} betas are cut to {max_betas}: {100 * np.sqrt(dropped / (kept + dropped)):.1f} % of their length is "
-            "lost (root of the squares; a body with all of them would say how many millimetres)",
+            f"{most} betas are cut to {max_betas}: {100 * np.sqrt(dropped / (kept + dropped)):.1f} % of their length "
+            "is lost (root of the squares; a body with all of them would say how many millimetres)",
             GeometryWarning,
             stacklevel=3,
         )

@@ -92,9 +92,9 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
 def _read_easymocap(content: Any, person: int | None) -> Frames | None:
     """EasyMocap: one record a person, `V = R(Rh) X + Th` about the origin, where X is posed with `poses`.
 
-    Numbers of `poses`, as its `bodymodel` and its older `smplmodel` write them: 63 (body alone; SMPL-H, hands in
-    `handl` and `handr`, PCA or complete), 69 (SMPL), 156 (SMPL-H, complete) without or with a root of zeros; 66, 72, 78,
-    87 (SMPL-X, hands as 6 PCA numbers before the face) and 165 with it.
+    Numbers of `poses`, as its `bodymodel` and its older `smplmodel` write them: without a root 63 (SMPL-H: the body,
+    hands in `handl` and `handr`, PCA or axis-angle) and 69 (SMPL); with a root, which is zero, 66, 72 (SMPL), 78
+    (SMPL-H) and 87 (SMPL-X, hands of 6 PCA numbers before the face), and complete 156 (SMPL-H) and 165 (SMPL-X).
     """
     records = content if isinstance(content, list) else content.get("annots", [content])
     ids = [record.get("id", 0) for record in records]

@@ -44,8 +44,9 @@ class StackedParams:
         if rows > 1:
             for array in stacked.values():
                 good &= np.isfinite(array).all(axis=1)
-        if rows > 1 and np.ndim(arrays.get("v_shape")) == 3 and len(arrays["v_shape"]) == rows:
-            stacked["v_shape"] = arrays["v_shape"]
+        offsets = np.asarray(arrays.get("v_shape", ()))
+        if rows > 1 and offsets.ndim == 3 and len(offsets) == rows:
+            stacked["v_shape"] = offsets
         kept = arrays if good.all() else {**arrays, **{name: array[good] for name, array in stacked.items()}}
         if not good.any():
             raise InputError(f"file {self.path}", expected="finite values", received="NaN or infinity in every row")

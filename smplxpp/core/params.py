@@ -125,13 +125,16 @@ class BodyParams:
         """The poses alone, for a body that has the person's shape already: no betas, nothing added to the vertices."""
         return replace(self, betas=np.zeros((len(self), 0)), v_shape=None)
 
-    def offsets_by_row(self, frames: Sequence[int] | np.ndarray) -> Float64[np.ndarray, "R V 3"] | None:
-        """`v_shape` for a file whose row is the frame's number, NaN where there is no frame; one row if that does."""
+    def offsets_by_row(self, frames: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
+        """`v_shape`, where there is any, for a file whose row is the frame's number: NaN where there is no frame.
+
+        One row stands for all frames where it does here.
+        """
         if self.v_shape is None or len(self.v_shape) == 1:
-            return self.v_shape
+            return {} if self.v_shape is None else {"v_shape": self.v_shape}
         rows = np.full((int(max(frames)) + 1, *self.v_shape.shape[1:]), np.nan)
         rows[np.asarray(frames)] = self.v_shape
-        return rows
+        return {"v_shape": rows}
 
     @staticmethod
     def concatenate(parts: Sequence[BodyParams]) -> BodyParams:

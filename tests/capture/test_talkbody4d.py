@@ -56,7 +56,7 @@ def test_photographs_are_refused_until_they_are_declared(root, scene):
     assert find_problems(capture) == []
     assert capture.composited(next(iter(capture.cameras)), 0).max() > 0.3
     describe(root, background=[1, 1, 1])
-    with pytest.raises(InputError, match="background in capture.json"):
+    with pytest.raises(InputError, match=r"background in capture\.json"):
         open_capture(root)
 
 
@@ -109,7 +109,7 @@ def test_a_world_that_has_y_up_already_is_told_and_can_be_said(root):
     assert capture.problems == ()
     assert capture.params(0).transl[0, 1] < 0, "parameters follow: these have y down"
     describe(root, up="z")
-    with pytest.raises(InputError, match="up in capture.json"):
+    with pytest.raises(InputError, match=r"up in capture\.json"):
         open_capture(root)
 
 

@@ -168,7 +168,7 @@ def _params(root: Path, options: ReaderOptions, up: UpAxis) -> tuple[ParamSource
         if content.keys() >= _PARAM_KEYS:
             reason = _unfitting(content, options.body or load_body())
             if reason is None:
-                return ParamFiles(series, NAME, options.body, up), []
+                return ParamFiles(series, "talkbody4d", options.body, up), []
             given = "the body given" if options.body is not None else "the open body, taken because none is given,"
             message = f"parameters in {root / name} are left out: {given} has {reason}. Rh and Th move the posed body "
             message += (

@@ -36,7 +36,6 @@ def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
         values = getattr(joined, name)
         arrays[name] = np.full((rows.max() + 1, values.shape[1]), np.nan)
         arrays[name][rows] = values
-    if joined.v_shape is not None:
-        arrays["v_shape"] = joined.offsets_by_row(rows)
+    arrays |= joined.offsets_by_row(rows)
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # numpy: the names might be `allow_pickle`
