@@ -15,10 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.json_file import as_numbers
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 
 _JOINTS = dict(POSE_BLOCKS)
 _EASYMOCAP_HAND_PCA = 6
+# Radians and metres: nobody turns or goes farther.
+_FARTHEST = 1e6
 # Poses with all fingers: of SMPL-H and of SMPL-X. VPoser's numbers, which some of its models write instead.
 _EASYMOCAP_COMPLETE, _EASYMOCAP_EMBEDDING = (156, 165), 32
 
@@ -223,7 +226,10 @@ def _split(poses: np.ndarray, *, face_first: bool) -> dict[str, np.ndarray]:
 
 
 def _outer(record: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    rotvec, shift = (np.asarray(record[key], dtype=np.float64).reshape(-1, 3) for key in ("Rh", "Th"))
+    rotvec, shift = (as_numbers(record[key], subject=key).reshape(-1, 3) for key in ("Rh", "Th"))
+    for key, value in (("Rh", rotvec), ("Th", shift)):
+        if not (np.abs(value) <= _FARTHEST).all():
+            raise InputError(key, expected=f"numbers within {_FARTHEST:g}", received=f"{np.abs(value).max():g}")
     return rotvec, shift
 
 

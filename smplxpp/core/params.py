@@ -24,6 +24,8 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
 )
 # Every array of BodyParams, in the order of its fields.
 ARRAY_NAMES: tuple[str, ...] = (*(name for name, _ in POSE_BLOCKS), "betas", "expression", "transl")
+# Of radians, metres and coefficients: nobody has more, and squares of far more overflow.
+_LARGEST = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +81,12 @@ class BodyParams:
                 value = np.repeat(value, frames, axis=0)
             if value.shape[0] != frames:
                 raise InputError(f"parameter {name}", expected=f"{frames} frames", received=f"{value.shape[0]} frames")
-            bad = ~np.isfinite(value).all(axis=1)
+            bad = ~(np.abs(value) <= _LARGEST).all(axis=1)
             if bad.any():
                 raise InputError(
                     f"parameter {name}",
-                    expected="finite values",
-                    received=f"NaN or infinity in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}",
+                    expected=f"finite values, none beyond {_LARGEST:g}",
+                    received=f"others or NaN in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}",
                 )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -269,8 +271,8 @@ def _vertex_offsets(value: object, frames: int) -> np.ndarray:
         raise InputError(
             subject, expected=f"shape (V, 3), (1, V, 3) or ({frames}, V, 3)", received=f"shape {offsets.shape}"
         )
-    if not np.isfinite(offsets).all():
-        raise InputError(subject, expected="finite values", received="NaN or infinity")
+    if not (np.abs(offsets) <= _LARGEST).all():
+        raise InputError(subject, expected=f"finite values, none beyond {_LARGEST:g}", received="others or NaN")
     offsets.setflags(write=False)
     return offsets
 

@@ -11,7 +11,7 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.json_file import as_numbers, read_json
 
 NAME = "avatarrex"
 LOOKS_FOR = "calibration_full.json"
@@ -60,7 +60,8 @@ def read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distortio
     for name, entry in content.items():
         source = f"file {path}: camera {name}"
         K, R, T, size = (required(entry, key, source=source) for key in ("K", "R", "T", "imgSize"))
-        cameras[name] = pinhole(name, K, R, T, tuple(size), opencv_pixels=True)
+        width, height = as_numbers(size, (2,), subject=f"{source}: imgSize").tolist()
+        cameras[name] = pinhole(name, K, R, T, (width, height), opencv_pixels=True)
         distortion = Distortion.from_opencv(entry.get("distCoeff", []), subject=source)
         if distortion is not None:
             distortions[name] = distortion

@@ -18,7 +18,7 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.json_file import as_numbers, read_json
 from smplxpp.core.validation import require_choice
 
 NAME = "talkbody4d"
@@ -122,7 +122,8 @@ def _read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distorti
             )
         K, size = (required(entry, key, source=source) for key in ("K", "image_size"))
         R, T = (required(pose, key, source=source) for key in ("R", "T"))
-        cameras[name] = pinhole(name, K, R, T, tuple(size), opencv_pixels=True)
+        width, height = as_numbers(size, (2,), subject=f"{source}: image_size").tolist()
+        cameras[name] = pinhole(name, K, R, T, (width, height), opencv_pixels=True)
         distortion = Distortion.from_opencv(entry.get("dist", []), subject=source)
         if distortion is not None:
             distortions[name] = distortion
