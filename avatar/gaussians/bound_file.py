@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Int
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.tensor_file import open_tensor_file, require_finite
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_text, shown
 
 SCHEMA = 1
 _KIND = "bound_gaussians"
+_REMEDY = "take the file that `smplxpp fit-reference` wrote, or fit again"
 
 
 def save_bound(bound: BoundGaussians, path: str | Path) -> None:
@@ -38,32 +43,55 @@ def load_bound(path: str | Path, *, faces: Int[np.ndarray, "F 3"] | None = None)
     Raises:
         InputError: a missing, damaged or foreign file, numbers that are not finite, or Gaussians of another mesh.
     """
-    path = Path(path)
     subject = f"Gaussians {path}"
-    if not path.is_file():
-        raise InputError(subject, expected="an existing file", received="none")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise InputError(subject, expected="a safetensors file", received=str(error)) from None
-    try:
-        about = json.loads(metadata.get(_KIND, "{}"))
-        schema = about.get("schema", "?") if _KIND in metadata else "something else"
-    except (ValueError, AttributeError):
-        about, schema = {}, "unreadable"
+    file = open_tensor_file(path, subject=subject, header=_KIND, remedy=_REMEDY)
+    schema = file.about.get("schema")
     if schema != SCHEMA:
-        raise InputError(subject, expected=f"{_KIND} of schema {SCHEMA}", received=f"schema: {schema}")
-    try:
-        bound = BoundGaussians(**tensors, face_count=int(about["face_count"]), topology=about["topology"])
-    except InputError as error:
-        raise InputError(f"{subject}: {error.subject}", expected=error.expected, received=error.received) from None
-    except (TypeError, KeyError, AttributeError, ValueError) as error:
-        raise InputError(subject, expected="all tensors of bound Gaussians", received=str(error)) from None
-    for name, value in bound.tensors.items():
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise InputError(f"{subject}: {name}", expected="finite values", received="NaN or infinity")
+        raise InputError(subject, expected=f"{_KIND} of schema {SCHEMA}", received=f"schema: {shown(schema)}")
+    bound = bound_from_tensors(file.tensors(), file.about, subject=subject)
     if faces is not None:
         bound.check_topology(faces, subject)
+    return bound
+
+
+def bound_from_tensors(tensors: Mapping[str, Tensor], about: Mapping[str, Any], *, subject: str) -> BoundGaussians:
+    """Make the Gaussians that a file holds.
+
+    Args:
+        tensors: the attributes by name, no others; integers of any size.
+        about: what the file says of them: `face_count` and `topology`.
+        subject: of messages.
+
+    Raises:
+        InputError: attributes that are missing, unknown, of other shapes or types, or not finite; a quaternion of no
+            length.
+    """
+    names = [field.name for field in fields(BoundGaussians) if field.name not in ("face_count", "topology")]
+    if set(tensors) != set(names):
+        missing, unknown = sorted(set(names) - set(tensors)), sorted(set(tensors) - set(names))
+        received = [f"no {', '.join(missing)}"] if missing else []
+        received += [f"unknown {', '.join(unknown)[:200]}"] if unknown else []
+        raise InputError(
+            subject,
+            expected=f"all tensors of bound Gaussians: {', '.join(names)}",
+            received="; ".join(received),
+            remedy=_REMEDY,
+        )
+    count = as_integer(about.get("face_count"), subject=f"{subject}: face_count", least=0)
+    topology = as_text(about.get("topology"), subject=f"{subject}: topology")
+    index = tensors["face_index"]
+    if index.is_floating_point() or index.is_complex() or index.ndim != 1:
+        raise InputError(
+            f"{subject}: face_index", expected="whole numbers of shape (N,)", received=f"{index.dtype}, {index.ndim} D"
+        )
+    for name, value in tensors.items():
+        if name != "face_index" and not value.is_floating_point():
+            raise InputError(f"{subject}: {name}", expected="floats", received=str(value.dtype))
+    require_finite(tensors, subject=subject, remedy=_REMEDY)
+    try:
+        bound = BoundGaussians(**{**tensors, "face_index": index.long()}, face_count=count, topology=topology)
+    except InputError as error:
+        raise InputError(f"{subject}: {error.subject}", expected=error.expected, received=error.received) from None
+    if bool((bound.quats == 0).all(dim=1).any()):
+        raise InputError(f"{subject}: quats", expected="quaternions of any length but zero", received="zero")
     return bound

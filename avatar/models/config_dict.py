@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from avatar.models.networks.limits import LARGEST_NUMBER
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -38,10 +40,14 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
             remedy="the checkpoint was made by another version: train again, or use the version that made it",
         )
     for name, default in defaults.items():
+        value = stored[name]
         # 1 stands for 1.0 in JSON written by hand; True never stands for 1.
         accepted = (float, int) if type(default) is float else (type(default),)
-        if type(stored[name]) not in accepted:
+        usable = type(value) in accepted and (not isinstance(value, int | float) or abs(value) <= LARGEST_NUMBER)
+        if not usable:  # NaN is not
             raise InputError(
-                f"stored {cls.__name__}.{name}", expected=type(default).__name__, received=repr(stored[name])
+                f"stored {cls.__name__}.{name}",
+                expected=f"{type(default).__name__}, numbers up to {LARGEST_NUMBER}",
+                received=shown(value),
             )
     return cls(**{name: type(default)(stored[name]) for name, default in defaults.items()})

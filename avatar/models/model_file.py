@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
-from avatar.models.config_dict import config_from_dict, config_to_dict
-from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
-from avatar.models.networks.deformation_field import FieldConfig, show_null_code
-from avatar.models.networks.teacher import TeacherConfig
+from avatar.gaussians.bound_file import bound_from_tensors
+from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
+from avatar.models.config_dict import config_to_dict
+from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes, mapping_networks
+from avatar.models.networks.deformation_field import FieldConfig, FieldNetwork, show_null_code
+from avatar.models.networks.teacher import Teacher, TeacherConfig
+from avatar.models.stored_model import StoredModel
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, shown
 
 SCHEMA = 1
 HEADER = "avatar"
 GAUSSIANS = "gaussians."
-SHAPES = "blend_shapes."
 KINDS = ("teacher", "student")
+_EXPECTED = "a file that `smplxpp train` wrote"
+_REMEDY = "take the file as `smplxpp train` wrote it, or train again"
 
 
 def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bool = False) -> int:
@@ -62,95 +67,93 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
 def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
     """Read what `save_avatar` wrote, on the rig's device.
 
+    Everything is held against the tensors of the file before a network is made: what the header says cannot take more
+    memory than they do.
+
     Raises:
-        InputError: a missing, damaged or foreign file, one of a newer version, or one of another template.
+        InputError: a missing, damaged or foreign file, one of a newer version, one of another template, numbers that
+            are not finite.
     """
-    about, tensors = _read(Path(path))
-    tensors = {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}
-    if about["topology"] != topology_digest(rig.faces):
+    subject = f"avatar {path}"
+    file = open_tensor_file(path, subject=subject, header=HEADER, expected=_EXPECTED, remedy=_REMEDY)
+    _check_version(file.about, subject)
+    if file.about.get("topology") != topology_digest(rig.faces):
         raise InputError(
-            f"avatar {path}",
+            subject,
             expected="one of this template",
             received="Gaussians on other faces",
             remedy="train again: the template was built anew since",
         )
-    gaussians = _gaussians(tensors, about)
-    model: TeacherAvatar | Student
-    if about["kind"] == "teacher":
-        model = _teacher(about, tensors, rig, gaussians)
-    else:
-        model = _student(about, tensors, rig, gaussians)
-    _load(model, tensors, path)
+    tensors = {name: value.float() if value.is_floating_point() else value for name, value in file.tensors().items()}
+    require_finite(tensors, subject=subject, remedy=_REMEDY)
+    own = {name.removeprefix(GAUSSIANS): value for name, value in tensors.items() if name.startswith(GAUSSIANS)}
+    gaussians = bound_from_tensors(own, file.about, subject=subject)
+    stored = StoredModel(file.about, tensors, subject)
+    try:
+        make = _teacher if file.about["kind"] == "teacher" else _student
+        model = make(stored, rig, gaussians)
+    except InputError as error:
+        if error.subject.startswith(subject):
+            raise
+        named = {name: getattr(error, name) for name in ("expected", "received", "remedy")}
+        raise InputError(f"{subject}: {error.subject}", **named) from None
+    state: Mapping[str, Tensor] = model.state_dict()
+    require_like(tensors, state, subject=subject, remedy=_REMEDY)
+    unknown = sorted(set(tensors) - set(state))
+    if unknown:  # left out without a word they would leave another avatar
+        raise InputError(
+            subject, expected="the tensors of the model alone", received=", ".join(unknown)[:200], remedy=_REMEDY
+        )
+    model.load_state_dict(dict(tensors))
     return model.eval()
 
 
-def _teacher(
-    about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, gaussians: BoundGaussians
-) -> TeacherAvatar:
-    teacher = TeacherAvatar(config_from_dict(TeacherConfig, about["config"]), rig, gaussians)
-    if "track_controls" in tensors:
-        frames, controls = tensors["track_frames"].tolist(), tensors["track_controls"]
+def _check_version(about: Mapping[str, Any], subject: str) -> None:
+    schema = as_integer(about.get("schema"), subject=f"{subject}: schema", least=1)
+    if schema > SCHEMA:
+        raise InputError(
+            subject,
+            expected=f"version {SCHEMA} or older",
+            received=f"version {schema}",
+            remedy="update smplxpp to the version that wrote it",
+        )
+    if about.get("kind") not in KINDS:
+        raise InputError(
+            f"{subject}: kind", expected=" or ".join(KINDS), received=shown(about.get("kind")), remedy=_REMEDY
+        )
+
+
+def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> TeacherAvatar:
+    config = stored.config("config", TeacherConfig)
+    assert config is not None  # what a teacher is never without
+    stored.require_networks({"networks": lambda: Teacher(config)})
+    teacher = TeacherAvatar(config, rig, gaussians)
+    if "track_controls" in stored.tensors:
+        frames, controls = stored.track(rig.template.vertex_count)
         row = {frame: k for k, frame in enumerate(frames)}
         teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1])))
     return teacher
 
 
-def _student(about: Mapping[str, Any], tensors: Mapping[str, Tensor], rig: Rig, gaussians: BoundGaussians) -> Student:
-    field = None if about["field"] is None else config_from_dict(FieldConfig, about["field"])
+def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Student:
+    field = stored.config("field", FieldConfig, optional=True)
+    shapes_config = stored.config("blend_shapes", BlendShapeConfig, optional=True)
+    frames = stored.frames()
+    if field is not None:
+        network = partial(FieldNetwork, field)
+        stored.require_networks({"field.body": network, "field.cloth": network})
+        stored.require("codes.codes", (len(frames), field.code_size))
     shapes = None
-    if about["blend_shapes"] is not None:
-        extra = {name: tensors.get(SHAPES + name) for name in ("part", "head_weight", "active")}
-        extra = {
-            name: value.long() if name != "head_weight" and value is not None else value
-            for name, value in extra.items()
-        }
-        shapes = BlendShapes(config_from_dict(BlendShapeConfig, about["blend_shapes"]), len(gaussians), **extra)
-    config = StudentConfig(field, None if shapes is None else shapes.config, about["control_points"])
-    student = Student(config, rig, gaussians, tuple(about["frames"]), blend_shapes=shapes)
-    if about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
+    if shapes_config is not None:
+        stored.require_networks({"blend_shapes": lambda: nn.ModuleDict(mapping_networks(shapes_config))})
+        extra = stored.blended(shapes_config, len(gaussians))
+        shapes = BlendShapes(shapes_config, len(gaussians), **extra)
+    control_points = as_integer(stored.about.get("control_points"), subject="control_points", least=0)
+    config = StudentConfig(field, shapes_config, control_points)
+    student = Student(config, rig, gaussians, frames, blend_shapes=shapes)
+    if stored.about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
         show_null_code(student)
     return student
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {})[HEADER])
-            newer = about["schema"] > SCHEMA
-            kinds = {name: type(about[name]) for name in ("kind", "topology", "face_count")}
-            if not newer and (kinds != {"kind": str, "topology": str, "face_count": int} or about["kind"] not in KINDS):
-                raise ValueError(f"an unknown kind of model, {about['kind']!r}")
-            tensors = {} if newer else {name: file.get_tensor(name) for name in file.keys()}
-    except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise InputError(
-            f"avatar {path}", expected="a file that `smplxpp train` wrote", received=str(error) or type(error).__name__
-        ) from error
-    if newer:
-        raise InputError(
-            f"avatar {path}",
-            expected=f"version {SCHEMA} or older",
-            received=f"version {about['schema']}",
-            remedy="update smplxpp to the version that wrote it",
-        )
-    return about, tensors
-
-
-def _gaussians(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> BoundGaussians:
-    own = {name.removeprefix(GAUSSIANS): value for name, value in tensors.items() if name.startswith(GAUSSIANS)}
-    own["face_index"] = own["face_index"].long()
-    return BoundGaussians(**own, face_count=about["face_count"], topology=about["topology"])
-
-
-def _load(model: nn.Module, tensors: Mapping[str, Tensor], path: str | Path) -> None:
-    own: Mapping[str, Tensor] = model.state_dict()
-    for name, value in own.items():
-        if name not in tensors or tensors[name].shape != value.shape:
-            raise InputError(
-                f"avatar {path}",
-                expected=f"{name} of shape {tuple(value.shape)}",
-                received="none" if name not in tensors else f"shape {tuple(tensors[name].shape)}",
-            )
-    model.load_state_dict({name: tensors[name] for name in own})
 
 
 def _stored(value: Tensor, compact: bool) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -208,3 +209,93 @@ def test_metadata_that_makes_no_sense_is_refused(rig, tmp_path, about):
     changed(path, about=about)
     with pytest.raises(InputError):
         load_avatar(path, rig)
+
+
+def content(path) -> tuple[dict, dict[str, torch.Tensor]]:
+    """What a file says of itself, and its tensors."""
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()[HEADER]), {name: file.get_tensor(name) for name in file.keys()}
+
+
+def written(path, about: object, tensors: dict[str, torch.Tensor]):
+    save_file(tensors, path, metadata={HEADER: json.dumps(about)})
+    return path
+
+
+FULL = ("tracked", "centred", "student", "pruned")
+
+
+@pytest.mark.parametrize("compact", [False, True])
+@pytest.mark.parametrize("kind", FULL)
+def test_every_tensor_is_needed_in_its_shape_finite_and_of_its_kind(kind, compact, rig, tmp_path):
+    save_avatar(tmp_path / "good", make(kind, rig), compact=compact)
+    about, tensors = content(tmp_path / "good")
+    path = tmp_path / "bad"
+    for name, value in tensors.items():
+        short = name.removeprefix("gaussians.")
+        without = {other: kept for other, kept in tensors.items() if other != name}
+        if name != "track_controls":  # without it a teacher has no track
+            with pytest.raises(InputError, match=rf"{short}.*received n[o]"):
+                load_avatar(written(path, about, without), rig)
+        wrong = [value.new_zeros((*value.shape, 2)), ~value if value.dtype == torch.bool else value.to(torch.bool)]
+        if value.is_floating_point():
+            spoilt = value.clone()
+            spoilt.view(-1)[-1] = float("nan")
+            with pytest.raises(InputError, match=rf"{short}: expected finite values, received NaN or infinity in 1 of"):
+                load_avatar(written(path, about, tensors | {name: spoilt}), rig)
+            wrong.append(value.int())
+        elif value.dtype != torch.bool:
+            wrong.append(value.float())
+        for other in wrong:
+            with pytest.raises(InputError, match=short):
+                load_avatar(written(path, about, tensors | {name: other}), rig)
+
+
+@pytest.mark.parametrize("kind", FULL)
+@pytest.mark.parametrize(
+    "wrong", [None, [], {}, "x", -1, 1.5, float("nan"), 10**6, 10**9, 10**30, [10**30], [[]], {"a": 1}]
+)
+def test_metadata_of_another_kind_is_refused_before_anything_is_made(kind, wrong, rig, tmp_path):
+    """Or gives the same model, where the value says the same; a size that the tensors do not have takes no memory."""
+    save_avatar(tmp_path / "good", make(kind, rig))
+    about, tensors = content(tmp_path / "good")
+    changed_abouts = [about | {name: wrong} for name in about]
+    for name, value in about.items():
+        if isinstance(value, dict):
+            changed_abouts += [about | {name: value | {field: wrong}} for field in value]
+    for changed_about in changed_abouts:
+        try:
+            model = load_avatar(written(tmp_path / "bad", changed_about, tensors), rig)
+        except InputError as error:
+            assert str(tmp_path / "bad") in str(error)
+            continue
+        assert model.state_dict().keys() == tensors.keys()
+
+
+@pytest.mark.parametrize("kind", FULL)
+def test_metadata_that_lacks_an_entry_is_refused(kind, rig, tmp_path):
+    save_avatar(tmp_path / "good", make(kind, rig))
+    about, tensors = content(tmp_path / "good")
+    for name in set(about) - {"null_code_shown"}:
+        lacking = {other: value for other, value in about.items() if other != name}
+        with pytest.raises(InputError, match=name if name != "topology" else "this template"):
+            load_avatar(written(tmp_path / "bad", lacking, tensors), rig)
+
+
+def test_damaged_bytes_give_a_model_or_words(rig, tmp_path):
+    save_avatar(tmp_path / "good", make("pruned", rig), compact=True)
+    data = (tmp_path / "good").read_bytes()
+    header = 8 + int.from_bytes(data[:8], "little")
+    rng = np.random.default_rng(0)
+    outcomes = {"read": 0, "refused": 0}
+    for _ in range(300):
+        changed_data = bytearray(data)
+        for place in rng.integers(0, header if rng.random() < 0.7 else len(data), rng.integers(1, 4)):
+            changed_data[place] = rng.integers(256)
+        (tmp_path / "bad").write_bytes(changed_data[: rng.integers(len(data)) if rng.random() < 0.1 else len(data)])
+        try:
+            load_avatar(tmp_path / "bad", rig)
+            outcomes["read"] += 1
+        except InputError:
+            outcomes["refused"] += 1
+    assert outcomes["refused"] > 50 and outcomes["read"] > 5

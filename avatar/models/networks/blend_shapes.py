@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
+from avatar.models.networks.limits import MOST_LAYERS
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.validation import require_at_least, require_between
 
 STORED_BYTES = 2
 """Bytes of a stored coefficient (half precision)."""
@@ -41,8 +42,9 @@ class BlendShapeConfig:
     parts: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("head_shapes", "body_shapes", "expression_size", "pose_size", "width", "hidden_layers", "parts"):
+        for name in ("head_shapes", "body_shapes", "expression_size", "pose_size", "width", "parts"):
             require_at_least(f"blend shapes {name}", getattr(self, name), 1)
+        require_between("blend shapes hidden_layers", self.hidden_layers, 1, MOST_LAYERS)
 
     @property
     def shapes(self) -> int:
@@ -53,6 +55,14 @@ class BlendShapeConfig:
     def head_inputs(self) -> int:
         """The length of what drives the head."""
         return self.expression_size + 3 * self.jaw
+
+
+def mapping_networks(config: BlendShapeConfig) -> dict[str, nn.Module]:
+    """Make the networks H, "head", and B, "body"."""
+    return {
+        "head": _mapping_network(config.head_inputs, config.parts * config.head_shapes, config),
+        "body": _mapping_network(config.pose_size, config.parts * config.body_shapes, config),
+    }
 
 
 def _mapping_network(inputs: int, outputs: int, config: BlendShapeConfig) -> nn.Sequential:
@@ -121,8 +131,8 @@ class BlendShapes(nn.Module):
                 "active Gaussians", expected=f"increasing indices below {count}", received=f"{active.tolist()[:8]} ..."
             )
         self.config, self.count = config, count
-        self.head = _mapping_network(config.head_inputs, config.parts * config.head_shapes, config)
-        self.body = _mapping_network(config.pose_size, config.parts * config.body_shapes, config)
+        networks = mapping_networks(config)
+        self.head, self.body = networks["head"], networks["body"]
         self.U = nn.Parameter(torch.zeros(len(active), 3, config.shapes))
         self.C = nn.Parameter(torch.zeros(len(active), 3, config.shapes))
         self.register_buffer("active", active)

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from avatar.models.networks.control_points import ControlPoints
+from avatar.models.networks.limits import MOST_LAYERS
 from avatar.models.networks.sparse_rows import SparseRows
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.validation import require_at_least, require_between
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,10 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         for name in ("frequencies", "local_pose"):
-            require_at_least(f"field {name}", getattr(self, name), 0)
-        for name in ("pose_size", "code_size", "width", "hidden_layers"):
+            require_between(f"field {name}", getattr(self, name), 0, MOST_LAYERS)
+        for name in ("pose_size", "code_size", "width"):
             require_at_least(f"field {name}", getattr(self, name), 1)
+        require_between("field hidden_layers", self.hidden_layers, 1, MOST_LAYERS)
 
     @property
     def encoding_size(self) -> int:
@@ -61,7 +63,7 @@ def positional_encoding(points: Float[Tensor, "*P 3"], frequencies: int) -> Floa
     return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
 
 
-class _FieldNetwork(nn.Module):
+class FieldNetwork(nn.Module):
     """MLP on `phi(v) + theta + z`; the last layer starts at zero.
 
     The first layer is linear in its parts: that of pose and code is computed once a frame (and once for every set of
@@ -143,8 +145,8 @@ class DeformationField(nn.Module):
                 received="none" if seen is None else f"shape {tuple(seen.shape)}",
             )
         self.config = config
-        self.body = _FieldNetwork(config)
-        self.cloth = _FieldNetwork(config)
+        self.body = FieldNetwork(config)
+        self.cloth = FieldNetwork(config)
         if control is not None:
             where = torch.as_tensor(control.vertices, device=vertices.device)
             vertices, cloth_mask = vertices[where], cloth_mask[where]

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avatar.models.networks.limits import LARGEST_SIDE, MOST_LAYERS
 from avatar.models.networks.stylegan2_layers import (
     GAIN,
     SLOPE,
@@ -26,7 +27,7 @@ from avatar.models.networks.stylegan2_layers import (
     ToMaps,
 )
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.validation import require_at_least, require_between
 
 STYLE_LR_MULTIPLIER = 0.01
 """Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""
@@ -70,12 +71,15 @@ class StyleUNetConfig:
     def __post_init__(self) -> None:
         for name in ("in_size", "out_size", "bottleneck"):
             value = getattr(self, name)
-            if value < 1 or value & (value - 1):
-                raise InputError(f"StyleUNet {name}", expected="a power of two", received=str(value))
+            if not 1 <= value <= LARGEST_SIDE or value & (value - 1):
+                raise InputError(
+                    f"StyleUNet {name}", expected=f"a power of two, at most {LARGEST_SIDE}", received=str(value)
+                )
         require_at_least("StyleUNet in_size", self.in_size, 4 * self.bottleneck)
         require_at_least("StyleUNet out_size", self.out_size, 8 * self.bottleneck)
-        for name in ("in_channels", "channel_max", "style_size", "style_layers"):
+        for name in ("in_channels", "channel_max", "style_size"):
             require_at_least(f"StyleUNet {name}", getattr(self, name), 1)
+        require_between("StyleUNet style_layers", self.style_layers, 1, MOST_LAYERS)
         require_at_least("StyleUNet channel_base", self.channel_base, max(self.in_size, self.out_size) // 2)
         if not self.heads or min(head.channels for head in self.heads) < 1:
             raise InputError(

@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from avatar.gaussians.tensor_file import open_tensor_file
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_number, shown
 
 SCHEMA = 1
 log = logging.getLogger(__name__)
@@ -54,27 +55,26 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
     if not path.exists():
         return None
     try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {})["training"])
-            schema, found = about["schema"], {"key": None, **about}["key"]
-            own = schema == SCHEMA and found == key
-            tensors = {name: file.get_tensor(name) for name in file.keys()} if own else {}
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        file = open_tensor_file(path, subject=f"checkpoint {path}", header="training")
+        schema, found = file.about["schema"], file.about.get("key")
+        if schema == SCHEMA and found == key:
+            iteration = as_integer(file.about.get("iteration"), subject="iteration", least=0)
+            seconds = as_number(file.about.get("seconds"), subject="seconds", least=0.0)
+            return Checkpoint(iteration, seconds, key, file.tensors())
+    except (InputError, KeyError) as error:
         log.warning("%s cannot be read (%s): the training starts over", path, error)
         return None
-    if own:
-        return Checkpoint(int(about["iteration"]), float(about["seconds"]), key, tensors)
     if schema != SCHEMA:
         raise InputError(
             f"checkpoint {path}",
             expected=f"version {SCHEMA} of the format",
-            received=f"version {schema}",
+            received=f"version {shown(schema)}",
             remedy="go on with the smplxpp that wrote it; to start anew, delete it (--force does)",
         )
     raise InputError(
         f"checkpoint {path}",
         expected="one of these options, inputs and code",
-        received=f"one of others, at iteration {about.get('iteration')}",
+        received=f"one of others, at iteration {shown(file.about.get('iteration'))}",
         remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
         "(--force does)",
     )

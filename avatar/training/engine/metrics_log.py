@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from smplxpp.core.atomic import atomic_write_text
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.json_file import as_integer, as_object, as_text, parse_json
 from smplxpp.core.json_values import jsonable
+
+log = logging.getLogger(__name__)
 
 
 def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
@@ -19,24 +23,36 @@ def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
-    """Return all entries; a last line that a kill cut short is left out."""
+    """Return all entries: objects with a kind and an iteration. A last line that a kill cut short is left out.
+
+    Lines that are something else are left out too, with a warning in the log.
+    """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_bytes().split(b"\n")
     except OSError:
         return []
-    entries = []
-    for line in lines:
-        try:
-            entries.append(json.loads(line))
-        except ValueError:
-            break
-    return entries
+    read = [_entry(line) for line in lines]
+    foreign = [number for number, entry in enumerate(read[:-1], start=1) if entry is None and lines[number - 1].strip()]
+    if foreign:
+        log.warning("%s: %d lines are no entries of a log and left out, the first is %d", path, len(foreign), foreign[0])
+    return [entry for entry in read if entry is not None]
 
 
 def truncate_metrics(path: str | Path, iteration: int) -> None:
     """Drop the entries after `iteration`: those steps are done again from the checkpoint."""
     kept = [entry for entry in read_metrics(path) if entry["iteration"] <= iteration]
     atomic_write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))
+
+
+def _entry(line: bytes) -> dict[str, Any] | None:
+    """A line's entry; None for anything else."""
+    try:
+        entry = as_object(parse_json(line, subject="line"), subject="line")
+        as_text(entry.get("kind"), subject="kind")
+        as_integer(entry.get("iteration"), subject="iteration", least=0)
+    except InputError:
+        return None
+    return entry
 
 
 class TensorboardLog:

@@ -11,11 +11,13 @@ from typing import Any, Generic, Literal, TypeVar
 import torch
 from torch import Tensor
 
+from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
 Batch = TypeVar("Batch")
+_START_ANEW = "delete the file of its state, or give --force, to start anew"
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -179,7 +181,18 @@ class OptimizationTask(ABC, Generic[Batch]):
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `state` gave, bit for bit."""
+        """Take what `state` gave, bit for bit.
+
+        Raises:
+            InputError: tensors that are missing, of another shape or type, or not finite; nothing was taken.
+        """
+        wanted = dict(self.learned)
+        for key, value in self.learned.items():
+            if any(f"adam.{moment}.{key}" in tensors for moment in MOMENTS):
+                shapes = {"step": torch.empty(()), "exp_avg": value, "exp_avg_sq": value}
+                wanted |= {f"adam.{moment}.{key}": shapes[moment] for moment in MOMENTS}
+        require_like(tensors, wanted, subject="checkpoint", remedy=_START_ANEW)
+        require_finite({name: tensors[name] for name in wanted}, subject="checkpoint", remedy=_START_ANEW)
         with torch.no_grad():
             for key, value in self.learned.items():
                 value.copy_(tensors[key])

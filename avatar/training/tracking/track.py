@@ -16,6 +16,7 @@ from torch import Tensor
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.loop import Progress
@@ -212,6 +213,8 @@ class TrackTask(PhotometricTask):
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take what `state` gave."""
+        require_like(tensors, {"solved": self.solved}, subject="checkpoint")
+        require_finite({"solved": tensors["solved"]}, subject="checkpoint")
         super().restore(tensors)
         self.solved.copy_(tensors["solved"])
 

@@ -212,7 +212,7 @@ def test_tensorboard_gets_every_number_of_the_log_once(tmp_path):
 def test_metrics_survive_a_line_that_was_cut_short(tmp_path):
     path = tmp_path / "metrics.jsonl"
     for k in range(4):
-        append_metrics(path, {"iteration": k, "loss": math.nan if k == 1 else 0.5})
+        append_metrics(path, {"kind": "step", "iteration": k, "loss": math.nan if k == 1 else 0.5})
     path.write_text(path.read_text() + '{"iteration": 4, "lo')
     assert [e["iteration"] for e in read_metrics(path)] == [0, 1, 2, 3]
     assert read_metrics(path)[1]["loss"] is None

@@ -1,0 +1,118 @@
+"""The one door for files of tensors: safetensors with a header of our own, everything checked before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_object, parse_json
+from smplxpp.core.paths import regular_file
+
+_DAMAGED = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError)
+"""What a damaged file, or a type that torch does not know, makes the library raise."""
+
+
+@dataclass(frozen=True)
+class TensorFile:
+    """A file of tensors whose header was read; the tensors come when they are asked for.
+
+    Attributes:
+        path, subject: of the file; the subject names it in messages.
+        expected: what it should be, for messages.
+        about: what the header says; empty for a file without one.
+    """
+
+    path: Path
+    subject: str
+    expected: str
+    about: Mapping[str, Any]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Read all tensors by name. They take the file's size at most: their shapes are held against it.
+
+        Raises:
+            InputError: a damaged file, or a type that torch does not know.
+        """
+        try:
+            with safe_open(self.path, framework="pt") as file:
+                return {name: file.get_tensor(name) for name in file.keys()}
+        except _DAMAGED as error:
+            raise InputError(self.subject, expected=self.expected, received=_words(error)) from None
+
+
+def open_tensor_file(
+    path: str | Path, *, subject: str, header: str | None, expected: str = "a safetensors file", remedy: str = ""
+) -> TensorFile:
+    """Read the header of a safetensors file.
+
+    Args:
+        path: of the file.
+        subject: names it in messages.
+        header: key of the metadata under which the file tells, as a JSON object, what it is; None: it does not.
+        expected: what it should be, for messages.
+        remedy: what a user can do where there is none.
+
+    Raises:
+        InputError: missing, damaged or foreign file.
+    """
+    path = regular_file(path, subject=subject.removesuffix(str(path)).strip(), remedy=remedy)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+    except _DAMAGED as error:
+        raise InputError(subject, expected=expected, received=_words(error), remedy=remedy) from None
+    if header is None:
+        return TensorFile(path, subject, expected, {})
+    if header not in metadata:
+        received = f"one that is something else: it has no {header!r} in its metadata"
+        raise InputError(subject, expected=expected, received=received, remedy=remedy)
+    about = as_object(parse_json(metadata[header], subject=f"{subject}: metadata"), subject=f"{subject}: metadata")
+    return TensorFile(path, subject, expected, about)
+
+
+def require_finite(tensors: Mapping[str, Tensor], *, subject: str, remedy: str = "") -> None:
+    """Raise `InputError` that names the first tensor with NaN or infinity in it, and how many."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            wrong = int((~torch.isfinite(value)).sum())
+            raise InputError(
+                f"{subject}: {name}",
+                expected="finite values",
+                received=f"NaN or infinity in {wrong} of {value.numel()}",
+                remedy=remedy,
+            )
+
+
+def require_like(
+    tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, subject: str, remedy: str = ""
+) -> None:
+    """Raise `InputError` unless each of `wanted` is among the tensors, of its shape and kind (floats, integers, bools).
+
+    Of `wanted` shapes and types alone are looked at: it may lie on torch's device "meta".
+    """
+    for name, model in wanted.items():
+        given = tensors.get(name)
+        if given is None or given.shape != model.shape or _kind(given) != _kind(model):
+            raise InputError(
+                subject,
+                expected=f"{name} of shape {tuple(model.shape)}, {_kind(model)}",
+                received="none" if given is None else f"shape {tuple(given.shape)}, {_kind(given)}",
+                remedy=remedy,
+            )
+
+
+def _kind(value: Tensor) -> str:
+    if value.dtype == torch.bool:
+        return "bools"
+    return "floats" if value.is_floating_point() else "complex numbers" if value.is_complex() else "integers"
+
+
+def _words(error: Exception) -> str:
+    return (str(error) or type(error).__name__)[:300]

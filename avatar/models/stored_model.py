@@ -1,0 +1,95 @@
+"""What a model's file says of itself, held against its tensors before anything is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from avatar.gaussians.tensor_file import require_like
+from avatar.models.config_dict import config_from_dict
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_list, as_object
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SHAPES = "blend_shapes."
+_LAST_FRAME = 1 << 53
+Config = TypeVar("Config", bound="DataclassInstance")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredModel:
+    """A model as its file holds it.
+
+    Attributes:
+        about: what the header says.
+        tensors: by name.
+        subject: of messages.
+    """
+
+    about: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+    subject: str
+
+    def config(self, name: str, cls: type[Config], *, optional: bool = False) -> Config | None:
+        """Read a configuration of the header; None for null, where it is optional."""
+        if name not in self.about:
+            raise InputError(self.subject, expected=f"{name} in the metadata", received="none")
+        value = self.about[name]
+        return None if value is None and optional else config_from_dict(cls, as_object(value, subject=name))
+
+    def frames(self) -> tuple[int, ...]:
+        """Read the frames that have a code."""
+        values = as_list(self.about.get("frames"), subject="frames")
+        return tuple(as_integer(value, subject="frame of a code", least=0, most=_LAST_FRAME) for value in values)
+
+    def require(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return a tensor of this shape and kind of numbers.
+
+        Raises:
+            InputError: none, or another.
+        """
+        require_like(self.tensors, {name: torch.empty(shape, dtype=dtype, device="meta")}, subject=self.subject)
+        return self.tensors[name]
+
+    def require_networks(self, makers: Mapping[str, Callable[[], nn.Module]]) -> None:
+        """Raise `InputError` unless the tensors of networks of these names are there, in their shapes.
+
+        They are made without memory: sizes of the header that the tensors do not have cost nothing.
+        """
+        for name, make in makers.items():
+            with torch.device("meta"):
+                state = make().state_dict()
+            require_like(self.tensors, {f"{name}.{key}": value for key, value in state.items()}, subject=self.subject)
+
+    def track(self, most: int) -> tuple[list[int], Tensor]:
+        """Read the frames (T,) and controls (T, K, 3) of the surface that was followed; at most so many controls."""
+        controls = self.tensors["track_controls"]
+        if controls.ndim != 3 or controls.shape[2] != 3 or not 1 <= controls.shape[1] <= most:
+            raise InputError(
+                "track_controls", expected=f"shape (T, K, 3), K up to {most}", received=f"shape {tuple(controls.shape)}"
+            )
+        self.require("track_controls", tuple(controls.shape))
+        frames = self.require("track_frames", (len(controls),), torch.int64).tolist()
+        if len(set(frames)) != len(frames):
+            raise InputError("track_frames", expected="each frame once", received="one of them again")
+        return frames, controls
+
+    def blended(self, config: BlendShapeConfig, count: int) -> dict[str, Tensor | None]:
+        """Return what blend shapes of so many Gaussians are made from beside their sizes, as their arguments."""
+        active = self.tensors.get(f"{SHAPES}active")
+        rows = len(active) if active is not None and active.ndim == 1 else count
+        self.require(f"{SHAPES}active", (rows,), torch.int64)
+        for name in ("U", "C"):
+            self.require(f"{SHAPES}{name}", (rows, 3, config.shapes))
+        kept: dict[str, Tensor | None] = {"active": self.tensors[f"{SHAPES}active"].long()}
+        several, gated = config.parts > 1, config.gated
+        kept["part"] = self.require(f"{SHAPES}part", (count,), torch.int64).long() if several else None
+        kept["head_weight"] = self.require(f"{SHAPES}head_weight", (count,)) if gated else None
+        return kept
