@@ -34,7 +34,9 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
     read = [_entry(line) for line in lines]
     foreign = [number for number, entry in enumerate(read[:-1], start=1) if entry is None and lines[number - 1].strip()]
     if foreign:
-        log.warning("%s: %d lines are no entries of a log and left out, the first is %d", path, len(foreign), foreign[0])
+        log.warning(
+            "%s: %d lines are no entries of a log and left out, the first is %d", path, len(foreign), foreign[0]
+        )
     return [entry for entry in read if entry is not None]
 
 

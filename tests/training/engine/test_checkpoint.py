@@ -70,3 +70,32 @@ def test_a_kill_while_writing_leaves_the_one_before(tmp_path, monkeypatch):
         save_checkpoint(path, some(iteration=2))
     assert load_checkpoint(path, key="this").iteration == 1
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
+
+
+@pytest.mark.parametrize(
+    "about",
+    [
+        [1],
+        "words",
+        7,
+        None,
+        {},
+        {"schema": 1, "key": "this"},
+        {"schema": 1, "key": "this", "iteration": "many", "seconds": 1.0},
+        {"schema": 1, "key": "this", "iteration": -3, "seconds": 1.0},
+        {"schema": 1, "key": "this", "iteration": 3, "seconds": None},
+        {"schema": 1, "key": "this", "iteration": 3, "seconds": float("nan")},
+    ],
+)
+def test_metadata_of_another_kind_means_a_new_start(about, tmp_path, caplog):
+    (tmp_path / "state").write_bytes(save({"a": torch.zeros(1)}, metadata={"training": json.dumps(about)}))
+    assert load_checkpoint(tmp_path / "state", key="this") is None
+    assert "cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize("found", [None, [], {"a": 1}, 5])
+def test_keys_of_another_kind_are_those_of_another_training(found, tmp_path):
+    about = {"schema": 1, "key": found, "iteration": [9], "seconds": 0}
+    (tmp_path / "state").write_bytes(save({"a": torch.zeros(1)}, metadata={"training": json.dumps(about)}))
+    with pytest.raises(InputError, match="one of others"):
+        load_checkpoint(tmp_path / "state", key="this")

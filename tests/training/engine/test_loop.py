@@ -221,6 +221,20 @@ def test_metrics_survive_a_line_that_was_cut_short(tmp_path):
     assert read_metrics(tmp_path / "none") == []
 
 
+def test_lines_of_another_kind_are_left_out_and_told(tmp_path, caplog):
+    path = tmp_path / "metrics.jsonl"
+    foreign = [b"[1]", b"7", b"null", b"{}", b'{"kind": 3, "iteration": 1}', b'{"kind": "step", "iteration": "one"}']
+    foreign += [b"\xff\xfe", b"[" * 5000, b'{"kind": "step"}', b"9" * 6000]
+    append_metrics(path, {"kind": "step", "iteration": 0})
+    assert read_metrics(path) and not caplog.records
+    path.write_bytes(path.read_bytes() + b"\n".join(foreign) + b"\n")
+    append_metrics(path, {"kind": "step", "iteration": 1})
+    assert [entry["iteration"] for entry in read_metrics(path)] == [0, 1]
+    assert f"{len(foreign)} lines" in caplog.text and "first is 2" in caplog.text
+    truncate_metrics(path, 0)
+    assert path.read_text().count("\n") == 1
+
+
 def test_a_training_that_stopped_before_its_first_step_logs_the_start_once(tmp_path):
     run_training(Walk(), config(max_seconds=0.0), tmp_path, key="k")
     run_training(Walk(), config(), tmp_path, key="k")

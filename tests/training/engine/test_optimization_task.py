@@ -149,6 +149,32 @@ def test_a_restored_task_goes_on_bit_for_bit(tmp_path):
     assert same_state(whole.state(), other.state())
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("net.first", None, "received none"),
+        ("net.first", lambda value: value[..., None], "of shape"),
+        ("net.first", lambda value: value.int(), "integers"),
+        ("net.first", lambda value: value * math.nan, "finite"),
+        ("adam.exp_avg.net.first", None, "received none"),
+        ("adam.exp_avg_sq.net.first", lambda value: value * math.inf, "finite"),
+        ("adam.step.net.first", lambda value: value[None], "of shape"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_by_name_and_nothing_is_taken(name, change, words):
+    task, other = Toy(CONFIG), Toy(CONFIG)
+    task.step(0)
+    state = {key: value.detach().clone() for key, value in task.state().items()}
+    assert name in state
+    state = {key: value for key, value in state.items() if key != name or change}
+    if change:
+        state[name] = change(state[name])
+    before = {key: value.detach().clone() for key, value in other.state().items()}
+    with pytest.raises(InputError, match=f"{name}.*{words}"):
+        other.restore(state)
+    assert all(torch.equal(value, before[key]) for key, value in other.state().items())
+
+
 def test_restoring_keeps_to_itself():
     task, other = Toy(CONFIG), Toy(CONFIG, seed=1)
     task.step(0)
