@@ -14,12 +14,11 @@ from jaxtyping import Bool, Float
 from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimated_labels
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
-from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.images import read_labels
+from smplxpp.capture.keypoints import moved_keypoints
 from smplxpp.capture.writers.images import write_gray_png
 from smplxpp.capture.writers.keypoints import write_keypoints
 from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.params import BodyParams
 from smplxpp.raster import rasterize_mesh
@@ -94,7 +93,9 @@ def write_tracked_keypoints(
             config=config,
         )
         lens = capture.recording.distortions.get(name)
-        write_keypoints(root / KEYPOINTS / f"{name}.npz", found if lens is None else _through(found, camera, lens))
+        if lens is not None:  # the images on disk are the lens's
+            found = moved_keypoints(found, camera, lens.distort)
+        write_keypoints(root / KEYPOINTS / f"{name}.npz", found)
         progress((k + 1) / len(capture.cameras))
 
 
@@ -138,13 +139,3 @@ def _visible(
         x, y = screen[inside, :2].astype(np.int64).T
         out[row, inside] = depth[y, x] > screen[inside, 2] - _BEHIND
     return out
-
-
-def _through(found: Keypoints2D, camera: Camera, lens: Distortion) -> Keypoints2D:
-    """Keypoints of the undistorted image where the image on disk has them."""
-    K = camera.K
-    there = found.confidence > 0
-    points = found.points.copy()
-    plane = (points[there] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-    points[there] = lens.distort(plane) @ K[:2, :2].T + K[:2, 2]
-    return Keypoints2D(found.names, found.frames, points, found.confidence)

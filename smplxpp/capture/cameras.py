@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.readers.common import inverted, pinhole
+from smplxpp.capture.distortion import OPENCV, Distortion
+from smplxpp.capture.readers.common import inverted, pinhole, required
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.json_file import as_list, as_numbers, as_text, read_json
+from smplxpp.core.paths import regular_file
 from smplxpp.core.rotations import matrix_from_rotvec
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
@@ -38,46 +41,60 @@ def read_cameras(path: str | Path) -> list[Camera]:
 
 
 def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
-    """Read what `read_cameras` reads, with each camera's distortion (`dist` in OpenCV's order); None: a pinhole."""
+    """Read what `read_cameras` reads, with each camera's lens; None: a pinhole.
+
+    `dist` holds a lens's coefficients and `dist_model` its model, `opencv` unless told (`Distortion.from_opencv`).
+
+    Raises:
+        InputError: missing file, unknown layout, fields missing or of another type, a name given twice.
+    """
     path = Path(path)
-    if not path.is_file():
-        raise InputError("camera file", expected="an existing file", received=str(path))
-    try:
-        if path.suffix.lower() == ".csv":
-            return _read_actorshq(path)
-        if path.suffix.lower() == ".json":
-            return _read_opencv(path)
-    except (KeyError, ValueError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"camera file {path}",
-            expected=f"ActorsHQ columns {', '.join(_CSV_FIELDS)}, or JSON cameras with name, w, h, K, R, T",
-            received=f"{type(error).__name__}: {error}",
-        ) from None
-    raise InputError(f"camera file {path}", expected="a .json or .csv file", received=path.suffix or "no suffix")
+    readers = {".csv": _read_actorshq, ".json": _read_opencv}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"camera file {path}", expected="a .json or .csv file", received=path.suffix or "no suffix")
+    lenses = reader(regular_file(path, subject="camera file"))
+    names = Counter(camera.name for camera, _ in lenses)
+    twice = [name for name, count in names.items() if count > 1]
+    if twice:
+        raise InputError(f"camera file {path}", expected="every name once", received=f"{twice[:5]} several times")
+    return lenses
 
 
 def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
-    content = read_json(path)
+    content = read_json(path, subject="camera file")
+    if isinstance(content, dict):
+        content = required(content, "cameras", source=f"camera file {path}")
     lenses = []
-    for entry in content["cameras"] if isinstance(content, dict) else content:
-        name = str(entry["name"])
-        camera = pinhole(name, entry["K"], entry["R"], entry["T"], (int(entry["w"]), int(entry["h"])))
-        lenses.append((camera, Distortion.from_opencv(entry.get("dist", []), subject=f"camera {name!r}")))
+    for index, entry in enumerate(as_list(content, subject=f"camera file {path}: cameras")):
+        source = f"camera file {path}: entry {index}"
+        name, K, R, T, w, h = (required(entry, key, source=source) for key in ("name", "K", "R", "T", "w", "h"))
+        camera = pinhole(str(name), K, R, T, (w, h))
+        model = as_text(entry.get("dist_model", OPENCV), subject=f"{source}: dist_model")
+        lens = Distortion.from_opencv(entry.get("dist", []), subject=f"camera {name!r}", model=model)
+        lenses.append((camera, lens))
     return lenses
 
 
 def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
     lenses: list[tuple[Camera, Distortion | None]] = []
-    with open(path, newline="") as file:
-        for row in csv.DictReader(file):
-            width, height = int(row["w"]), int(row["h"])
-            value = {key: float(row[key]) for key in _CSV_FIELDS[3:]}
-            world_from_cam = np.eye(4)
-            world_from_cam[:3, :3] = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]]))
-            world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]
-            K = np.diag([value["fx"] * width, value["fy"] * height, 1.0])
-            K[:2, 2] = value["px"] * width, value["py"] * height
-            lenses.append((pinhole(row["name"], K, *inverted(world_from_cam), (width, height)), None))
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+        numbers = [{key: float(row[key]) for key in _CSV_FIELDS[1:]} for row in rows]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(
+            f"camera file {path}",
+            expected=f"ActorsHQ columns {', '.join(_CSV_FIELDS)}",
+            received=f"{type(error).__name__}: {error}"[:200],
+        ) from None
+    for row, value in zip(rows, numbers, strict=True):
+        source = f"camera file {path}: camera {row['name']}"
+        as_numbers(list(value.values()), subject=source)
+        width, height = value["w"], value["h"]
+        world_from_cam = np.eye(4)
+        world_from_cam[:3, :3] = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]]))
+        world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]
+        K = np.diag([value["fx"] * width, value["fy"] * height, 1.0])
+        K[:2, 2] = value["px"] * width, value["py"] * height
+        lenses.append((pinhole(row["name"] or "", K, *inverted(world_from_cam), (width, height)), None))
     return lenses

@@ -1,22 +1,79 @@
-"""Lens distortion in OpenCV's model, and undistortion of images."""
+"""Lens models, in OpenCV's parameters: where a lens puts points of the plane z = 1, and undistortion of images."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_numbers
+from smplxpp.core.validation import require_choice
 from smplxpp.native import native_library
 
+OPENCV, FISHEYE, FOV = LENS_MODELS = ("opencv", "fisheye", "fov")
+"""Names of the models, as `dist_model` of cameras.json says them."""
+
 _NEWTON_STEPS = 12
+_BISECTIONS = 60
+# The farthest from the axis that a pinhole is asked to show: at 90 degrees its picture would have no end.
+_WIDEST = np.radians(89.0)
+_NO_LENS_REMEDY = "calibrate without thin prism and tilt, or undistort the images beforehand"
+
+
+class Distortion(ABC):
+    """A lens, between points of the plane z = 1 of the pinhole camera and points of the same plane as it draws them.
+
+    Attributes:
+        native_id: number of the model in the native library.
+    """
+
+    native_id: ClassVar[int]
+
+    @abstractmethod
+    def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Where the lens puts points on the plane z = 1 of the pinhole camera; NaN where it does not show them."""
+
+    @abstractmethod
+    def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Where the pinhole would have put points that the lens has put at `xy`: the inverse of `distort`.
+
+        NaN for what no pinhole sees (89 degrees from the axis and more).
+        """
+
+    @abstractmethod
+    def native_parameters(self) -> Float64[np.ndarray, " P"]:
+        """The numbers that the native library takes for this model."""
+
+    @staticmethod
+    def from_opencv(coefficients: Any, *, subject: str, model: str = OPENCV) -> Distortion | None:
+        """Read coefficients in OpenCV's order, nested or not; None where the lens is a pinhole.
+
+        Args:
+            coefficients: `opencv`: k1, k2, p1, p2[, k3[, k4, k5, k6]]; `fisheye` (`cv2.fisheye`): k1, k2, k3, k4;
+                `fov`: omega, in radians.
+            subject: what messages call the camera.
+            model: one of `LENS_MODELS`.
+
+        Raises:
+            InputError: an unknown model, other values than finite numbers, another number of them (thin prism and tilt:
+                any beyond the eighth that is not zero), no field of view.
+        """
+        require_choice(f"{subject}: model of the lens", model, LENS_MODELS)
+        values = as_numbers(coefficients, subject=f"{subject}: distortion").ravel()
+        if model == FISHEYE:
+            return FisheyeDistortion.from_coefficients(values, subject=subject)
+        if model == FOV:
+            return FovDistortion.from_coefficients(values, subject=subject)
+        return RationalDistortion.from_coefficients(values, subject=subject)
 
 
 @dataclass(frozen=True)
-class Distortion:
+class RationalDistortion(Distortion):
     """Radial and tangential distortion (OpenCV's rational model; Brown 1966 with k4..k6 = 0).
 
     With x, y on the plane z = 1 and r^2 = x^2 + y^2:
@@ -29,31 +86,21 @@ class Distortion:
 
     radial: tuple[float, float, float, float, float, float]
     tangential: tuple[float, float]
+    native_id: ClassVar[int] = 0
 
     @staticmethod
-    def from_opencv(coefficients: Sequence[float], *, subject: str) -> Distortion | None:
-        """Read OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero.
-
-        Raises:
-            InputError: another number of coefficients (thin prism and tilt: any beyond the eighth that is not zero).
-        """
-        values = np.asarray(coefficients, dtype=np.float64).ravel()
-        if len(values) not in (0, 4, 5, 8, 12, 14) or not np.isfinite(values).all() or values[8:].any():
-            raise InputError(
-                f"{subject}: distortion",
-                expected="4, 5 or 8 finite coefficients k1 k2 p1 p2 k3 k4 k5 k6",
-                received=str(values.tolist()),
-                remedy="calibrate without thin prism and tilt, or undistort the images beforehand",
-            )
+    def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> RationalDistortion | None:
+        """Read k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero."""
+        if len(values) not in (0, 4, 5, 8, 12, 14) or values[8:].any():
+            raise _misfit(subject, "4, 5 or 8 finite coefficients k1 k2 p1 p2 k3 k4 k5 k6", values)
         if not values.any():
             return None
         full = np.zeros(8)
         full[: min(len(values), 8)] = values[:8]
         k1, k2, p1, p2, k3, k4, k5, k6 = full.tolist()
-        return Distortion((k1, k2, k3, k4, k5, k6), (p1, p2))
+        return RationalDistortion((k1, k2, k3, k4, k5, k6), (p1, p2))
 
     def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """Where the lens puts points on the plane z = 1 of the pinhole camera."""
         x, y = np.asarray(xy, dtype=np.float64).T
         (k1, k2, k3, k4, k5, k6), (p1, p2) = self.radial, self.tangential
         r2 = x * x + y * y
@@ -63,7 +110,7 @@ class Distortion:
         )
 
     def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """Where the pinhole would have put points that the lens has put at `xy`: the inverse of `distort`, by Newton.
+        """The inverse of `distort`, by Newton.
 
         Far outside of the picture, where a lens's polynomial folds back, there is no inverse and the result means
         nothing.
@@ -79,6 +126,110 @@ class Distortion:
             u, v = (target - value).T
             found = found + np.stack([d * u - b * v, a * v - c * u], axis=1) / determinant[:, None]
         return found
+
+    def native_parameters(self) -> Float64[np.ndarray, " P"]:
+        return np.array([*self.radial, *self.tangential])
+
+
+class _RadialDistortion(Distortion):
+    """A lens that moves points along the line to the middle alone."""
+
+    @abstractmethod
+    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        """The distance from the middle at which the lens puts what is at `r`; NaN where it shows nothing."""
+
+    @abstractmethod
+    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        """The inverse of `bent`; NaN where there is none."""
+
+    def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        return _scaled(xy, self.bent)
+
+    def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        return _scaled(xy, self.unbent)
+
+
+@dataclass(frozen=True)
+class FisheyeDistortion(_RadialDistortion):
+    """OpenCV's fisheye (`cv2.fisheye`; Kannala and Brandt 2006): equidistant where all coefficients are 0.
+
+    With theta the angle from the axis: `r_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`. Beyond the
+    angle where that turns back (or 89 degrees) the lens counts as showing nothing.
+
+    Attributes:
+        k: k1..k4.
+    """
+
+    k: tuple[float, float, float, float]
+    native_id: ClassVar[int] = 1
+
+    @staticmethod
+    def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> FisheyeDistortion:
+        """Read k1, k2, k3, k4; none at all are four zeros."""
+        if len(values) not in (0, 4):
+            raise _misfit(subject, "4 finite coefficients k1 k2 k3 k4 of a fisheye", values)
+        k1, k2, k3, k4 = values.tolist() or [0.0] * 4
+        return FisheyeDistortion((k1, k2, k3, k4))
+
+    @property
+    def reach(self) -> float:
+        """The angle from the axis, in radians, up to which the lens is one to one, at most 89 degrees."""
+        slope = [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.k, strict=True))]
+        roots = np.polynomial.Polynomial(slope).trim().roots()
+        turns = [root.real for root in roots if abs(root.imag) < 1e-9 * abs(root) and root.real > 0]
+        return min([_WIDEST, *np.sqrt(turns)])
+
+    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        theta = np.arctan(r)
+        return np.where(theta <= self.reach, self._polynomial(theta), np.nan)
+
+    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        low, high = np.zeros_like(r), np.full_like(r, self.reach)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            beyond = self._polynomial(middle) < r
+            low, high = np.where(beyond, middle, low), np.where(beyond, high, middle)
+        return np.where(r <= self._polynomial(np.asarray(self.reach)), np.tan(0.5 * (low + high)), np.nan)
+
+    def native_parameters(self) -> Float64[np.ndarray, " P"]:
+        return np.array([*self.k, np.tan(self.reach)])
+
+    def _polynomial(self, theta: Float64[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
+        t2, (k1, k2, k3, k4) = theta * theta, self.k
+        return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+
+@dataclass(frozen=True)
+class FovDistortion(_RadialDistortion):
+    """The field-of-view model (Devernay and Faugeras 2001): `r_d = atan(2 r tan(omega / 2)) / omega`.
+
+    Attributes:
+        omega: the lens's field of view, in radians, above 0 and below pi.
+    """
+
+    omega: float
+    native_id: ClassVar[int] = 2
+
+    @staticmethod
+    def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> FovDistortion | None:
+        """Read omega; None for 0, which is a pinhole."""
+        if len(values) != 1 or not 0 <= values[0] < np.pi:
+            raise _misfit(subject, "one angle omega from 0 to below pi", values)
+        return FovDistortion(float(values[0])) if values[0] > 0 else None
+
+    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        return np.arctan(r * self._slope) / self.omega
+
+    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        plane = np.tan(np.minimum(r * self.omega, _WIDEST)) / self._slope
+        return np.where((r * self.omega < _WIDEST) & (plane < np.tan(_WIDEST)), plane, np.nan)
+
+    def native_parameters(self) -> Float64[np.ndarray, " P"]:
+        return np.array([self.omega, self._slope])
+
+    @property
+    def _slope(self) -> float:
+        return float(2.0 * np.tan(0.5 * self.omega))
 
 
 def undistort(
@@ -106,7 +257,7 @@ def undistort(
     out = np.empty((height, width, *image.shape[2:]), dtype=np.uint8)
     inverse = np.ascontiguousarray(np.linalg.inv(target_K)[:2], dtype=np.float64)
     K = np.ascontiguousarray(np.asarray(source_K)[:2], dtype=np.float64)
-    lens = np.array([*distortion.radial, *distortion.tangential])
+    lens = np.ascontiguousarray(distortion.native_parameters(), dtype=np.float64)
 
     def pointer(array: np.ndarray) -> ctypes.c_void_p:
         return ctypes.c_void_p(array.ctypes.data)
@@ -118,6 +269,7 @@ def undistort(
         channels,
         pointer(inverse),
         pointer(K),
+        distortion.native_id,
         pointer(lens),
         int(nearest),
         pointer(out),
@@ -125,3 +277,17 @@ def undistort(
         height,
     )
     return out
+
+
+def _scaled(xy: Float[np.ndarray, "N 2"], change: Any) -> Float64[np.ndarray, "N 2"]:
+    """Points at another distance from the middle, in the same direction."""
+    points = np.asarray(xy, dtype=np.float64)
+    r = np.linalg.norm(points, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(r > 0, change(r) / r, 1.0)
+    return points * factor[:, None]
+
+
+def _misfit(subject: str, expected: str, received: Float64[np.ndarray, " N"]) -> InputError:
+    text = str(received.tolist())[:200]
+    return InputError(f"{subject}: distortion", expected=expected, received=text, remedy=_NO_LENS_REMEDY)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.keypoint_files import KeypointFiles, KeypointFormat, KeypointOptions, find_places
@@ -48,14 +49,22 @@ def found_keypoints(
 
 def shown_keypoints(found: Keypoints2D, full: Camera, window: Window, distortion: Distortion | None) -> Keypoints2D:
     """Where a window of the undistorted image shows points of the image on disk."""
-    points = found.points.copy()
     if distortion is not None:
-        there = found.confidence > 0
-        K = full.K[:2, :2]
-        plane = distortion.undistort((points[there] - full.K[:2, 2]) @ np.linalg.inv(K).T)
-        points[there] = plane @ K.T + full.K[:2, 2]
+        found = moved_keypoints(found, full, distortion.undistort)
     x0, y0 = window.box[:2]
-    return replace(found, points=(points - (x0, y0)) * window.scale)
+    return replace(found, points=(found.points - (x0, y0)) * window.scale)
+
+
+def moved_keypoints(
+    found: Keypoints2D, camera: Camera, change: Callable[[Float64[np.ndarray, "N 2"]], Float64[np.ndarray, "N 2"]]
+) -> Keypoints2D:
+    """Keypoints after a change on the plane z = 1; those that it leaves nowhere (NaN) have confidence 0."""
+    there, K = found.confidence > 0, camera.K
+    plane = change((found.points[there] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
+    points, confidence = found.points.copy(), found.confidence.copy()
+    points[there] = plane @ K[:2, :2].T + K[:2, 2]
+    confidence[~np.isfinite(points).all(axis=-1)] = 0.0
+    return replace(found, points=points, confidence=confidence)
 
 
 def _files(folder: Path, cameras: Mapping[str, Camera], options: KeypointOptions) -> KeypointFiles:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from smplxpp.body import BodyModel
@@ -9,6 +10,7 @@ from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import with_keypoints
+from smplxpp.capture.lens_loss import lens_problems
 from smplxpp.capture.masks import with_masks
 from smplxpp.capture.readers import (
     actorshq,
@@ -83,6 +85,8 @@ def open_capture(
             received=f"one of the layout {recording.format}",
             remedy="name its parameters with --params, or convert it with `smplxpp capture convert`",
         )
+    lost = lens_problems(recording.cameras, recording.distortions)
+    recording = replace(recording, problems=(*recording.problems, *lost))
     if masks is not None:
         recording = with_masks(recording, Path(masks))
     if keypoints is not None:

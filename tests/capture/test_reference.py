@@ -81,7 +81,7 @@ def test_ground_truth_capture_has_the_same_cameras_in_both_files(captures):
     ("name", "text", "words"),
     [
         ("c.json", "{", "expected JSON"),
-        ("c.json", '{"cameras": [{"name": "A"}]}', "KeyError"),
+        ("c.json", '{"cameras": [{"name": "A"}]}', "an entry 'K'"),
         ("c.csv", "name,w\nA,3\n", "KeyError"),
         ("c.txt", "", r"\.json or \.csv"),
     ],

@@ -17,6 +17,8 @@ _KINDS = (
     (r"calibrated, but without any image$", "camera-without-images"),
     (r"an image in camera .* alone$", "frame-alone"),
     (r"no image of frame \d+$|: named in .*, but missing$", "image-missing"),
+    (r"is outside of the undistorted one$", "lens-loss"),
+    (r": left aside$", "left-aside"),
     (r"^no masks: ", "masks-none"),
     (r"no mask( of frame \d+)?$", "mask-missing"),
     (r"no (label|normal) of frame \d+$", "map-missing"),

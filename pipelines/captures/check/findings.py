@@ -16,6 +16,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "file-damaged": ("files", "fail", "copy the file anew from its source, or delete it: the view is then left out"),
     "file-size": ("files", "fail", "give images, masks and calibration of one resolution"),
     "file-other": ("files", "fail", "correct the file, or delete it"),
+    "left-aside": ("files", "warn", "docs/captures.md says what each layout's reader leaves aside, and why"),
     "camera-uncalibrated": ("files", "fail", "add the camera to the calibration, or delete the folder"),
     "camera-without-images": ("files", "fail", "add its images, or take the camera out of the calibration"),
     "image-missing": ("files", "warn", "copy the missing images; the views are left out until then"),
@@ -65,6 +66,11 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
         "calibration",
         "fail",
         "fit these frames anew, or check that cameras and parameters show one moment",
+    ),
+    "lens-loss": (
+        "calibration",
+        "warn",
+        "nothing, if the person is inside; else undistort the images to a smaller focal length with another tool",
     ),
     "calibration-loose": (
         "calibration",

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.readers.colmap_model import ColmapImage, model_folder, read_model
 from smplxpp.capture.readers.common import chosen_params, pinhole
+from smplxpp.capture.readers.image_cameras import camera_names, number_at_end
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError
+from smplxpp.core.paths import path_inside
 
 NAME = "colmap"
 LOOKS_FOR = "cameras and images as .bin or .txt, in sparse/0, sparse or there"
@@ -31,25 +33,25 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     Masks are `masks/NAME.png` (NAME with its suffix, as for COLMAP itself) or `masks/` with the same names.
 
     Raises:
-        InputError: a broken model, a fisheye camera.
+        InputError: a broken model, a camera model that is not read, images outside of `images/`.
     """
     folder = model_folder(root)
     if folder is None:
         raise InputError(f"capture {root}", expected=LOOKS_FOR, received="none")
     lenses, images = read_model(folder)
-    rig = _is_rig(images)
+    paths = [_path_of(root, image, folder) for image in images]
+    rig = _is_rig(paths)
+    names = camera_names((path.parent if rig else path for path in paths), subject=f"file {folder}")
     cameras, distortions = {}, {}
     files: dict[str, dict[str, FileSeries]] = {"image": {}, "mask": {}}
-    for image in images:
-        path = PurePosixPath(image.name)
-        name = path.parent.name if rig else "_".join([*path.parent.parts, path.stem])
-        source = f"file {folder}: image {image.name}"
+    for image, path in zip(images, paths, strict=True):
+        name = names[path.parent if rig else path]
+        source = f"file {folder}: image {path}"
         if image.camera not in lenses:
-            raise InputError(source, expected=f"a camera among {sorted(lenses)}", received=str(image.camera))
+            raise InputError(source, expected=f"a camera among {sorted(lenses)[:20]}", received=str(image.camera))
         lens = lenses[image.camera]
-        K, coefficients = lens.intrinsics(source=source)
+        K, distortion = lens.intrinsics(source=source)
         cameras[name] = pinhole(name, K, image.R, image.t, (lens.width, lens.height))
-        distortion = Distortion.from_opencv(coefficients, subject=source)
         if distortion is not None:
             distortions[name] = distortion
         if rig:
@@ -57,10 +59,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             masks = image_name(after=r"(?:\.\w+)?")
             files["mask"][name] = FileSeries.find(root / "masks" / path.parent, masks)
         else:
-            files["image"][name] = _single(root / "images", [image.name])
-            files["mask"][name] = _single(
-                root / "masks", [f"{image.name}.png", image.name, str(path.with_suffix(".png"))]
-            )
+            files["image"][name] = _single(root / "images", [str(path)])
+            files["mask"][name] = _single(root / "masks", [f"{path}.png", str(path), str(path.with_suffix(".png"))])
     return Recording(
         name=root.resolve().name,
         root=root,
@@ -72,12 +72,17 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     )
 
 
-def _is_rig(images: Sequence[ColmapImage]) -> bool:
-    folders = Counter(PurePosixPath(image.name).parent.name for image in images)
-    numbered = all(PurePosixPath(image.name).stem.isdigit() for image in images)
-    return numbered and "" not in folders and max(folders.values(), default=0) == 1
+def _path_of(root: Path, image: ColmapImage, folder: Path) -> PurePosixPath:
+    inside = path_inside(root / "images", image.name, subject=f"file {folder}: name of an image")
+    return PurePosixPath(inside.relative_to(os.path.normpath(root / "images")))
+
+
+def _is_rig(paths: Sequence[PurePosixPath]) -> bool:
+    folders = Counter(path.parent for path in paths)
+    numbered = all((number_at_end(path) or ("?", 0))[0] == "" for path in paths)
+    return numbered and PurePosixPath() not in folders and max(folders.values(), default=0) == 1
 
 
 def _single(folder: Path, names: Sequence[str]) -> FileSeries:
-    found = next((name for name in names if (folder / name).is_file()), None)
+    found = next((name for name in names if os.path.isfile(folder / name)), None)
     return FileSeries.from_names(folder, {} if found is None else {0: found})

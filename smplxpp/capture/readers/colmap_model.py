@@ -1,7 +1,8 @@
-"""COLMAP's cameras and images, from text or binary files."""
+"""COLMAP's cameras and images, from text or binary files (src/colmap/scene/reconstruction_io_*.cc)."""
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +13,14 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from smplxpp.capture.distortion import FISHEYE, FOV, OPENCV, Distortion
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_numbers
+from smplxpp.core.paths import regular_file
 
 T = TypeVar("T")
 
-# Name, number of parameters, in the order of COLMAP's model ids.
+# Name, number of parameters, in the order of COLMAP's model ids (src/colmap/sensor/models.h, version 4.2).
 MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -25,7 +29,35 @@ MODELS = (
     ("OPENCV", 8),
     ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 )
+# How many focal lengths the models that we can read have, and which lens their last parameters are, filled up with 0.
+_READ = {
+    "SIMPLE_PINHOLE": (1, OPENCV),
+    "PINHOLE": (2, OPENCV),
+    "SIMPLE_RADIAL": (1, OPENCV),
+    "RADIAL": (1, OPENCV),
+    "OPENCV": (2, OPENCV),
+    "FULL_OPENCV": (2, OPENCV),
+    "FOV": (2, FOV),
+    "OPENCV_FISHEYE": (2, FISHEYE),
+    "SIMPLE_RADIAL_FISHEYE": (1, FISHEYE),
+    "RADIAL_FISHEYE": (1, FISHEYE),
+    "SIMPLE_FISHEYE": (1, FISHEYE),
+    "FISHEYE": (2, FISHEYE),
+}
+_REMEDY = "undistort with `colmap image_undistorter` and open its result"
+_LONGEST_NAME = 4096
 
 
 @dataclass(frozen=True)
@@ -37,29 +69,24 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
-    def intrinsics(self, *, source: str) -> tuple[Float64[np.ndarray, "3 3"], list[float]]:
-        """K (3, 3), and the distortion in OpenCV's order.
+    def intrinsics(self, *, source: str) -> tuple[Float64[np.ndarray, "3 3"], Distortion | None]:
+        """K (3, 3), and the lens.
 
         Raises:
-            InputError: a model that is not a pinhole with OpenCV's distortion.
+            InputError: a model that is none of ours, parameters that are no numbers.
         """
-        p = self.params
-        single = self.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-        K = np.diag([p[0], p[0] if single else p[1], 1.0])
-        K[:2, 2] = p[1:3] if single else p[2:4]
-        rest = list(p[3:] if single else p[4:])
-        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
-            return K, []
-        if self.model in ("SIMPLE_RADIAL", "RADIAL"):
-            return K, [*rest, *[0.0] * (4 - len(rest))]
-        if self.model in ("OPENCV", "FULL_OPENCV"):
-            return K, rest
-        raise InputError(
-            source,
-            expected=f"one of {', '.join(name for name, _ in MODELS if 'FISHEYE' not in name)}",
-            received=self.model,
-            remedy="undistort with `colmap image_undistorter` and open its result",
-        )
+        if self.model not in _READ:
+            raise InputError(
+                f"{source}: camera model", expected=f"one of {', '.join(_READ)}", received=self.model, remedy=_REMEDY
+            )
+        p = as_numbers(self.params, (None,), subject=f"{source}: camera parameters").tolist()
+        focal_lengths, model = _READ[self.model]
+        K = np.diag([p[0], p[focal_lengths - 1], 1.0])
+        K[:2, 2] = p[focal_lengths : focal_lengths + 2]
+        lens = p[focal_lengths + 2 :]
+        if model != FOV:
+            lens += [0.0] * (4 - len(lens))
+        return K, Distortion.from_opencv(lens, subject=source, model=model)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +110,9 @@ def model_folder(root: Path) -> Path | None:
 def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
     """Cameras by id, and images; the binary files where both kinds are there.
 
+    Poses of images are whole in `images`: `rigs` and `frames`, which COLMAP 3.12 and later write beside them, say the
+    same in another way.
+
     Raises:
         InputError: a truncated or foreign file, an unknown camera model.
     """
@@ -94,67 +124,80 @@ def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]
 
 def _read_table(reader: Callable[[Path], T], path: Path) -> T:
     try:
-        return reader(path)
+        return reader(regular_file(path))
     except InputError:
         raise
     except (ValueError, IndexError, OverflowError, struct.error, OSError) as error:
         raise InputError(
             f"file {path}",
             expected=f"COLMAP's {path.stem} as {path.suffix[1:]}",
-            received=f"{type(error).__name__}: {error}",
+            received=f"{type(error).__name__}: {error}"[:200],
         ) from None
 
 
-def _image(quaternion: list[float], t: list[float], camera: int, name: str) -> ColmapImage:
-    w, x, y, z = quaternion
+def _image(numbers: list[float], camera: int, name: str) -> ColmapImage:
+    w, x, y, z, *t = as_numbers(numbers, (7,), subject=f"pose of image {name!r}").tolist()
     return ColmapImage(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t), camera, name)
+
+
+def _unknown(path: Path, model: str) -> InputError:
+    known = ", ".join(name for name, _ in MODELS)
+    return InputError(f"file {path}: camera model", expected=f"one of {known}", received=model, remedy=_REMEDY)
 
 
 def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
     cameras = {}
-    for line in path.read_text().splitlines():
-        if line.strip() and not line.startswith("#"):
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
             number, model, width, height, *params = line.split()
-            if model not in dict(MODELS) or len(params) != dict(MODELS)[model]:
+            if model not in dict(MODELS):
+                raise _unknown(path, model[:80])
+            if len(params) != dict(MODELS)[model]:
                 raise ValueError(f"camera {number} of model {model} with {len(params)} parameters")
             cameras[int(number)] = ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
     return cameras
 
 
 def _images_txt(path: Path) -> list[ColmapImage]:
-    # Two lines an image; the second, its points, may be empty.
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     images = []
-    for line in lines[::2]:
-        if not line.strip():
-            continue
-        fields = line.split(maxsplit=9)
-        images.append(
-            _image([float(f) for f in fields[1:5]], [float(f) for f in fields[5:8]], int(fields[8]), fields[9].strip())
-        )
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            fields = line.split(maxsplit=9)
+            if not fields or fields[0].startswith("#"):
+                continue
+            images.append(_image([float(f) for f in fields[1:8]], int(fields[8]), fields[9].strip()))
+            next(file, "")  # the image's points, which may be none
     return images
 
 
 def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
-    data = path.read_bytes()
-    (count,), at, cameras = struct.unpack_from("<Q", data), 8, {}
-    for _ in range(count):
-        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        if not 0 <= model < len(MODELS):
-            raise ValueError(f"camera {number} of unknown model {model}")
-        name, parameters = MODELS[model]
-        cameras[number] = ColmapCamera(name, width, height, struct.unpack_from(f"<{parameters}d", data, at + 24))
-        at += 24 + 8 * parameters
+    cameras = {}
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,), at = struct.unpack_from("<Q", data), 8
+        for _ in range(count):
+            number, model, width, height = struct.unpack_from("<IiQQ", data, at)
+            if not 0 <= model < len(MODELS):
+                raise _unknown(path, f"number {model}")
+            name, parameters = MODELS[model]
+            cameras[number] = ColmapCamera(name, width, height, struct.unpack_from(f"<{parameters}d", data, at + 24))
+            at += 24 + 8 * parameters
     return cameras
 
 
 def _images_bin(path: Path) -> list[ColmapImage]:
-    data = path.read_bytes()
-    (count,), at, images = struct.unpack_from("<Q", data), 8, []
-    for _ in range(count):
-        values = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
-        (points,) = struct.unpack_from("<Q", data, end + 1)
-        images.append(_image(list(values[1:5]), list(values[5:8]), values[8], data[at + 64 : end].decode()))
-        at = end + 9 + 24 * points
+    images = []
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,), at = struct.unpack_from("<Q", data), 8
+        for _ in range(count):
+            values = struct.unpack_from("<I7dI", data, at)
+            end = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
+            if end < 0:
+                raise ValueError(f"image {values[0]} without the end of its name")
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            images.append(_image(list(values[1:8]), values[8], data[at + 64 : end].decode()))
+            at = end + 9 + 24 * points
+            if at > len(data):
+                raise ValueError(f"{points} points of image {values[0]} beyond the end of the file")
     return images

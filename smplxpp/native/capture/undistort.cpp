@@ -1,6 +1,8 @@
 // Undistortion of 8-bit images: every output pixel looks up the lens model and interpolates; no map is stored.
+#include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <vector>
 
 #include "common/parallel.hpp"
@@ -8,14 +10,49 @@
 namespace {
 
 // OpenCV's rational model: k1..k6 radial, p1, p2 tangential.
-struct Lens {
+struct Rational {
     double k[6], p[2];
+
+    explicit Rational(const double* lens) {
+        std::memcpy(k, lens, sizeof(k));
+        std::memcpy(p, lens + 6, sizeof(p));
+    }
 
     void distort(double x, double y, double& xd, double& yd) const {  // no branch: the row's loop is vectorised
         const double r2 = x * x + y * y;
         const double radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))) / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])));
         xd = x * radial + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x);
         yd = y * radial + p[0] * (r2 + 2 * y * y) + 2 * p[1] * x * y;
+    }
+};
+
+// OpenCV's fisheye: k1..k4 of the angle's polynomial, and the distance on the plane beyond which it shows nothing.
+struct Fisheye {
+    double k[4], reach;
+
+    explicit Fisheye(const double* lens) : reach(lens[4]) { std::memcpy(k, lens, sizeof(k)); }
+
+    void distort(double x, double y, double& xd, double& yd) const {
+        const double r = std::sqrt(x * x + y * y), theta = std::atan(r), t2 = theta * theta;
+        double scale = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r;
+        if (r == 0) scale = 1;
+        if (r > reach) scale = std::numeric_limits<double>::quiet_NaN();
+        xd = x * scale;
+        yd = y * scale;
+    }
+};
+
+// The field-of-view model: omega, and 2 tan(omega / 2).
+struct FieldOfView {
+    double omega, slope;
+
+    explicit FieldOfView(const double* lens) : omega(lens[0]), slope(lens[1]) {}
+
+    void distort(double x, double y, double& xd, double& yd) const {
+        const double r = std::sqrt(x * x + y * y);
+        const double scale = r == 0 ? slope / omega : std::atan(slope * r) / (omega * r);
+        xd = x * scale;
+        yd = y * scale;
     }
 };
 
@@ -51,7 +88,7 @@ void bilinear(const Image& source, double u, double v, uint8_t* out) {
     }
 }
 
-template <int channels, void (*sample)(const Image&, double, double, uint8_t*)>
+template <class Lens, int channels, void (*sample)(const Image&, double, double, uint8_t*)>
 void undistort(const Image& source, const Lens& lens, const double* inverse, const double* K, uint8_t* out, int width,
                int height) {
     std::vector<double> u(width), v(width);
@@ -75,20 +112,28 @@ void undistort(const Image& source, const Lens& lens, const double* inverse, con
     }
 }
 
+template <class Lens>
+void undistort(const Image& source, int channels, bool use_nearest, const Lens& lens, const double* inverse, const double* K,
+               uint8_t* out, int width, int height) {
+    const auto work = channels == 1 ? (use_nearest ? undistort<Lens, 1, nearest<1>> : undistort<Lens, 1, bilinear<1>>)
+                                    : (use_nearest ? undistort<Lens, 3, nearest<3>> : undistort<Lens, 3, bilinear<3>>);
+    work(source, lens, inverse, K, out, width, height);
+}
+
 }  // namespace
 
 // Pixels of an undistorted image (height, width, channels) from a distorted one; 0 where it does not reach.
 // inverse: 2x3, from output pixels to the plane z = 1; K: 2x3, from the distorted plane to source pixels;
-// lens: k1..k6, p1, p2; channels 1 or 3.
+// model and lens: 0, k1..k6, p1, p2 (rational); 1, k1..k4, reach (fisheye); 2, omega, slope (field of view);
+// channels 1 or 3.
 SMPLXPP_EXPORT void smplxpp_undistort(const uint8_t* source, int source_width, int source_height, int channels,
-                                      const double* inverse, const double* K, const double* lens, int use_nearest,
-                                      uint8_t* out, int width, int height) {
+                                      const double* inverse, const double* K, int model, const double* lens,
+                                      int use_nearest, uint8_t* out, int width, int height) {
     const Image image{source, source_width, source_height};
-    Lens model;
-    std::memcpy(model.k, lens, sizeof(model.k));
-    std::memcpy(model.p, lens + 6, sizeof(model.p));
-    if (channels == 1)
-        (use_nearest ? undistort<1, nearest<1>> : undistort<1, bilinear<1>>)(image, model, inverse, K, out, width, height);
+    if (model == 0)
+        undistort(image, channels, use_nearest, Rational(lens), inverse, K, out, width, height);
+    else if (model == 1)
+        undistort(image, channels, use_nearest, Fisheye(lens), inverse, K, out, width, height);
     else
-        (use_nearest ? undistort<3, nearest<3>> : undistort<3, bilinear<3>>)(image, model, inverse, K, out, width, height);
+        undistort(image, channels, use_nearest, FieldOfView(lens), inverse, K, out, width, height);
 }
