@@ -13,7 +13,7 @@ from smplxpp.capture.distortion import OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_list, as_numbers, as_text, read_json
+from smplxpp.core.json_file import as_integer, as_list, as_numbers, as_text, read_json
 from smplxpp.core.paths import regular_file
 from smplxpp.core.rotations import matrix_from_rotvec
 
@@ -90,7 +90,7 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
     for row, value in zip(rows, numbers, strict=True):
         source = f"camera file {path}: camera {row['name']}"
         as_numbers(list(value.values()), subject=source)
-        width, height = value["w"], value["h"]
+        width, height = (as_integer(value[key], subject=f"{source}: {key}") for key in ("w", "h"))
         world_from_cam = np.eye(4)
         world_from_cam[:3, :3] = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]]))
         world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]

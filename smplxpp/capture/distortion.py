@@ -153,8 +153,8 @@ class _RadialDistortion(Distortion):
 class FisheyeDistortion(_RadialDistortion):
     """OpenCV's fisheye (`cv2.fisheye`; Kannala and Brandt 2006): equidistant where all coefficients are 0.
 
-    With theta the angle from the axis: `r_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`. Beyond the
-    angle where that turns back (or 89 degrees) the lens counts as showing nothing.
+    With theta the angle from the axis: `r_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`. Beyond
+    the angle where that turns back (or 89 degrees) the lens counts as showing nothing.
 
     Attributes:
         k: k1..k4.
@@ -175,9 +175,9 @@ class FisheyeDistortion(_RadialDistortion):
     def reach(self) -> float:
         """The angle from the axis, in radians, up to which the lens is one to one, at most 89 degrees."""
         slope = [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.k, strict=True))]
-        roots = np.polynomial.Polynomial(slope).trim().roots()
-        turns = [root.real for root in roots if abs(root.imag) < 1e-9 * abs(root) and root.real > 0]
-        return min([_WIDEST, *np.sqrt(turns)])
+        roots = np.asarray(np.polynomial.Polynomial(slope).trim().roots(), dtype=np.complex128)
+        turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
+        return float(min(_WIDEST, np.sqrt(turns).min(initial=_WIDEST)))
 
     def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         theta = np.arctan(r)
@@ -189,12 +189,12 @@ class FisheyeDistortion(_RadialDistortion):
             middle = 0.5 * (low + high)
             beyond = self._polynomial(middle) < r
             low, high = np.where(beyond, middle, low), np.where(beyond, high, middle)
-        return np.where(r <= self._polynomial(np.asarray(self.reach)), np.tan(0.5 * (low + high)), np.nan)
+        return np.where(r <= self._polynomial(np.array([self.reach])), np.tan(0.5 * (low + high)), np.nan)
 
     def native_parameters(self) -> Float64[np.ndarray, " P"]:
         return np.array([*self.k, np.tan(self.reach)])
 
-    def _polynomial(self, theta: Float64[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
+    def _polynomial(self, theta: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         t2, (k1, k2, k3, k4) = theta * theta, self.k
         return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import PurePosixPath
 
 from smplxpp.capture.files import IMAGE_SUFFIXES
@@ -30,7 +31,7 @@ def camera_names(paths: Iterable[PurePosixPath], *, subject: str) -> dict[PurePo
         if len(set(names.values())) == len(distinct):
             return {path: check_name(name, subject=f"{subject}: image {path}") for path, name in names.items()}
     alike = sorted(names, key=lambda path: names[path])
-    pair = next((a, b) for a, b in zip(alike, alike[1:], strict=False) if names[a] == names[b])
+    pair = next((a, b) for a, b in pairwise(alike) if names[a] == names[b])
     raise InputError(
         f"{subject}: images {pair[0]} and {pair[1]}",
         expected="paths that give cameras different names",
