@@ -97,9 +97,9 @@ def test_other_models_are_refused_by_name_with_the_remedy(tmp_path, model, binar
 
 
 def test_models_of_the_future_are_refused_with_the_remedy(tmp_path):
-    with pytest.raises(InputError, match="number 18.*image_undistorter"):
+    with pytest.raises(InputError, match=r"number 18.*image_undistorter"):
         open_capture(write_model(tmp_path / "a", 18, (1.0, 1.0), binary=True))
-    with pytest.raises(InputError, match="MEI.*image_undistorter"):
+    with pytest.raises(InputError, match=r"MEI.*image_undistorter"):
         open_capture(write_model(tmp_path / "b", "MEI", (1.0,), binary=False))
 
 
