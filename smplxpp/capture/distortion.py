@@ -262,7 +262,7 @@ def undistort(
     def pointer(array: np.ndarray) -> ctypes.c_void_p:
         return ctypes.c_void_p(array.ctypes.data)
 
-    native_library().smplxpp_undistort(
+    native_library().smplxpp_undistort_image(
         pointer(image),
         image.shape[1],
         image.shape[0],
