@@ -135,8 +135,8 @@ def _read_table(reader: Callable[[Path], T], path: Path) -> T:
         ) from None
 
 
-def _image(numbers: list[float], camera: int, name: str) -> ColmapImage:
-    w, x, y, z, *t = as_numbers(numbers, (7,), subject=f"pose of image {name!r}").tolist()
+def _image(path: Path, numbers: list[float], camera: int, name: str) -> ColmapImage:
+    w, x, y, z, *t = as_numbers(numbers, (7,), subject=f"file {path}: pose of image {name!r}").tolist()
     return ColmapImage(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t), camera, name)
 
 
@@ -167,7 +167,7 @@ def _images_txt(path: Path) -> list[ColmapImage]:
             fields = line.split(maxsplit=9)
             if not fields or fields[0].startswith("#"):
                 continue
-            images.append(_image([float(f) for f in fields[1:8]], int(fields[8]), fields[9].strip()))
+            images.append(_image(path, [float(f) for f in fields[1:8]], int(fields[8]), fields[9].strip()))
             next(file, "")  # the image's points, which may be none
     return images
 
@@ -196,7 +196,7 @@ def _images_bin(path: Path) -> list[ColmapImage]:
             if end < 0:
                 raise ValueError(f"image {values[0]} without the end of its name")
             (points,) = struct.unpack_from("<Q", data, end + 1)
-            images.append(_image(list(values[1:8]), values[8], data[at + 64 : end].decode()))
+            images.append(_image(path, list(values[1:8]), values[8], data[at + 64 : end].decode()))
             at = end + 9 + 24 * points
             if at > len(data):
                 raise ValueError(f"{points} points of image {values[0]} beyond the end of the file")
