@@ -75,7 +75,8 @@ def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
     """
     if content.get("v_pose") is not None and np.any(content["v_pose"]):
         warnings.warn("TalkBody4D: `v_pose` is not read", GeometryWarning, stacklevel=2)
-    return Frames(_read_avatarrex(content, person).params, _outer(content))
+    params = _read_avatarrex(content, person).params
+    return Frames(params, _outer(content, len(params)))
 
 
 def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
@@ -118,7 +119,7 @@ def _read_easymocap(content: Any, person: int | None) -> Frames | None:
     values = {**blocks, "betas": record["shapes"], "transl": np.zeros(3), "flat_hand_mean": full}
     if "expression" in record:
         values["expression"] = record["expression"]
-    return Frames(BodyParams.from_mapping(values), _outer(record))
+    return Frames(BodyParams.from_mapping(values), _outer(record, 1))
 
 
 def _easymocap_poses(poses: np.ndarray) -> np.ndarray:
@@ -225,12 +226,16 @@ def _split(poses: np.ndarray, *, face_first: bool) -> dict[str, np.ndarray]:
     return blocks
 
 
-def _outer(record: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    rotvec, shift = (as_numbers(record[key], subject=key).reshape(-1, 3) for key in ("Rh", "Th"))
+def _outer(record: Mapping[str, Any], frames: int) -> tuple[np.ndarray, np.ndarray]:
+    rotvec, shift = (as_numbers(record[key], subject=key) for key in ("Rh", "Th"))
     for key, value in (("Rh", rotvec), ("Th", shift)):
-        if not (np.abs(value) <= _FARTHEST).all():
-            raise InputError(key, expected=f"numbers within {_FARTHEST:g}", received=f"{np.abs(value).max():g}")
-    return rotvec, shift
+        if value.size not in (3, 3 * frames) or not (np.abs(value) <= _FARTHEST).all():
+            raise InputError(
+                key,
+                expected=f"3 numbers within {_FARTHEST:g} for each of {frames} frames",
+                received=f"{value.size} numbers up to {np.abs(value).max(initial=0.0):g}",
+            )
+    return np.broadcast_to(rotvec.reshape(-1, 3), (frames, 3)), np.broadcast_to(shift.reshape(-1, 3), (frames, 3))
 
 
 def _flat_joints(name: str, value: Any) -> np.ndarray:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int, Int64, Shaped
 
 from smplxpp.core.errors import InputError
 
+_LAST_FRAME = 1 << 53
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 
 
@@ -33,7 +34,13 @@ class FileSeries:
 
     @staticmethod
     def from_names(folder: Path, names: Mapping[int, str]) -> FileSeries:
-        """Make a series of the file name of each frame."""
+        """Make a series of the file name of each frame.
+
+        Raises:
+            InputError: a frame's number beyond 2^53, which is none.
+        """
+        if max(names, default=0) > _LAST_FRAME:
+            raise InputError(f"frames of {folder}", expected=f"numbers up to {_LAST_FRAME}", received=f"{max(names)}")
         numbers = np.array(sorted(names), dtype=np.int64)
         encoded = np.array([os.fsencode(names[int(n)]) for n in numbers], dtype=bytes)
         return FileSeries(folder, numbers, encoded)
@@ -42,15 +49,15 @@ class FileSeries:
     def find(folder: Path, pattern: str) -> FileSeries:
         """Files of `folder` whose whole name matches `pattern`; its group `frame` is the number. May be empty.
 
-        Of two files with one number the first in alphabetical order counts.
+        Of two files with one number the first in alphabetical order counts; numbers beyond 2^53 are no frames'.
         """
         compiled = re.compile(pattern)
         found: dict[int, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
                 for name in sorted(entry.name for entry in entries):
-                    if match := compiled.fullmatch(name):
-                        found.setdefault(int(match["frame"]), name)
+                    if (match := compiled.fullmatch(name)) and (frame := int(match["frame"])) <= _LAST_FRAME:
+                        found.setdefault(frame, name)
         return FileSeries.from_names(folder, found)
 
     def __repr__(self) -> str:

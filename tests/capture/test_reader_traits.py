@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 
 from smplxpp.capture import find_problems, open_capture
+from smplxpp.capture.files import FileSeries
+from smplxpp.capture.writers.arrays import save_params_by_row
+from smplxpp.core.errors import InputError
 from tests.capture.scene import make_scene
 from tests.capture.writers import (
     write_actorshq,
     write_avatarrex,
     write_easymocap,
+    write_talkbody4d,
+    write_thuman4,
 )
 
 LENS = (0.02, -0.01, 0.001, -0.001, 0.0)
@@ -51,3 +59,101 @@ def test_stacked_v_shape_follows_the_rows(tmp_path):
     np.testing.assert_array_equal(open_capture(root).params(1).v_shape, offsets[1:])
     np.savez(root / "smpl_params.npz", **spoiled, v_shape=offsets[0])
     np.testing.assert_array_equal(open_capture(root).params(1).v_shape, offsets[:1])
+
+
+def test_frames_with_numbers_that_are_none_are_left_aside(tmp_path):
+    root = write_thuman4(make_scene(names=("cam00", "cam01", "cam02")), tmp_path / "set")
+    image = root / "images" / "cam00" / "00000001.jpg"
+    image.with_name("9" * 30 + ".jpg").write_bytes(image.read_bytes())
+    assert open_capture(root).frames == (0, 1)
+    with pytest.raises(InputError, match="numbers up to"):
+        FileSeries.from_names(root, {10**30: "a.jpg"})
+    params = open_capture(root).params(0)
+    with pytest.raises(InputError, match="frames numbered below"):
+        save_params_by_row(tmp_path / "params.npz", {10**12: params})
+
+
+JUNK = [None, True, -1, 1.5, 1e308, 10**400, "x", "a\0b", "9" * 30, [], [None], [[1, 2], 3], {}, {"a": 1}, "\ud800"]
+
+
+@pytest.mark.parametrize("junk", JUNK, ids=lambda value: repr(value)[:12])
+@pytest.mark.parametrize(
+    ("write", "file", "place"),
+    [
+        (write_talkbody4d, "calibration.json", ("cameras", "A")),
+        (write_talkbody4d, "calibration.json", ("cameras", "A", "image_size")),
+        (write_talkbody4d, "calibration.json", ("cameras", "A", "K")),
+        (write_talkbody4d, "calibration.json", ("camera_poses", "A")),
+        (write_talkbody4d, "calibration.json", ("camera_poses", "A", "R")),
+        (write_talkbody4d, "smplx/000000.json", ("Rh",)),
+        (write_talkbody4d, "smplx/000000.json", ("betas",)),
+        (write_avatarrex, "calibration_full.json", ("A",)),
+        (write_avatarrex, "calibration_full.json", ("A", "imgSize")),
+        (write_avatarrex, "calibration_full.json", ("A", "imgSize", 0)),
+        (write_avatarrex, "calibration_full.json", ("A", "T")),
+        (write_easymocap, "output/smpl/smpl/000000.json", (0, "poses")),
+        (write_easymocap, "output/smpl/smpl/000000.json", (0, "Th")),
+        (write_easymocap, "output/smpl/smpl/000000.json", (0, "shapes")),
+        (write_easymocap, "output/smpl/smpl/000000.json", (0,)),
+    ],
+)
+def test_values_of_other_types_are_refused_or_spoil_their_frame(scenes, tmp_path, write, file, place, junk):
+    """Never another exception than ours, whatever the value; parameters spoil their own frame alone."""
+    root = tmp_path / "set"
+    shutil.copytree(scenes[write], root)
+    content = json.loads((root / file).read_text())
+    *above, last = place
+    inner = content
+    for key in above:
+        inner = inner[key]
+    inner[last] = junk
+    (root / file).write_text(json.dumps(content))
+    if "000000" not in file:
+        with pytest.raises(InputError):
+            open_capture(root)
+        return
+    capture = open_capture(root)
+    assert {problem.frame for problem in find_problems(capture, decode=False)} <= {0, None}
+    assert capture.params(1) is not None
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    scene = make_scene(lens=LENS)
+    return {
+        write: write(scene, tmp_path_factory.mktemp("scenes") / write.__name__)
+        for write in (write_talkbody4d, write_avatarrex, write_easymocap)
+    }
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"W_A: .Inf\r\nH_A: 100\r\n",
+        b"W_A: 9e999\r\nH_A: 1e999\r\n",
+        b"K_A: !!opencv-matrix\r\n  rows: 3\r\n  cols: 3\r\n  data: [.Nan, 0, 0, 0, 1, 0, 0, 0, 1]\r\n",
+        b"K_A: !!opencv-matrix\r\n  rows: 99999999999999999999\r\n  cols: 3\r\n  data: [1]\r\n",
+        b'names:\r\n  - "../A"\r\n',
+        b"names: 3\r\n",
+    ],
+)
+def test_easymocap_cameras_with_numbers_that_are_none_are_refused(scenes, tmp_path, text):
+    root = tmp_path / "set"
+    shutil.copytree(scenes[write_easymocap], root)
+    path = root / "intri.yml"
+    key = text.split(b":")[0]
+    kept = b"".join(block for block in _blocks(path.read_bytes()) if not block.startswith(key + b":"))
+    path.write_bytes(kept + text)
+    with pytest.raises(InputError):
+        open_capture(root)
+
+
+def _blocks(data: bytes) -> list[bytes]:
+    """Top-level entries of the YAML, each with its lines."""
+    out: list[bytes] = []
+    for line in data.splitlines(keepends=True):
+        if line[:1] in b" -" and out:
+            out[-1] += line
+        else:
+            out.append(line)
+    return out

@@ -57,10 +57,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     masks = first_folder(root, ("masks", "mask"))
     cameras, distortions = {}, {}
     for name in names:
-        width, height = intri.get(f"W_{name}"), intri.get(f"H_{name}")
-        if isinstance(width, float) and isinstance(height, float) and width and height:
-            size = (int(width), int(height))
-        else:
+        size: Any = (intri.get(f"W_{name}", 0.0), intri.get(f"H_{name}", 0.0))
+        if any(isinstance(side, float) and side == 0.0 for side in size):  # as EasyMocap reads what is not there
             size = size_of_first_image(name, images)
         K = required(intri, f"K_{name}", source=f"file {root / 'intri.yml'}")
         cameras[name] = pinhole(name, K, *_pose(extri, name, root / "extri.yml"), size, opencv_pixels=True)

@@ -11,10 +11,13 @@ from jaxtyping import Float
 
 from smplxpp.core.array_file import write_arrays
 from smplxpp.core.atomic import atomic_path
+from smplxpp.core.errors import InputError
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 # Coordinates of truth meshes are rounded to this many metres (0.06 mm): they compress better.
 QUANTUM = 2.0**-14
+# Rows of a file of parameters: 14 hours at 20 frames a second, two gigabytes.
+_MOST_ROWS = 1_000_000
 
 
 def rounded(vertices: Float[np.ndarray, "*V 3"]) -> Float[np.ndarray, "*V 3"]:
@@ -31,6 +34,13 @@ def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
     """Write parameters so that row n is frame n; NaN where a frame has none, which spoils that frame alone."""
     joined = BodyParams.concatenate(list(params.values()))
     rows = np.array(list(params))
+    if rows.max() >= _MOST_ROWS:
+        raise InputError(
+            "parameters of the capture",
+            expected=f"frames numbered below {_MOST_ROWS}: their row is the frame's number",
+            received=f"frame {rows.max()}",
+            remedy="number the frames from 0",
+        )
     arrays: dict[str, np.ndarray] = {"flat_hand_mean": np.array(joined.flat_hand_mean, dtype=bool)}
     for name in ARRAY_NAMES:
         values = getattr(joined, name)
