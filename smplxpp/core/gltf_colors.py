@@ -1,0 +1,111 @@
+"""The colours of a glTF primitive's vertices: picture, vertex colours, base colour."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Num, UInt8
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.gltf_document import GltfDocument
+from smplxpp.core.json_file import as_number, as_numbers, as_text
+from smplxpp.core.raw_mesh import warn
+from smplxpp.core.texture import decode_picture, sample_texture
+
+
+def primitive_colors(
+    document: GltfDocument, primitive: dict[str, Any], count: int
+) -> UInt8[np.ndarray, "N 3"] | None:
+    """The colours of a primitive's vertices; None where it has none, or, with a warning, where they are damaged.
+
+    Args:
+        document: the file.
+        primitive: of its meshes.
+        count: its vertices.
+    """
+    try:
+        colors = _picture_colors(document, primitive, count)
+        if colors is None:
+            colors = _vertex_colors(document, primitive, count)
+        return _base_color(document, primitive, count) if colors is None else colors
+    except InputError as error:
+        warn(f"{document.subject}: colours of a primitive are lost: {error}")
+        return None
+
+
+def _surface(document: GltfDocument, primitive: dict[str, Any]) -> tuple[dict[str, Any], str, str]:
+    """What a material says of its surface, and its names for the picture and the factor of the base colour."""
+    if "material" not in primitive:
+        return {}, "", ""
+    material = document.entry("materials", primitive["material"])
+    older = document.part(document.part(material, "extensions"), "KHR_materials_pbrSpecularGlossiness")
+    if older:
+        return older, "diffuseTexture", "diffuseFactor"
+    return document.part(material, "pbrMetallicRoughness"), "baseColorTexture", "baseColorFactor"
+
+
+def _picture_colors(
+    document: GltfDocument, primitive: dict[str, Any], count: int
+) -> UInt8[np.ndarray, "N 3"] | None:
+    surface, name, _ = _surface(document, primitive)
+    if name not in surface:
+        return None
+    use = document.part(surface, name)
+    transform = document.part(document.part(use, "extensions"), "KHR_texture_transform")
+    layer = document.number(transform if "texCoord" in transform else use, "texCoord", 0)
+    attributes = document.part(primitive, "attributes")
+    if f"TEXCOORD_{layer}" not in attributes:
+        return None
+    uv = document.accessor(attributes[f"TEXCOORD_{layer}"]).astype(np.float64)
+    if uv.shape != (count, 2):
+        raise InputError("texture coordinates", expected="two a vertex", received=f"shape {uv.shape}")
+    picture = document.picture(use.get("index"))
+    if picture is None:
+        return None
+    return sample_texture(picture, _transformed(uv, transform), top_down=True)
+
+
+def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> Float64[np.ndarray, "N 2"]:
+    """KHR_texture_transform: scale, then rotation, then offset."""
+    if not transform:
+        return uv
+    scale, offset = (
+        as_numbers(transform.get(name, default), (2,), subject=f"texture {name}")
+        for name, default in (("scale", [1, 1]), ("offset", [0, 0]))
+    )
+    angle = as_number(transform.get("rotation", 0), subject="texture rotation")
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    with np.errstate(all="ignore"):
+        return (uv * scale) @ turn.T + offset
+
+
+def _vertex_colors(
+    document: GltfDocument, primitive: dict[str, Any], count: int
+) -> UInt8[np.ndarray, "N 3"] | None:
+    attributes = document.part(primitive, "attributes")
+    if "COLOR_0" not in attributes:
+        return None
+    colors = document.accessor(attributes["COLOR_0"])
+    if len(colors) != count or colors.shape[1] not in (3, 4):
+        raise InputError("vertex colours", expected="one a vertex", received=f"shape {colors.shape}")
+    stored = document.entry("accessors", attributes["COLOR_0"]).get("componentType")
+    rgb = colors[:, :3].astype(np.float64)
+    if stored == 5121:
+        # glTF's vertex colours are linear, but those of eight bits are in practice the sRGB bytes of another file.
+        return np.rint(rgb * (255.0 if colors.dtype.kind == "f" else 1.0)).astype(np.uint8)
+    return srgb_from_linear(rgb if colors.dtype.kind == "f" else rgb / 65535.0)
+
+
+def _base_color(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
+    surface, picture, factor = _surface(document, primitive)
+    if factor not in surface or picture in surface:
+        return None
+    color = as_numbers(surface[factor], (4,), subject="base colour")
+    return np.repeat(srgb_from_linear(color[None, :3]), count, axis=0)
+
+
+def srgb_from_linear(colors: Num[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
+    """Linear RGB in [0, 1] as 8-bit sRGB (IEC 61966-2-1); NaN as 0."""
+    c = np.clip(np.nan_to_num(colors), 0.0, 1.0)
+    return np.rint(255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)

@@ -1,0 +1,234 @@
+"""glTF 2.0's container and accessors, each offset, stride and count held against the bytes that are there.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6 (binary data) and 4.4 (GLB).
+"""
+
+from __future__ import annotations
+
+import binascii
+import urllib.parse
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, parse_json
+from smplxpp.core.raw_mesh import read_bytes
+from smplxpp.core.texture import beside
+
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_DAMAGED = "the file is damaged or incomplete: copy or export it again"
+# Accessors of no bytes at all, zeros with a few sparse values, are real but small.
+_MOST_WITHOUT_BYTES = 1 << 20
+
+
+class GltfDocument:
+    """A `.gltf` or `.glb` file.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        path: of the file. subject: its name in messages. size: bytes of the file.
+        json: the document.
+
+    Raises:
+        InputError: no glTF 2.0, or a container whose lengths do not fit.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.subject = path, f"mesh file {path}"
+        data = read_bytes(path, subject="mesh file")
+        self.size = len(data)
+        self._binary: bytes | None = None
+        if data[:4] == b"glTF":
+            data, self._binary = self._chunks(data)
+        self.json = as_object(parse_json(data, subject=self.subject), subject=self.subject)
+        version = as_text(self.part(self.json, "asset").get("version", ""), subject=f"{self.subject}: asset.version")
+        if not version.startswith("2."):
+            raise InputError(self.subject, expected="glTF 2.0", received=f"version {version or 'unknown'}")
+        self._buffers: dict[int, bytes] = {}
+        self._files: dict[Path, bytes] = {}
+
+    def _chunks(self, data: bytes) -> tuple[bytes, bytes | None]:
+        """The JSON chunk and the binary one of a GLB."""
+        found: dict[int, bytes] = {}
+        place, end = 12, min(int.from_bytes(data[8:12], "little"), len(data))
+        if int.from_bytes(data[4:8], "little") != 2 or int.from_bytes(data[8:12], "little") > len(data):
+            raise InputError(self.subject, expected="a whole GLB 2 file", received="another", remedy=_DAMAGED)
+        while place + 8 <= end:
+            length, kind = (int.from_bytes(data[place + k : place + k + 4], "little") for k in (0, 4))
+            if place + 8 + length > end:
+                raise InputError(
+                    self.subject, expected="chunks within the file", received="a longer one", remedy=_DAMAGED
+                )
+            found.setdefault(kind, data[place + 8 : place + 8 + length])
+            place += 8 + length
+        if _JSON_CHUNK not in found:
+            raise InputError(self.subject, expected="a JSON chunk", received="none", remedy=_DAMAGED)
+        return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+
+    def part(self, of: dict[str, Any], name: str) -> dict[str, Any]:
+        """An object's member that is an object; {} where it has none."""
+        return as_object(of.get(name, {}), subject=f"{self.subject}: {name}")
+
+    def items(self, of: dict[str, Any], name: str) -> list[Any]:
+        """An object's member that is a list; [] where it has none."""
+        return as_list(of.get(name, []), subject=f"{self.subject}: {name}")
+
+    def entry(self, kind: str, index: Any) -> dict[str, Any]:
+        """The object at an index of one of the document's lists.
+
+        Raises:
+            InputError: no such entry.
+        """
+        entries = self.items(self.json, kind)
+        if not entries:
+            raise InputError(f"{self.subject}: {kind}", expected="entries", received="none", remedy=_DAMAGED)
+        place = as_integer(index, subject=f"{self.subject}: index of {kind}", least=0, most=len(entries) - 1)
+        return as_object(entries[place], subject=f"{self.subject}: {kind}[{place}]")
+
+    def number(self, of: dict[str, Any], name: str, default: int | None = None) -> int:
+        """A count, an offset or an index of an object."""
+        return as_integer(of.get(name, default), subject=f"{self.subject}: {name}", least=0, most=2**53)
+
+    @cached_property
+    def extensions_required(self) -> set[str]:
+        """The names of the extensions without which the document means something else."""
+        return {str(name) for name in self.items(self.json, "extensionsRequired")}
+
+    def view(self, index: Any) -> tuple[memoryview, int]:
+        """The bytes of a buffer view, and its stride (0 for none).
+
+        Raises:
+            InputError: a view outside its buffer, or a compressed one.
+        """
+        view = self.entry("bufferViews", index)
+        for name in self.part(view, "extensions"):
+            if name in ("EXT_meshopt_compression", "KHR_meshopt_compression"):
+                raise compressed(self.subject, name)
+        data = self._buffer(self.number(view, "buffer"))
+        start, length = self.number(view, "byteOffset", 0), self.number(view, "byteLength")
+        if start + length > len(data):
+            raise InputError(
+                f"{self.subject}: buffer view",
+                expected=f"at most {len(data)} bytes",
+                received=f"{length} from {start} on",
+                remedy=_DAMAGED,
+            )
+        return memoryview(data)[start : start + length], self.number(view, "byteStride", 0)
+
+    def accessor(self, index: Any) -> np.ndarray:
+        """An accessor's values, (count, components): as stored, or in [-1, 1] or [0, 1] where they are normalized.
+
+        Raises:
+            InputError: values outside their buffer view, or an unknown type.
+        """
+        accessor = self.entry("accessors", index)
+        count = self.number(accessor, "count")
+        kind = _COMPONENTS.get(self.number(accessor, "componentType"))
+        width = _TYPES.get(as_text(accessor.get("type"), subject=f"{self.subject}: accessor type"))
+        if kind is None or width is None:
+            raise InputError(
+                f"{self.subject}: accessor",
+                expected="numbers, vectors or 4 x 4 matrices",
+                received=f"component type {accessor.get('componentType')}, type {accessor.get('type')}"[:80],
+            )
+        if "bufferView" in accessor:
+            values = self._values(accessor, count, width, kind)
+        elif "sparse" in accessor and count <= _MOST_WITHOUT_BYTES:
+            values = np.zeros((count, width), kind)
+        else:
+            raise InputError(f"{self.subject}: accessor", expected="data", received="none", remedy=_DAMAGED)
+        if "sparse" in accessor:
+            values = self._with_sparse(values, self.part(accessor, "sparse"), kind)
+        values = values.astype(np.dtype(kind).newbyteorder("="))
+        if accessor.get("normalized") is True and values.dtype.kind in "iu":
+            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+        return values
+
+    def _values(self, of: dict[str, Any], count: int, width: int, kind: str) -> np.ndarray:
+        """The values that lie in a buffer view, not copied."""
+        data, stride = self.view(of["bufferView"])
+        start, item = self.number(of, "byteOffset", 0), width * np.dtype(kind).itemsize
+        stride = stride or item
+        if count and (start + (count - 1) * stride + item > len(data) or stride < item):
+            raise InputError(
+                f"{self.subject}: accessor",
+                expected=f"values within the {len(data)} bytes of its view",
+                received=f"{count} of {item} bytes, {stride} apart, from {start} on",
+                remedy=_DAMAGED,
+            )
+        if not count:
+            return np.empty((0, width), kind)
+        return np.ndarray((count, width), kind, buffer=data, offset=start, strides=(stride, item // width))
+
+    def _with_sparse(self, values: np.ndarray, sparse: dict[str, Any], kind: str) -> np.ndarray:
+        """The values with those replaced that a sparse accessor lists."""
+        count = self.number(sparse, "count")
+        where, what = self.part(sparse, "indices"), self.part(sparse, "values")
+        places_kind = _COMPONENTS.get(self.number(where, "componentType"), "")
+        if places_kind not in ("u1", "<u2", "<u4") or "bufferView" not in where or "bufferView" not in what:
+            raise InputError(
+                f"{self.subject}: sparse accessor", expected="unsigned indices, and values", received="others"
+            )
+        places = self._values(where, count, 1, places_kind).reshape(-1)
+        if count and places.max() >= len(values):
+            raise InputError(f"{self.subject}: sparse accessor", expected="indices below its count", received="others")
+        values = values.copy()
+        values[places] = self._values(what, count, values.shape[1], kind)
+        return values
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            buffer = self.entry("buffers", index)
+            if "uri" in buffer:
+                uri = as_text(buffer["uri"], subject=f"{self.subject}: buffer uri")
+                found = self.resource(uri)
+                if found is None:
+                    raise InputError(
+                        f"{self.subject}: buffer",
+                        expected="a file in the mesh file's folder",
+                        received=repr(uri[:80]),
+                        remedy="copy the file that belongs to it beside it",
+                    )
+                data = found
+            elif index == 0 and self._binary is not None:
+                data = self._binary
+            else:
+                raise InputError(f"{self.subject}: buffer", expected="data", received="none", remedy=_DAMAGED)
+            self._buffers[index] = data
+        return self._buffers[index]
+
+    def resource(self, uri: str) -> bytes | None:
+        """The bytes of a data URI, or of a file inside the document's folder; None where there is none.
+
+        Raises:
+            InputError: a data URI that is not base64.
+        """
+        if uri.startswith("data:"):
+            head, _, text = uri.partition(",")
+            try:
+                return binascii.a2b_base64(text) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(text)
+            except (binascii.Error, ValueError) as error:
+                raise InputError(f"{self.subject}: data URI", expected="base64", received=str(error)) from None
+        found = beside(self.path, urllib.parse.unquote(uri))
+        if found is None:
+            return None
+        if found not in self._files:
+            self._files[found] = read_bytes(found, subject=f"{self.subject}: file")
+        return self._files[found]
+
+
+def compressed(subject: str, name: str) -> InputError:
+    """The refusal of a compression that is not read."""
+    return InputError(
+        subject,
+        expected="uncompressed geometry",
+        received=name,
+        remedy="export without compression, or decompress it (gltf-transform copy, Blender's import and export)",
+    )

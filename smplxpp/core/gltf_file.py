@@ -1,0 +1,236 @@
+"""glTF and GLB meshes: the scene's primitives one after the other, in world coordinates.
+
+Vertices are those of the accessors in their order, nodes depth first; primitives of a node that share an accessor of
+positions share its vertices.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.gltf_colors import primitive_colors
+from smplxpp.core.gltf_document import GltfDocument, compressed
+from smplxpp.core.json_file import as_integer, as_numbers, as_object
+from smplxpp.core.raw_mesh import RawMesh, require_indices, warn
+from smplxpp.core.texture import LOST
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# A file may show one mesh many times over; beyond its own bytes only this many vertices and faces are made of it.
+_MOST_SHARED = 1_000_000
+
+
+def read_gltf(path: Path) -> RawMesh:
+    """Read a `.gltf` or `.glb` file as one mesh; skinned meshes stand as the file's joints pose them.
+
+    Colours are the base colour's picture at the vertices, else `COLOR_0`, else the base colour. Lines and points are
+    left out, which a warning says; morph targets and motions too.
+
+    Raises:
+        InputError: no glTF 2.0, Draco or meshopt compression, data outside the file, a node below two others.
+    """
+    document = GltfDocument(path)
+    parts = _Parts(document)
+    for node, world in _world_nodes(document):
+        if "mesh" in node:
+            mesh = document.entry("meshes", node["mesh"])
+            joints = _joint_matrices(document, node) if "skin" in node else None
+            shared: dict[int, int] = {}
+            for primitive in document.items(mesh, "primitives"):
+                parts.add(as_object(primitive, subject=f"{document.subject}: primitive"), world, joints, shared)
+    return parts.joined()
+
+
+class _Parts:
+    """The primitives read so far."""
+
+    def __init__(self, document: GltfDocument) -> None:
+        self._document = document
+        self._vertices: list[Float64[np.ndarray, "n 3"]] = []
+        self._colors: list[UInt8[np.ndarray, "n 3"]] = []
+        self._colored: list[np.ndarray] = []
+        self._faces: list[Int64[np.ndarray, "m 3"]] = []
+        self._starts: list[int] = []
+        self._count = self._made = self._left_out = 0
+
+    def add(
+        self,
+        primitive: dict[str, Any],
+        world: Float64[np.ndarray, "4 4"],
+        joints: Float64[np.ndarray, "J 4 4"] | None,
+        shared: dict[int, int],
+    ) -> None:
+        """Append a primitive; `shared` has the parts of the node's earlier ones by their accessor of positions."""
+        document, subject = self._document, self._document.subject
+        mode = as_integer(primitive.get("mode", _TRIANGLES), subject=f"{subject}: mode", least=0, most=6)
+        attributes = document.part(primitive, "attributes")
+        if mode < _TRIANGLES or "POSITION" not in attributes:
+            self._left_out += 1
+            return
+        position = document.number(attributes, "POSITION")
+        draco = "KHR_draco_mesh_compression"
+        if draco in document.part(primitive, "extensions") and "bufferView" not in document.entry("accessors", position):
+            raise compressed(subject, draco)
+        if position not in shared:
+            shared[position] = self._add_vertices(attributes, position, world, joints)
+        part = shared[position]
+        count = len(self._vertices[part])
+        if "indices" in primitive:
+            indices = document.accessor(primitive["indices"])
+            if indices.dtype.kind not in "iu" or indices.shape[1] != 1:
+                raise InputError(f"{subject}: indices", expected="whole numbers", received="others")
+            indices = indices.reshape(-1).astype(np.int64)
+            require_indices(indices, count, subject=subject, kind="indices")
+        else:
+            indices = np.arange(count, dtype=np.int64)
+        faces = _triangles(indices, mode)
+        mirrored = joints is None and np.linalg.det(world[:3, :3]) < 0
+        self._faces.append((faces[:, ::-1] if mirrored else faces) + self._starts[part])
+        self._charge(len(faces))
+        used = np.zeros(count, bool)
+        used[indices] = True
+        used &= ~self._colored[part]
+        colors = primitive_colors(document, primitive, count)
+        if colors is not None:
+            self._colors[part][used] = colors[used]
+            self._colored[part] |= used
+
+    def _add_vertices(
+        self,
+        attributes: dict[str, Any],
+        position: int,
+        world: Float64[np.ndarray, "4 4"],
+        joints: Float64[np.ndarray, "J 4 4"] | None,
+    ) -> int:
+        points = self._document.accessor(position).astype(np.float64)
+        if points.shape[1] != 3:
+            raise InputError(f"{self._document.subject}: POSITION", expected="three coordinates", received="others")
+        self._charge(len(points))
+        with np.errstate(all="ignore"):  # what overflows becomes infinite, which is refused where it matters
+            if joints is None:
+                points = points @ world[:3, :3].T + world[:3, 3]
+            else:
+                points = _skinned(self._document, attributes, points, joints)
+        self._starts.append(self._count)
+        self._count += len(points)
+        self._vertices.append(points)
+        self._colors.append(np.full((len(points), 3), LOST, np.uint8))
+        self._colored.append(np.zeros(len(points), bool))
+        return len(self._vertices) - 1
+
+    def _charge(self, elements: int) -> None:
+        """Refuse a small file that repeats its meshes beyond all memory."""
+        self._made += elements
+        most = max(_MOST_SHARED, self._document.size + self._document.file_bytes)
+        if self._made > most:
+            raise InputError(
+                self._document.subject,
+                expected=f"at most {most} vertices and faces from a file of this size",
+                received="nodes that repeat its meshes beyond them",
+            )
+
+    def joined(self) -> RawMesh:
+        """All parts as one mesh."""
+        if self._left_out:
+            warn(f"{self._document.subject}: {self._left_out} primitives of points or lines are left out")
+        if not self._vertices:
+            return RawMesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
+        colors = np.concatenate(self._colors) if any(mask.any() for mask in self._colored) else None
+        return RawMesh(np.concatenate(self._vertices), np.concatenate(self._faces), colors)
+
+
+def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray, "m 3"]:
+    if mode == _TRIANGLES:
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
+    k = np.arange(max(len(indices) - 2, 0))
+    if mode == _FAN:
+        return indices[np.stack([np.zeros_like(k), k + 1, k + 2], axis=1)]
+    odd = k % 2
+    return indices[np.stack([k, k + 1 + odd, k + 2 - odd], axis=1)]
+
+
+def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
+    """The scene's nodes, depth first, with their transforms to the world."""
+    scenes = document.items(document.json, "scenes")
+    if scenes:
+        roots = document.items(document.entry("scenes", document.json.get("scene", 0)), "nodes")
+    else:
+        nodes = [document.entry("nodes", k) for k in range(len(document.items(document.json, "nodes")))]
+        below = {child for node in nodes for child in document.items(node, "children") if isinstance(child, int)}
+        roots = [k for k in range(len(nodes)) if k not in below]
+    found = []
+    seen: set[int] = set()
+    stack = [(index, np.eye(4)) for index in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        node = document.entry("nodes", index)
+        if index in seen:
+            raise InputError(f"{document.subject}: nodes", expected="a tree", received=f"node {index} twice")
+        seen.add(index)
+        with np.errstate(all="ignore"):
+            world = parent @ _local(document, node)
+        found.append((node, world))
+        stack += [(child, world) for child in reversed(document.items(node, "children"))]
+    return found
+
+
+def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    subject = f"{document.subject}: node"
+    if "matrix" in node:
+        return as_numbers(node["matrix"], (16,), subject=f"{subject} matrix").reshape(4, 4).T
+    x, y, z, w = as_numbers(node.get("rotation", [0, 0, 0, 1]), (4,), subject=f"{subject} rotation")
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    out = np.eye(4)
+    out[:3, :3] = rotation * as_numbers(node.get("scale", [1, 1, 1]), (3,), subject=f"{subject} scale")
+    out[:3, 3] = as_numbers(node.get("translation", [0, 0, 0]), (3,), subject=f"{subject} translation")
+    return out
+
+
+def _joint_matrices(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, "J 4 4"]:
+    """A skin's joints: their transforms to the world times their inverse bind matrices."""
+    skin = document.entry("skins", node["skin"])
+    joints = document.items(skin, "joints")
+    worlds = {id(entry): world for entry, world in _world_nodes(document)}
+    try:
+        out = np.stack([worlds[id(document.entry("nodes", joint))] for joint in joints])
+    except (KeyError, ValueError):
+        raise InputError(f"{document.subject}: skin", expected="joints of the scene", received="others") from None
+    if "inverseBindMatrices" in skin:
+        bind = document.accessor(skin["inverseBindMatrices"])
+        if bind.shape[1] != 16 or len(bind) < len(out):
+            raise InputError(f"{document.subject}: skin", expected="a matrix a joint", received="others")
+        with np.errstate(all="ignore"):
+            out = out @ bind[: len(out)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+    return out
+
+
+def _skinned(
+    document: GltfDocument,
+    attributes: dict[str, Any],
+    points: Float64[np.ndarray, "n 3"],
+    joints: Float64[np.ndarray, "J 4 4"],
+) -> Float64[np.ndarray, "n 3"]:
+    out = np.zeros_like(points)
+    total = np.zeros((len(points), 1))
+    k = 0
+    while f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes:
+        index, weights = (document.accessor(attributes[f"{name}_{k}"]) for name in ("JOINTS", "WEIGHTS"))
+        if index.shape != weights.shape or len(index) != len(points) or index.dtype.kind not in "iu":
+            raise InputError(f"{document.subject}: skin", expected="joints and weights a vertex", received="others")
+        require_indices(index, len(joints), subject=document.subject, kind="joints")
+        for joint, weight in zip(index.T, weights.T.astype(np.float64), strict=True):
+            moved = np.einsum("nij,nj->ni", joints[joint, :3, :3], points) + joints[joint, :3, 3]
+            out += weight[:, None] * moved
+            total += weight[:, None]
+        k += 1
+    return np.divide(out, total, out=points.copy(), where=total > 0)

@@ -1,0 +1,226 @@
+"""Wavefront OBJ files: vertices, faces, colours; https://paulbourke.net/dataformats/obj/.
+
+Vertices are the file's `v` lines, all of them and in their order, whatever objects, groups, materials, texture
+coordinates and normals the file divides them by; faces are its `f` lines.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.number_text import IS_SPACE, as_bytes, count_between, parse_numbers, word_starts
+from smplxpp.core.obj_material import Material, read_materials
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices, warn
+from smplxpp.core.texture import LOST, sample_texture
+
+# Lines that are numbers are read together up to this many bytes, so that the work space stays small.
+_BLOCK = 1 << 24
+
+
+def read_obj(path: Path) -> RawMesh:
+    """Read an OBJ file.
+
+    Colours are those of the `v` lines (`v x y z r g b`); without them the material's: its picture at the vertex's
+    first texture coordinate, or its `Kd`.
+
+    Raises:
+        InputError: a word that is no number, a vertex of fewer than three, indices of vertices that do not exist.
+    """
+    subject = f"mesh file {path}"
+    lines = _Lines.of(read_bytes(path, subject="mesh file"))
+    vertices, colors = _read_vertices(lines, subject)
+    face_lines = lines.of_kind(b"f")
+    references, sizes = _read_faces(lines, face_lines, subject)
+    if len(sizes) != len(face_lines):
+        raise InputError(subject, expected="corners in each f line", received="f lines without any")
+    corner_lines = np.repeat(face_lines, sizes)
+    corners = _resolve(references[:, 0], lines.of_kind(b"v"), corner_lines)
+    fans = fan_triangles(corners, sizes, subject=subject)
+    require_indices(fans.faces, len(vertices), subject=subject)
+    if colors is None:
+        colors = _material_colors(path, lines, corners, references[:, 1], corner_lines, vertex_count=len(vertices))
+    return RawMesh(vertices, fans.faces, colors, source_faces=fans.source_faces)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """A text's lines: (L,) where they begin, blanks skipped, where they end, and the bytes of it all."""
+
+    text: bytes
+    starts: Int64[np.ndarray, " L"]
+    ends: Int64[np.ndarray, " L"]
+
+    @classmethod
+    def of(cls, text: bytes) -> _Lines:
+        # A backslash at a line's end joins the next line to it.
+        text = re.sub(rb"\\[ \t]*\r?\n", b" ", text) if b"\\" in text else text
+        text = text.replace(b"\r", b"\n") if b"\r" in text else text
+        text += b"\n"
+        ends = np.flatnonzero(as_bytes(text) == 10) + 1
+        starts = np.concatenate([[0], ends[:-1]])
+        data = as_bytes(text)
+        indented = IS_SPACE & (np.arange(256) != 10)
+        if indented[data[starts]].any():
+            words = np.flatnonzero(~indented[data])  # line ends among them: an empty line begins at its end
+            starts = words[np.searchsorted(words, starts)]
+        return cls(text, starts, ends)
+
+    def of_kind(self, word: bytes) -> Int64[np.ndarray, " n"]:
+        """The numbers of the lines whose first word is `word`."""
+        return np.flatnonzero(self.kind_mask(word))
+
+    def kind_mask(self, word: bytes) -> Bool[np.ndarray, " L"]:
+        data = as_bytes(self.text)
+        mask = self.ends - self.starts > len(word)
+        for k, byte in enumerate(word):
+            mask &= data[np.minimum(self.starts + k, len(data) - 1)] == byte
+        return mask & IS_SPACE[data[np.minimum(self.starts + len(word), len(data) - 1)]]
+
+    def blocks(self, chosen: Int64[np.ndarray, " n"], word: bytes) -> list[tuple[bytes, Int64[np.ndarray, " m"]]]:
+        """The chosen lines without their first word and without comments, in blocks; where each line begins there."""
+        out: list[tuple[bytes, Int64[np.ndarray, " m"]]] = []
+        if not len(chosen):
+            return out
+        size = np.cumsum(self.ends[chosen] - self.starts[chosen])
+        for rows in np.split(chosen, np.flatnonzero(np.diff(size // _BLOCK)) + 1):
+            breaks = np.flatnonzero(np.diff(rows) > 1)
+            first, last = rows[np.concatenate([[0], breaks + 1])], rows[np.append(breaks, len(rows) - 1)]
+            runs = [self.text[a:b] for a, b in zip(self.starts[first], self.ends[last], strict=True)]
+            shift = np.cumsum([0] + [len(run) for run in runs[:-1]]) - self.starts[first]
+            starts = self.starts[rows] + np.repeat(shift, np.diff(np.concatenate([[0], breaks + 1, [len(rows)]])))
+            # The first word becomes blanks: what is left are numbers, and every line keeps its place.
+            data = as_bytes(b"".join(runs)).copy()
+            data[starts[:, None] + np.arange(len(word))] = ord(" ")
+            text = data.tobytes()
+            if b"#" in text:
+                text = re.sub(rb"#[^\n]*", lambda comment: b" " * len(comment.group()), text)
+            out.append((text, starts))
+        return out
+
+    def words(self, keyword: bytes) -> list[tuple[int, str]]:
+        """What follows a keyword, with the number of the line, for each line that begins with it."""
+        return [
+            (int(k), self.text[self.starts[k] + len(keyword) : self.ends[k]].decode("utf-8", "replace").strip())
+            for k in self.of_kind(keyword)
+        ]
+
+
+def _read_vertices(
+    lines: _Lines, subject: str
+) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
+    places, rgb = [np.empty((0, 3))], [np.empty((0, 3))]
+    for values, counts in _rows(lines, b"v", subject):
+        if counts.min() < 3:
+            raise InputError(subject, expected="three numbers in each v line", received=f"{counts.min()}")
+        first = np.cumsum(counts) - counts
+        places.append(values[first[:, None] + np.arange(3)])
+        colored = first[counts >= 6]
+        rgb.append(values[colored[:, None] + np.arange(3, 6)])
+    vertices, colors = np.concatenate(places), np.concatenate(rgb)
+    if not len(colors):
+        return vertices, None
+    if len(colors) < len(vertices):
+        warn(f"{subject}: colours of {len(colors)} of {len(vertices)} vertices are left out, the others have none")
+        return vertices, None
+    return vertices, color_bytes(colors, subject=subject)
+
+
+def _rows(
+    lines: _Lines, word: bytes, subject: str
+) -> list[tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " m"]]]:
+    """The numbers of all lines of a kind, block by block, and how many are in each line."""
+    out = []
+    for text, starts in lines.blocks(lines.of_kind(word), word):
+        values = parse_numbers(text, subject=f"{subject}: {word.decode()} lines")
+        out.append((values, count_between(word_starts(text), starts)))
+    return out
+
+
+def _read_faces(
+    lines: _Lines, face_lines: Int64[np.ndarray, " F"], subject: str
+) -> tuple[Int64[np.ndarray, "C 2"], Int64[np.ndarray, " F"]]:
+    """Each corner's references to a vertex and a texture coordinate as the file has them, 0 for none; corners a line."""
+    references, sizes = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
+    for text, starts in lines.blocks(face_lines, b"f"):
+        while b"//" in text:  # a reference that is left out
+            text = text.replace(b"//", b"/0/")
+            starts = np.concatenate([[0], np.flatnonzero(as_bytes(text) == 10)[:-1] + 1])
+        corners = word_starts(text)
+        plain = text.replace(b"/", b" ")
+        numbers = parse_numbers(plain, subject=f"{subject}: f lines")
+        if not (np.abs(numbers) < 2**53).all() or (numbers != np.rint(numbers)).any():
+            raise InputError(f"{subject}: f lines", expected="whole numbers", received="others")
+        places = word_starts(plain)
+        corner = np.searchsorted(corners, places, side="right") - 1
+        if (corner < 0).any() or not np.isin(corners, places).all():
+            raise InputError(f"{subject}: f lines", expected="corners that name a vertex", received="others")
+        slashes = np.flatnonzero(as_bytes(text) == 47)
+        slot = np.searchsorted(slashes, places) - np.searchsorted(slashes, corners)[corner]
+        block = np.zeros((len(corners), 2), np.int64)
+        kept = slot < 2
+        block[corner[kept], slot[kept]] = numbers[kept]
+        references.append(block)
+        sizes.append(count_between(corners, starts))
+    return np.concatenate(references), np.concatenate(sizes)
+
+
+def _resolve(
+    references: Int64[np.ndarray, " C"], defined: Int64[np.ndarray, " n"], corner_lines: Int64[np.ndarray, " C"]
+) -> Int64[np.ndarray, " C"]:
+    """Indices from 0; a negative reference counts back from the line in which it stands. -1 for none."""
+    if len(references) and references.min() < 0:
+        back = references < 0
+        known = np.searchsorted(defined, corner_lines[back])
+        references = references.copy()
+        references[back] = np.maximum(known + references[back] + 1, 0)
+    return references - 1
+
+
+def _material_colors(
+    path: Path,
+    lines: _Lines,
+    corners: Int64[np.ndarray, " C"],
+    uv_references: Int64[np.ndarray, " C"],
+    corner_lines: Int64[np.ndarray, " C"],
+    *,
+    vertex_count: int,
+) -> UInt8[np.ndarray, "N 3"] | None:
+    """The colours that the materials of the vertices' first corners give; None where no material has any."""
+    uses, libraries = lines.words(b"usemtl"), lines.words(b"mtllib")
+    if not uses or not libraries:
+        return None
+    materials = read_materials(path, [name for _, name in libraries])
+    names = sorted({name for _, name in uses})
+    found = [materials.get(name, Material()) for name in names]
+    if all(material.color is None and material.picture is None for material in found):
+        return None
+    corners = np.where((corners >= 0) & (corners < vertex_count), corners, 0)  # of faces that were left out
+    vertices, first = np.unique(corners, return_index=True)
+    use = np.searchsorted([line for line, _ in uses], corner_lines[first]) - 1
+    used = np.array([names.index(name) for _, name in uses])[use]
+    colors = np.full((vertex_count, 3), LOST, np.uint8)
+    rows = _rows(lines, b"vt", f"mesh file {path}")
+    uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
+    index = _resolve(uv_references[first], lines.of_kind(b"vt"), corner_lines[first])
+    index = np.where(index < len(uv), index, -1)
+    for k, material in enumerate(found):
+        chosen = (used == k) & (use >= 0)
+        if material.color is not None:
+            colors[vertices[chosen]] = material.color
+        if material.picture is not None:
+            chosen &= index >= 0
+            colors[vertices[chosen]] = sample_texture(material.picture, uv[index[chosen]])
+    return colors
+
+
+def _first_two(values: Float64[np.ndarray, " n"], counts: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:
+    """The first two numbers of each line; a lone one has 0 for its second."""
+    values = np.append(values, [0.0, 0.0])
+    first = np.cumsum(counts) - counts
+    return np.stack([np.where(counts > k, values[first + k], 0.0) for k in range(2)], axis=1)

@@ -1,0 +1,101 @@
+"""The colours of an OBJ file's materials, from its `.mtl` files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from smplxpp.core.raw_mesh import read_bytes, warn
+from smplxpp.core.texture import beside, read_picture
+
+# How many numbers follow an option of a picture's name.
+_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}
+_VECTORS = ("-mm", "-o", "-s", "-t")
+_MOST_BYTES = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A material's colour: `color` (3,) of its `Kd`, `picture` (H, W, 3) of its `map_Kd`; None for what it lacks."""
+
+    color: UInt8[np.ndarray, "3"] | None = None
+    picture: UInt8[np.ndarray, "H W 3"] | None = None
+
+
+def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
+    """The materials of an OBJ file by name; what is missing or damaged is left out with a warning.
+
+    A picture that cannot be read takes the material's `Kd` with it, which then is a factor and no colour.
+
+    Args:
+        path: of the OBJ file.
+        libraries: what follows `mtllib`, a line an entry: a name with blanks in it, or several names.
+    """
+    out: dict[str, Material] = {}
+    pictures: dict[str, UInt8[np.ndarray, "H W 3"] | None] = {}
+    for entry in dict.fromkeys(libraries):
+        names = [entry] if beside(path, entry) is not None else entry.split()
+        for name in names:
+            found = beside(path, name)
+            if found is None:
+                warn(f"mesh file {path}: colours of its materials are lost: {name!r} is not in its folder")
+                continue
+            text = read_bytes(found, subject="material file", limit=_MOST_BYTES).decode("utf-8", "replace")
+            for material, (color, picture) in _parse(text).items():
+                if picture is None:
+                    out[material] = Material(color)
+                    continue
+                if picture not in pictures:
+                    pictures[picture] = read_picture(path, picture)
+                out[material] = Material(picture=pictures[picture])
+    return out
+
+
+def _parse(text: str) -> dict[str, tuple[UInt8[np.ndarray, "3"] | None, str | None]]:
+    """Each material's `Kd` as 8-bit RGB, and the name of its picture."""
+    out: dict[str, tuple[UInt8[np.ndarray, "3"] | None, str | None]] = {}
+    name = ""
+    for line in text.splitlines():
+        words = line.split(None, 1) + ["", ""]
+        keyword, rest = words[0].lower(), words[1].strip()
+        color, picture = out.get(name, (None, None))
+        if keyword == "newmtl":
+            name = rest
+            out[name] = (None, None)
+        elif keyword == "kd":
+            out[name] = (_kd(rest), picture)
+        elif keyword == "map_kd" and rest:
+            out[name] = (color, _without_options(rest))
+    return out
+
+
+def _kd(text: str) -> UInt8[np.ndarray, "3"] | None:
+    try:
+        values = np.array([float(word) for word in text.split()[:3]])
+    except ValueError:
+        return None
+    if len(values) != 3 or not np.isfinite(values).all():
+        return None
+    return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+
+
+def _without_options(text: str) -> str:
+    words = text.split()
+    while words and words[0] in (*_OPTIONS, *_VECTORS) and len(words) > 1:
+        option = words.pop(0)
+        for _ in range(3 if option in _VECTORS else _OPTIONS[option]):
+            # Of a vector's three numbers the last two may be left out.
+            if len(words) > 1 and (option not in _VECTORS or _is_number(words[0])):
+                words.pop(0)
+    return " ".join(words) if words[:1] != text.split()[:1] else text
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

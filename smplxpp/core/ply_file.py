@@ -1,0 +1,175 @@
+"""PLY meshes: ASCII and both binary byte orders; vertices, faces, colours, further properties."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.number_text import as_bytes, count_between, parse_numbers, word_starts
+from smplxpp.core.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices
+from smplxpp.core.texture import LOST, read_picture, sample_texture
+
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 1 << 20
+# Properties that a mesh keeps elsewhere; all others stay by their names.
+_KNOWN = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
+_CORNERS = ("vertex_indices", "vertex_index")
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_TEXTURE_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+
+
+def read_ply(path: Path) -> RawMesh:
+    """Read a PLY mesh: the vertex element's rows, the face element's rows, polygons cut into fans.
+
+    Face properties are repeated for each triangle of a polygon. Colours are those of the vertices; without them, or
+    where all are the same, the picture's (`comment TextureFile`), at the vertex's coordinates, or at its first corner's
+    of the faces' lists.
+
+    Raises:
+        InputError: no PLY, a damaged header, fewer data than it announces, indices of vertices that do not exist.
+    """
+    subject = f"mesh file {path}"
+    data = read_bytes(path, subject="mesh file")
+    byte_order, elements, pictures, body = _read_header(data, subject)
+    if byte_order:
+        cells = Cells(np.frombuffer(data, np.uint8)[body:], byte_order)
+    else:
+        cells = _ascii_cells(data[body:], sum(element.count for element in elements), subject)
+    found: dict[str, Columns] = {}
+    place = 0
+    for element in elements:
+        found[element.name], place = read_element(cells, place, element, subject=subject)
+    vertex, face = found.get("vertex", {}), found.get("face", {})
+    if "face" not in found and "tristrips" in found:
+        raise InputError(
+            subject,
+            expected="faces",
+            received="triangle strips",
+            remedy="export triangles; MeshLab writes them when it saves the file again",
+        )
+    vertices = _vertices(vertex, subject)
+    corners = next((face[name] for name in _CORNERS if name in face), None)
+    if corners is None:
+        corners = ListColumn(np.empty(0, np.int64), np.empty(0, np.int64))
+    if not isinstance(corners, ListColumn) or corners.values.dtype.kind not in "iu":
+        raise InputError(f"{subject}: faces", expected="lists of whole numbers", received="another property")
+    require_indices(corners.values, len(vertices), subject=subject)
+    fans = fan_triangles(corners.values, corners.lengths, subject=subject)
+    colors = _vertex_colors(vertex, subject)
+    if pictures and (colors is None or (colors == colors[:1]).all()):
+        found_in_pictures = _picture_colors(path, vertex, face, corners, pictures, vertex_count=len(vertices))
+        colors = colors if found_in_pictures is None else found_in_pictures
+    return RawMesh(
+        vertices,
+        fans.faces,
+        colors,
+        {name: column for name, column in vertex.items() if _is_extra(name, column)},
+        {name: column[fans.polygons] for name, column in face.items() if _is_extra(name, column)},
+        source_faces=fans.source_faces,
+    )
+
+
+def _read_header(data: bytes, subject: str) -> tuple[str, list[Element], list[str], int]:
+    """The byte order, the elements, the names of the pictures, and where the data begin."""
+    if not data.startswith(b"ply"):
+        raise InputError(subject, expected="a PLY file, which begins with `ply`", received=repr(data[:16]))
+    end = re.search(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\n|\r)", data[:_LONGEST_HEADER])
+    if end is None:
+        raise InputError(subject, expected="a header that ends with `end_header`", received="none")
+    body = end.end()
+    # A header of lone carriage returns may be followed by a byte 10 of the data.
+    if end.group(1) == b"\r\n" and b"\r\n" not in data[: end.start(1)]:
+        body -= 1
+    byte_order: str | None = None
+    elements: list[tuple[str, int, list[Property]]] = []
+    pictures: list[str] = []
+    for line in re.split(r"[\r\n]+", data[: end.start(1)].decode("latin1"))[1:]:
+        words = line.split()
+        match words:
+            case ["format", name, _] if name in _ORDERS:
+                byte_order = _ORDERS[name]
+            case ["comment", "TextureFile", *_]:
+                pictures.append(line.split(None, 2)[2].strip() if len(words) > 2 else "")
+            case [] | ["comment" | "obj_info" | "end_header", *_]:
+                pass
+            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count, re.ASCII):
+                elements.append((name, int(count), []))
+            case ["property", "list", lengths, values, name] if elements and lengths in TYPES and values in TYPES:
+                if TYPES[lengths][0] == "f":
+                    raise InputError(f"{subject}: header", expected="whole lengths of lists", received=line[:80])
+                elements[-1][2].append(Property(name, TYPES[values], TYPES[lengths]))
+            case ["property", values, name] if elements and values in TYPES:
+                elements[-1][2].append(Property(name, TYPES[values]))
+            case _:
+                raise InputError(f"{subject}: header", expected="lines of a PLY header", received=repr(line[:80]))
+    if byte_order is None:
+        raise InputError(f"{subject}: header", expected=f"a format of {', '.join(_ORDERS)}", received="none")
+    for name in (e[0] for e in elements):
+        if [e[0] for e in elements].count(name) > 1:
+            raise InputError(f"{subject}: header", expected="each element once", received=f"two elements {name}")
+    for name, _, properties in elements:
+        if len({p.name for p in properties}) < len(properties):
+            raise InputError(f"{subject}: header", expected="each property once", received=f"two alike of {name}")
+    return byte_order, [Element(name, count, tuple(ps)) for name, count, ps in elements], pictures, body
+
+
+def _ascii_cells(text: bytes, rows: int, subject: str) -> Cells:
+    numbers = parse_numbers(text, subject=subject)
+    text = text.replace(b"\r", b"\n")
+    starts = np.concatenate([[0], np.flatnonzero(as_bytes(text) == 10) + 1])
+    per_line = count_between(word_starts(text), starts)
+    lines = np.concatenate([[0], np.cumsum(per_line[per_line > 0])])
+    return Cells(numbers, "", lines if len(lines) == rows + 1 else None)
+
+
+def _vertices(vertex: Columns, subject: str) -> Float64[np.ndarray, "N 3"]:
+    axes = [vertex.get(axis) for axis in "xyz"]
+    if not all(isinstance(column, np.ndarray) for column in axes):
+        raise InputError(f"{subject}: vertices", expected="properties x, y and z", received=", ".join(vertex) or "none")
+    return np.stack([np.asarray(column, np.float64) for column in axes], axis=1)
+
+
+def _is_extra(name: str, column: np.ndarray | ListColumn) -> bool:
+    return isinstance(column, np.ndarray) and name not in _KNOWN
+
+
+def _vertex_colors(vertex: Columns, subject: str) -> UInt8[np.ndarray, "N 3"] | None:
+    for names in _COLORS:
+        columns = [vertex.get(name) for name in names]
+        if all(isinstance(column, np.ndarray) for column in columns):
+            return color_bytes(np.stack([np.asarray(column) for column in columns], axis=1), subject=subject)
+    return None
+
+
+def _picture_colors(
+    path: Path, vertex: Columns, face: Columns, corners: ListColumn, names: list[str], *, vertex_count: int
+) -> UInt8[np.ndarray, "N 3"] | None:
+    """The colours of the pictures at the vertices' coordinates; None where coordinates or all pictures are missing."""
+    coordinates = next(
+        (np.stack([vertex[a], vertex[b]], axis=1) for a, b in _TEXTURE_COORDINATES if a in vertex and b in vertex), None
+    )
+    vertices, page = np.arange(vertex_count), np.zeros(vertex_count, np.int64)
+    if coordinates is None:
+        lists = face.get("texcoord")
+        if not isinstance(lists, ListColumn) or not np.array_equal(lists.lengths, 2 * corners.lengths):
+            return None
+        vertices, first = np.unique(corners.values, return_index=True)
+        coordinates = lists.values.reshape(-1, 2)[first]
+        number = face.get("texnumber")
+        if isinstance(number, np.ndarray):
+            page = np.repeat(number, corners.lengths)[first]
+        else:
+            page = page[vertices]
+    pictures = [read_picture(path, name) for name in names]
+    if all(picture is None for picture in pictures):
+        return None
+    colors = np.full((vertex_count, 3), LOST, np.uint8)
+    for k, picture in enumerate(pictures):
+        if picture is not None:
+            colors[vertices[page == k]] = sample_texture(picture, coordinates[page == k])
+    return colors
