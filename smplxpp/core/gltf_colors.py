@@ -9,14 +9,13 @@ from jaxtyping import Float64, Num, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.gltf_document import GltfDocument
+from smplxpp.core.image_file import decode_image
 from smplxpp.core.json_file import as_number, as_numbers, as_text
 from smplxpp.core.raw_mesh import warn
-from smplxpp.core.texture import decode_picture, sample_texture
+from smplxpp.core.texture import sample_texture
 
 
-def primitive_colors(
-    document: GltfDocument, primitive: dict[str, Any], count: int
-) -> UInt8[np.ndarray, "N 3"] | None:
+def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
     """The colours of a primitive's vertices; None where it has none, or, with a warning, where they are damaged.
 
     Args:
@@ -45,9 +44,7 @@ def _surface(document: GltfDocument, primitive: dict[str, Any]) -> tuple[dict[st
     return document.part(material, "pbrMetallicRoughness"), "baseColorTexture", "baseColorFactor"
 
 
-def _picture_colors(
-    document: GltfDocument, primitive: dict[str, Any], count: int
-) -> UInt8[np.ndarray, "N 3"] | None:
+def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
     surface, name, _ = _surface(document, primitive)
     if name not in surface:
         return None
@@ -60,10 +57,28 @@ def _picture_colors(
     uv = document.accessor(attributes[f"TEXCOORD_{layer}"]).astype(np.float64)
     if uv.shape != (count, 2):
         raise InputError("texture coordinates", expected="two a vertex", received=f"shape {uv.shape}")
-    picture = document.picture(use.get("index"))
-    if picture is None:
-        return None
+    picture = _picture(document, use)
     return sample_texture(picture, _transformed(uv, transform), top_down=True)
+
+
+def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "H W 3"]:
+    """The decoded image of a texture.
+
+    Raises:
+        InputError: it names the file that is missing, or what is wrong with the picture.
+    """
+    texture = document.entry("textures", use.get("index"))
+    webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
+    image = document.entry("images", texture.get("source", webp.get("source")))
+    if "bufferView" in image:
+        data: bytes | None = bytes(document.view(image["bufferView"])[0])
+        name = f"image {image.get('name', '')}".strip()
+    else:
+        name = as_text(image.get("uri"), subject="uri of an image")
+        data = document.resource(name)
+    if data is None:
+        raise InputError("picture", expected="a file in the mesh file's folder", received=repr(name[:80]))
+    return np.array(decode_image(data, subject=f"picture {name[:80]!r}").convert("RGB"))
 
 
 def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> Float64[np.ndarray, "N 2"]:
@@ -80,9 +95,7 @@ def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> F
         return (uv * scale) @ turn.T + offset
 
 
-def _vertex_colors(
-    document: GltfDocument, primitive: dict[str, Any], count: int
-) -> UInt8[np.ndarray, "N 3"] | None:
+def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
     attributes = document.part(primitive, "attributes")
     if "COLOR_0" not in attributes:
         return None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import binascii
 import urllib.parse
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +94,6 @@ class GltfDocument:
     def number(self, of: dict[str, Any], name: str, default: int | None = None) -> int:
         """A count, an offset or an index of an object."""
         return as_integer(of.get(name, default), subject=f"{self.subject}: {name}", least=0, most=2**53)
-
-    @cached_property
-    def extensions_required(self) -> set[str]:
-        """The names of the extensions without which the document means something else."""
-        return {str(name) for name in self.items(self.json, "extensionsRequired")}
 
     def view(self, index: Any) -> tuple[memoryview, int]:
         """The bytes of a buffer view, and its stride (0 for none).
@@ -203,6 +197,11 @@ class GltfDocument:
                 raise InputError(f"{self.subject}: buffer", expected="data", received="none", remedy=_DAMAGED)
             self._buffers[index] = data
         return self._buffers[index]
+
+    @property
+    def file_bytes(self) -> int:
+        """The bytes of the other files that were read so far."""
+        return sum(len(data) for data in self._files.values())
 
     def resource(self, uri: str) -> bytes | None:
         """The bytes of a data URI, or of a file inside the document's folder; None where there is none.

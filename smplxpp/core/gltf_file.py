@@ -73,7 +73,9 @@ class _Parts:
             return
         position = document.number(attributes, "POSITION")
         draco = "KHR_draco_mesh_compression"
-        if draco in document.part(primitive, "extensions") and "bufferView" not in document.entry("accessors", position):
+        if draco in document.part(primitive, "extensions") and "bufferView" not in document.entry(
+            "accessors", position
+        ):
             raise compressed(subject, draco)
         if position not in shared:
             shared[position] = self._add_vertices(attributes, position, world, joints)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,11 @@ def open_image(path: str | Path, *, subject: str = "image file", remedy: str = "
     return _open(regular_file(path, subject=subject, remedy=remedy), subject, remedy, decode=True)
 
 
+def decode_image(data: bytes, *, subject: str, remedy: str = "") -> Image:
+    """An image in a file's bytes, decoded, as pictures inside of other files are; raises what `open_image` raises."""
+    return _open(io.BytesIO(data), subject, remedy, decode=True)
+
+
 def image_size(path: str | Path, *, subject: str = "image file", remedy: str = "") -> tuple[int, int]:
     """Width and height of an image, from the file's header.
 
@@ -40,11 +46,11 @@ def image_mode(path: str | Path, *, subject: str = "image file", remedy: str = "
     return _open(regular_file(path, subject=subject, remedy=remedy), subject, remedy, decode=False).mode
 
 
-def _open(path: Path, subject: str, remedy: str, *, decode: bool) -> Image:
+def _open(source: Path | io.BytesIO, subject: str, remedy: str, *, decode: bool) -> Image:
     import PIL.Image
 
     try:
-        with PIL.Image.open(path, formats=_FORMATS) as image:
+        with PIL.Image.open(source, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels, more than {_MOST_PIXELS}")
             image.info["raw_mode"] = str(image.tile[0][3]) if image.tile else ""
@@ -55,4 +61,5 @@ def _open(path: Path, subject: str, remedy: str, *, decode: bool) -> Image:
         raise
     except Exception as error:  # noqa: BLE001  a decoder may raise anything on a broken file
         received = str(error)[:300] or type(error).__name__
-        raise InputError(f"{subject} {path}", expected="a whole image", received=received, remedy=remedy) from None
+        subject = f"{subject} {source}" if isinstance(source, Path) else subject
+        raise InputError(subject, expected="a whole image", received=received, remedy=remedy) from None

@@ -1,39 +1,31 @@
-"""Mesh files: read anything trimesh reads (PLY, OBJ, GLB, STL, OFF) and our npz; write PLY.
+"""Mesh files: the one door to PLY, OBJ, glTF, STL, OFF and our npz; write PLY.
 
-Nothing is merged, reordered or repaired on reading, so labels that come in a second file keep their meaning.
+Nothing is merged, split, reordered or repaired on reading, so labels that come in a second file keep their meaning:
+vertices are the file's own, faces too, but that a polygon becomes a fan of triangles in its place.
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import UInt8
 
+from smplxpp.core.array_file import read_arrays
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
+from smplxpp.core.gltf_file import read_gltf
+from smplxpp.core.json_file import as_numbers
 from smplxpp.core.mesh import TriangleMesh
-
-SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off", ".npz", ".pkl")
-
-
-@dataclass(frozen=True, eq=False)
-class RawMesh:
-    """The arrays of a mesh file before any check.
-
-    Attributes:
-        vertices: (N, 3) float64, may hold NaN. faces: (M, 3) int64.
-        vertex_colors: (N, 3) uint8 or None.
-        vertex_properties, face_properties: other per-element arrays by name (PLY).
-    """
-
-    vertices: Float64[np.ndarray, "N 3"]
-    faces: Int64[np.ndarray, "M 3"]
-    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None
-    vertex_properties: dict[str, np.ndarray] = field(default_factory=dict)
-    face_properties: dict[str, np.ndarray] = field(default_factory=dict)
+from smplxpp.core.obj_file import read_obj
+from smplxpp.core.paths import regular_file
+from smplxpp.core.ply_file import read_ply
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, require_reach
+from smplxpp.core.stl_off_files import read_off, read_stl
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +55,16 @@ def read_mesh(path: str | Path) -> MeshFile:
 
 
 def read_raw_mesh(path: str | Path) -> RawMesh:
-    """Read the arrays of a mesh file, unchecked but for a file that holds no triangle mesh at all."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError("mesh file", expected="an existing file", received=str(path))
-    if path.suffix.lower() not in SUFFIXES:
+    """Read the arrays of a mesh file; they may hold NaN and infinity, which `smplxpp.clean.sanitize` repairs.
+
+    Raises:
+        InputError: missing, unknown, damaged or compressed file, no faces, or coordinates beyond 1e12.
+    """
+    path = regular_file(path, subject="mesh file")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
         raise InputError(f"mesh file {path}", expected=f"one of {', '.join(SUFFIXES)}", received=path.suffix or "none")
-    if path.suffix.lower() in (".npz", ".pkl"):
-        raw = _read_arrays(path)
-    else:
-        raw = _read_with_trimesh(path)
+    raw = reader(path)
     if not len(raw.faces) or not len(raw.vertices):
         raise InputError(
             f"mesh file {path}",
@@ -80,71 +72,56 @@ def read_raw_mesh(path: str | Path) -> RawMesh:
             received=f"{len(raw.vertices)} vertices, {len(raw.faces)} faces",
             remedy="export the surface, not the point cloud",
         )
+    require_reach(raw.vertices, subject=f"mesh file {path}")
     return raw
 
 
-def _read_arrays(path: Path) -> RawMesh:
-    if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as data:
-            values = {key: data[key] for key in data.files}
-    else:
-        from smplxpp.core.safe_pickle import safe_load
+def _read_npz(path: Path) -> RawMesh:
+    return _from_arrays(path, read_arrays(path, subject="mesh file"))
 
-        loaded = safe_load(path)
-        values = loaded if isinstance(loaded, dict) else {}
-    keys = {"vertices": ("vertices", "verts", "v"), "faces": ("faces", "f")}
-    found = {name: next((values[k] for k in names if k in values), None) for name, names in keys.items()}
+
+def _read_pickle(path: Path) -> RawMesh:
+    from smplxpp.core.safe_pickle import safe_load
+
+    loaded = safe_load(path)
+    return _from_arrays(path, loaded if isinstance(loaded, dict) else {})
+
+
+def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
+    subject = f"mesh file {path}"
+    names = {"vertices": ("vertices", "verts", "v"), "faces": ("faces", "f")}
+    found = {key: next((values[k] for k in known if k in values), None) for key, known in names.items()}
     if found["vertices"] is None or found["faces"] is None:
-        raise InputError(
-            f"mesh file {path}", expected="arrays `vertices` and `faces`", received=f"keys {sorted(map(str, values))}"
-        )
+        keys = sorted(map(str, values))
+        raise InputError(subject, expected="arrays `vertices` and `faces`", received=f"keys {keys}"[:300])
+    vertices = as_numbers(found["vertices"], (None, 3), subject=f"{subject}: vertices", finite=False)
+    faces = as_numbers(found["faces"], (None, 3), subject=f"{subject}: faces")
+    if not ((faces == np.rint(faces)) & (np.abs(faces) < 2**53)).all():
+        raise InputError(f"{subject}: faces", expected="whole numbers", received="others")
     colors = values.get("vertex_colors", values.get("colors"))
     if colors is not None:
-        colors = np.asarray(colors)[:, :3]
-        if colors.dtype.kind == "f":
-            colors = np.clip(colors * (255.0 if colors.max() <= 1.0 else 1.0) + 0.5, 0, 255)
-        colors = colors.astype(np.uint8)
-    return RawMesh(np.asarray(found["vertices"], np.float64), np.asarray(found["faces"]).astype(np.int64), colors)
+        array = np.asarray(colors) if getattr(colors, "dtype", None) == np.uint8 else None
+        if array is None:
+            array = as_numbers(colors, subject=f"{subject}: vertex colours", finite=False)
+        if array.ndim != 2 or array.shape[1] < 3 or len(array) != len(vertices):
+            raise InputError(
+                f"{subject}: vertex colours", expected=f"shape ({len(vertices)}, 3 or 4)", received=f"{array.shape}"
+            )
+        colors = color_bytes(array, subject=subject)
+    return RawMesh(vertices, faces.astype(np.int64), colors)
 
 
-def _read_with_trimesh(path: Path) -> RawMesh:
-    import trimesh
-
-    try:
-        loaded = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-    except Exception as error:  # noqa: BLE001  a parser may raise anything on a broken file
-        raise InputError(
-            f"mesh file {path}", expected="a readable mesh", received=f"{type(error).__name__}: {error}"
-        ) from None
-    if not isinstance(loaded, trimesh.Trimesh):
-        raise InputError(f"mesh file {path}", expected="a triangle mesh", received=type(loaded).__name__)
-    colors = None
-    visual = loaded.visual
-    if isinstance(visual, trimesh.visual.ColorVisuals):
-        if visual.kind == "vertex":
-            colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
-    elif visual is not None and visual.uv is not None and len(visual.uv) == len(loaded.vertices):
-        colors = np.asarray(visual.to_color().vertex_colors)[:, :3].astype(np.uint8)
-    vertex_properties, face_properties = _ply_properties(loaded)
-    return RawMesh(
-        np.asarray(loaded.vertices, np.float64),
-        np.asarray(loaded.faces, np.int64),
-        colors,
-        vertex_properties,
-        face_properties,
-    )
-
-
-def _ply_properties(loaded) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The extra per-vertex and per-face scalars of a PLY file, which trimesh keeps raw."""
-    known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "vertex_indices", "vertex_index"}
-    out: list[dict[str, np.ndarray]] = []
-    for element, count in (("vertex", len(loaded.vertices)), ("face", len(loaded.faces))):
-        data = loaded.metadata.get("_ply_raw", {}).get(element, {}).get("data", {})
-        names = data.dtype.names or () if isinstance(data, np.ndarray) else data
-        arrays = {name: np.asarray(data[name]).reshape(-1) for name in names if name not in known}
-        out.append({name: a for name, a in arrays.items() if len(a) == count and a.dtype.kind in "iuf"})
-    return out[0], out[1]
+_READERS = {
+    ".ply": read_ply,
+    ".obj": read_obj,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".stl": read_stl,
+    ".off": read_off,
+    ".npz": _read_npz,
+    ".pkl": _read_pickle,
+}
+SUFFIXES = tuple(_READERS)
 
 
 def write_ply(

@@ -111,9 +111,7 @@ class _Lines:
         ]
 
 
-def _read_vertices(
-    lines: _Lines, subject: str
-) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
+def _read_vertices(lines: _Lines, subject: str) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
     places, rgb = [np.empty((0, 3))], [np.empty((0, 3))]
     for values, counts in _rows(lines, b"v", subject):
         if counts.min() < 3:
@@ -131,9 +129,7 @@ def _read_vertices(
     return vertices, color_bytes(colors, subject=subject)
 
 
-def _rows(
-    lines: _Lines, word: bytes, subject: str
-) -> list[tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " m"]]]:
+def _rows(lines: _Lines, word: bytes, subject: str) -> list[tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " m"]]]:
     """The numbers of all lines of a kind, block by block, and how many are in each line."""
     out = []
     for text, starts in lines.blocks(lines.of_kind(word), word):
@@ -145,7 +141,7 @@ def _rows(
 def _read_faces(
     lines: _Lines, face_lines: Int64[np.ndarray, " F"], subject: str
 ) -> tuple[Int64[np.ndarray, "C 2"], Int64[np.ndarray, " F"]]:
-    """Each corner's references to a vertex and a texture coordinate as the file has them, 0 for none; corners a line."""
+    """Each corner's vertex and texture coordinate as the file counts them, 0 for none; and the corners of each line."""
     references, sizes = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     for text, starts in lines.blocks(face_lines, b"f"):
         while b"//" in text:  # a reference that is left out

@@ -21,7 +21,7 @@ _MOST_BYTES = 1 << 24
 class Material:
     """A material's colour: `color` (3,) of its `Kd`, `picture` (H, W, 3) of its `map_Kd`; None for what it lacks."""
 
-    color: UInt8[np.ndarray, "3"] | None = None
+    color: UInt8[np.ndarray, " 3"] | None = None
     picture: UInt8[np.ndarray, "H W 3"] | None = None
 
 
@@ -54,9 +54,9 @@ def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
     return out
 
 
-def _parse(text: str) -> dict[str, tuple[UInt8[np.ndarray, "3"] | None, str | None]]:
+def _parse(text: str) -> dict[str, tuple[UInt8[np.ndarray, " 3"] | None, str | None]]:
     """Each material's `Kd` as 8-bit RGB, and the name of its picture."""
-    out: dict[str, tuple[UInt8[np.ndarray, "3"] | None, str | None]] = {}
+    out: dict[str, tuple[UInt8[np.ndarray, " 3"] | None, str | None]] = {}
     name = ""
     for line in text.splitlines():
         words = line.split(None, 1) + ["", ""]
@@ -72,7 +72,7 @@ def _parse(text: str) -> dict[str, tuple[UInt8[np.ndarray, "3"] | None, str | No
     return out
 
 
-def _kd(text: str) -> UInt8[np.ndarray, "3"] | None:
+def _kd(text: str) -> UInt8[np.ndarray, " 3"] | None:
     try:
         values = np.array([float(word) for word in text.split()[:3]])
     except ValueError:

@@ -1,7 +1,7 @@
 """PLY's elements: what a header says of them, and their values, read within the file's size.
 
-http://paulbourke.net/dataformats/ply/. A property is one value or a list with its own length in each row. Rows are read
-together where all lists of a property are equally long, which is the rule; otherwise their lengths are found row by row.
+http://paulbourke.net/dataformats/ply/. A property is one value or a list with its own length in each row. Rows are
+read together where all lists of a property are equally long, which is the rule; otherwise row by row.
 """
 
 from __future__ import annotations
@@ -183,7 +183,9 @@ def _length_at(cells: Cells, place: int, p: Property, subject: str) -> int:
         raise _too_short(subject, place, len(cells.data))
     length = int(cells.values(np.array([place]), p.length_type, subject=f"{subject}: lengths of {p.name}")[0])
     if length < 0 or length > len(cells.data):
-        raise InputError(f"{subject}: lengths of {p.name}", expected="none below 0 or beyond the file", received=f"{length}")
+        raise InputError(
+            f"{subject}: lengths of {p.name}", expected="none below 0 or beyond the file", received=f"{length}"
+        )
     return length
 
 
@@ -249,7 +251,9 @@ def _read_uneven(
 
 def _plain_length(value: float, p: Property, subject: str) -> int:
     if not 0 <= value < 2**53 or value != int(value):
-        raise InputError(f"{subject}: lengths of {p.name}", expected="whole numbers, none below 0", received=f"{value:g}")
+        raise InputError(
+            f"{subject}: lengths of {p.name}", expected="whole numbers, none below 0", received=f"{value:g}"
+        )
     return int(value)
 
 

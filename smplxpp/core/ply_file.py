@@ -68,8 +68,8 @@ def read_ply(path: Path) -> RawMesh:
         vertices,
         fans.faces,
         colors,
-        {name: column for name, column in vertex.items() if _is_extra(name, column)},
-        {name: column[fans.polygons] for name, column in face.items() if _is_extra(name, column)},
+        _extra(vertex),
+        {name: column[fans.polygons] for name, column in _extra(face).items()},
         source_faces=fans.source_faces,
     )
 
@@ -134,8 +134,8 @@ def _vertices(vertex: Columns, subject: str) -> Float64[np.ndarray, "N 3"]:
     return np.stack([np.asarray(column, np.float64) for column in axes], axis=1)
 
 
-def _is_extra(name: str, column: np.ndarray | ListColumn) -> bool:
-    return isinstance(column, np.ndarray) and name not in _KNOWN
+def _extra(columns: Columns) -> dict[str, np.ndarray]:
+    return {name: c for name, c in columns.items() if isinstance(c, np.ndarray) and name not in _KNOWN}
 
 
 def _vertex_colors(vertex: Columns, subject: str) -> UInt8[np.ndarray, "N 3"] | None:
@@ -150,9 +150,9 @@ def _picture_colors(
     path: Path, vertex: Columns, face: Columns, corners: ListColumn, names: list[str], *, vertex_count: int
 ) -> UInt8[np.ndarray, "N 3"] | None:
     """The colours of the pictures at the vertices' coordinates; None where coordinates or all pictures are missing."""
-    coordinates = next(
-        (np.stack([vertex[a], vertex[b]], axis=1) for a, b in _TEXTURE_COORDINATES if a in vertex and b in vertex), None
-    )
+    scalars = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
+    pairs = [(scalars[a], scalars[b]) for a, b in _TEXTURE_COORDINATES if a in scalars and b in scalars]
+    coordinates = np.stack(pairs[0], axis=1) if pairs else None
     vertices, page = np.arange(vertex_count), np.zeros(vertex_count, np.int64)
     if coordinates is None:
         lists = face.get("texcoord")

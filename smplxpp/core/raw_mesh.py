@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, Integer, Num, UInt8
 
 from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.paths import regular_file
 
 # float64 still tells tenths of a millimetre at this distance, and no sum of squares overflows even in float32.
 LARGEST_COORDINATE = 1e12
@@ -78,7 +78,7 @@ def fan_triangles(corners: Integer[np.ndarray, " C"], sizes: Integer[np.ndarray,
     return Fans(corners.astype(np.int64)[places].reshape(-1, 3), places, polygons, len(sizes))
 
 
-def require_indices(faces: Integer[np.ndarray, "..."], count: int, *, subject: str, kind: str = "faces") -> None:
+def require_indices(faces: Integer[np.ndarray, "*n"], count: int, *, subject: str, kind: str = "faces") -> None:
     """Refuse indices outside [0, count).
 
     Raises:
@@ -139,23 +139,17 @@ def read_bytes(path: str | Path, *, subject: str, limit: int = 1 << 33) -> bytes
     Raises:
         InputError: missing, no regular file, unreadable or larger.
     """
-    path = Path(path)
+    path = regular_file(path, subject=subject)
     try:
-        if not path.is_file():
-            raise InputError(subject, expected="an existing file", received=str(path))
         size = path.stat().st_size
-        if size > limit:
-            raise InputError(f"{subject} {path}", expected=f"at most {limit} bytes", received=f"{size}")
-        return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{subject} {path}", expected="a readable file", received=str(error)) from None
-
-
-def names_list(names: Sequence[str]) -> str:
-    """A few names for a message."""
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        data = path.read_bytes() if size <= limit else b""
+    except OSError as error:
+        raise InputError(
+            f"{subject} {path}", expected="a readable file", received=error.strerror or str(error)
+        ) from None
+    if size > limit:
+        raise InputError(f"{subject} {path}", expected=f"at most {limit} bytes", received=f"{size}")
+    return data
 
 
 def warn(message: str) -> None:

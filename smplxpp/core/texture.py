@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import io
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from smplxpp.core.errors import InputError
+from smplxpp.core.image_file import open_image
+from smplxpp.core.paths import path_inside, regular_file
 from smplxpp.core.raw_mesh import warn
 
 # The colour of a vertex that has none in a file of which others have.
 LOST = 128
-MOST_PIXELS = 1 << 28
 
 
 def beside(path: Path, name: str) -> Path | None:
@@ -21,14 +22,11 @@ def beside(path: Path, name: str) -> Path | None:
     Names as Windows writes them are understood. One that leads out of the folder, as of another machine's disk, is
     looked for beside the mesh file under its last part; nothing outside the folder is ever opened.
     """
-    parts = PurePosixPath(name.replace("\\", "/").strip('"'))
-    folder = path.parent
-    for candidate in (parts, PurePosixPath(parts.name)):
+    name = name.strip().strip('"')
+    for candidate in (name, name.replace("\\", "/").rpartition("/")[2]):
         try:
-            found = (folder / candidate).resolve()
-            if found.is_relative_to(folder.resolve()) and found.is_file():
-                return found
-        except (OSError, ValueError, RuntimeError):  # a NUL, too long a name, a loop of links
+            return regular_file(path_inside(path.parent, candidate))
+        except InputError:
             continue
     return None
 
@@ -39,7 +37,11 @@ def read_picture(path: Path, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
     if found is None:
         warn(f"mesh file {path}: its colours are lost: the picture {name!r} is not in its folder")
         return None
-    return decode_picture(found.read_bytes(), subject=f"mesh file {path}", name=name)
+    try:
+        return np.array(open_image(found).convert("RGB"))
+    except InputError as error:
+        warn(f"mesh file {path}: its colours are lost: {error}")
+        return None
 
 
 def sample_texture(
@@ -58,18 +60,3 @@ def sample_texture(
     down = uv[:, 1] if top_down else 1.0 - uv[:, 1]
     column = np.minimum((uv[:, 0] * width).astype(np.int64), width - 1)
     return picture[np.minimum((down * height).astype(np.int64), height - 1), column]
-
-
-def decode_picture(data: bytes, *, subject: str, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The picture in a file's bytes; None, with a warning, where it cannot be decoded or is too large."""
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            if image.width * image.height > MOST_PIXELS:
-                warn(f"{subject}: its colours are lost: the picture {name!r} has {image.width} x {image.height} pixels")
-                return None
-            return np.array(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        warn(f"{subject}: its colours are lost: the picture {name!r} cannot be read ({error})")
-        return None
