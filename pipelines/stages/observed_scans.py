@@ -64,9 +64,16 @@ def observed_scans(
 
 def _given_labels(path: Path, scan: ScanFile, label_set: str) -> Int64[np.ndarray, " V"]:
     """The labels of a file, a vertex."""
-    labels = read_labels(path, vertex_count=len(scan.raw.vertices), face_count=len(scan.raw.faces), label_set=label_set)
+    raw = scan.raw
+    labels = read_labels(
+        path,
+        vertex_count=len(raw.vertices),
+        face_count=len(raw.faces),
+        label_set=label_set,
+        source_faces=raw.source_faces,
+    )
     clean = scan.clean
-    if len(labels) != len(scan.raw.faces):
+    if len(labels) != len(raw.faces):
         return labels[clean.source_vertex]
     out = np.full(clean.mesh.vertex_count, BACKGROUND, dtype=np.int64)
     out[clean.mesh.faces] = labels[clean.source_face][:, None]

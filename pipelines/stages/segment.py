@@ -48,6 +48,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             vertex_count=len(raw.vertices),
             face_count=len(raw.faces),
             label_set=build.inputs.label_set,
+            source_faces=raw.source_faces,
         )
         if len(labels) == len(raw.faces):
             source_face = load_arrays(build.run / SCAN)["scan"]["source_face"]

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
+from smplxpp.core.array_file import array_names, read_array, read_arrays
 from smplxpp.core.errors import InputError
+from smplxpp.core.image_file import open_image
+from smplxpp.core.json_file import as_numbers
 from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.paths import regular_file
 from smplxpp.core.safe_pickle import safe_load
 from smplxpp.segment.labels import LabelSet, map_labels
 
@@ -33,8 +38,12 @@ def read_labels(
     face_count: int,
     label_set: str | Path | LabelSet = "4ddress",
     color_tolerance: float = 24.0,
+    source_faces: Int64[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " n"]:
     """Labels of a scan's vertices (N,) or faces (M,), in our ids; which of the two, the length tells.
+
+    Of a scan file with polygons, `source_faces` (`RawMesh.source_faces`) names the polygon of each triangle: labels may
+    then count the file's polygons, and each triangle takes its polygon's.
 
     Reads `.npz` and `.pkl` (a key such as `label`, `labels`, `scan_labels`, `face_labels`), `.npy`, and mesh files:
     a PLY property of such a name, or else vertex colours, taken as the display colours of `smplxpp.core.labels`
@@ -43,26 +52,28 @@ def read_labels(
     Raises:
         InputError: no labels in the file, a length that is neither count, or that is both, or unknown ids.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError("label file", expected="an existing file", received=str(path))
+    path = regular_file(path, subject="label file")
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        values = _load_npy(path)
+        values = read_array(path, subject="label file")
     elif suffix == ".npz":
-        with np.load(path, allow_pickle=False) as data:
-            values = _pick({key: data[key] for key in data.files if key in _KEYS}, path, list(data.files))
+        names = array_names(path, subject="label file")
+        values = _pick(read_arrays(path, subject="label file", keys=_KEYS), path, names)
     elif suffix in (".pkl", ".pickle"):
         loaded = safe_load(path)
-        values = _pick(loaded, path, list(loaded)) if isinstance(loaded, Mapping) else np.asarray(loaded)
+        is_table = isinstance(loaded, Mapping)
+        values = _pick(loaded, path, list(loaded)) if is_table else _as_array(loaded, path)
     else:
         return _read_from_mesh(path, vertex_count, face_count, label_set, color_tolerance)
-    values = np.asarray(values)
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()
-    check_element_count(values, vertex_count=vertex_count, face_count=face_count, subject=f"label file {path}")
+    polygons = None if source_faces is None else int(source_faces.max()) + 1
+    of = check_element_count(
+        values, vertex_count=vertex_count, face_count=face_count, polygon_count=polygons, subject=f"label file {path}"
+    )
     try:
-        return map_labels(values, label_set)
+        labels = map_labels(values, label_set)
+        return labels if source_faces is None or of != "polygon" else labels[source_faces]
     except InputError as error:
         raise InputError(
             f"label file {path}: {error.subject}",
@@ -73,38 +84,56 @@ def read_labels(
 
 
 def check_element_count(
-    values: Shaped[np.ndarray, "n ..."], *, vertex_count: int, face_count: int, subject: str
-) -> bool:
-    """True where `values` has one entry a vertex, False where one a face.
+    values: Shaped[np.ndarray, "*n"],
+    *,
+    vertex_count: int,
+    face_count: int,
+    subject: str,
+    polygon_count: int | None = None,
+) -> str:
+    """What `values` has one entry of: "vertex", "face" (a triangle), or "polygon" of a file that has any.
 
     Raises:
-        InputError: another length or shape, or as many vertices as faces so that the length cannot tell.
+        InputError: another length or shape, or one that two of them have so that it cannot tell.
     """
     length = len(values) if values.ndim == 1 else -1
-    if length not in (vertex_count, face_count):
+    counts = {"vertex": vertex_count, "face": face_count}
+    if polygon_count not in (None, face_count):
+        counts["polygon"] = polygon_count
+    fitting = [name for name, count in counts.items() if count == length]
+    if not fitting:
+        polygons = f" or {counts['polygon']} (one a polygon)" if "polygon" in counts else ""
         raise InputError(
             subject,
-            expected=f"{vertex_count} labels (one a vertex) or {face_count} (one a face)",
+            expected=f"{vertex_count} labels (one a vertex) or {face_count} (one a face){polygons}, as the scan's file "
+            "has them",
             received=f"shape {values.shape}",
-            remedy="check that the labels belong to this scan and that the reader did not merge vertices",
+            remedy=_why_not(length, vertex_count),
         )
-    if vertex_count == face_count:
+    if len(fitting) > 1:
         raise InputError(
             subject,
             expected="a length that tells vertices from faces",
-            received=f"{length} labels for {vertex_count} vertices and {face_count} faces",
+            received=f"{length} labels for {vertex_count} vertices and {counts.get('polygon', face_count)} faces",
             remedy="give them as vertex_labels or face_labels of segment_scan",
         )
-    return length == vertex_count
+    return fitting[0]
 
 
-def _load_npy(path: Path) -> np.ndarray:
-    try:
-        return np.load(path, allow_pickle=False)
-    except ValueError as error:
-        raise InputError(
-            f"label file {path}", expected="an array without pickled objects", received=str(error)
-        ) from None
+def _why_not(length: int, vertex_count: int) -> str:
+    """Our reading neither merges nor splits: other counts come from the tool that wrote the labels."""
+    if length < 0:
+        return "give one list of labels"
+    did = (
+        "merged vertices that lie together"
+        if length < vertex_count
+        else "split vertices where texture or materials meet"
+    )
+    return (
+        f"these are labels of another scan, or the tool that wrote them {did} when it read this one: "
+        "label the file's own vertices or faces (trimesh: load with process=False from a PLY without texture), "
+        "or save that tool's mesh and build from it"
+    )
 
 
 def _pick(values: Mapping, path: Path, keys: list) -> np.ndarray:
@@ -115,7 +144,13 @@ def _pick(values: Mapping, path: Path, keys: list) -> np.ndarray:
             expected=f"one of the keys {', '.join(_KEYS)}",
             received=f"keys {sorted(map(str, keys))}",
         )
-    return np.asarray(values[found[0]])
+    return _as_array(values[found[0]], path)
+
+
+def _as_array(values: Any, path: Path) -> np.ndarray:
+    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
+        return values
+    return as_numbers(values, subject=f"label file {path}")
 
 
 def _read_from_mesh(
@@ -127,6 +162,7 @@ def _read_from_mesh(
             f"label file {path}",
             expected=f"the scan's {vertex_count} vertices and {face_count} faces",
             received=f"{file.mesh.vertex_count} and {file.mesh.face_count}",
+            remedy=_why_not(file.mesh.vertex_count, vertex_count),
         )
     for properties in (file.vertex_properties, file.face_properties):
         found = [key for key in _KEYS if key in properties]
@@ -163,19 +199,11 @@ def read_label_map(path: str | Path, *, label_set: str | Path | LabelSet) -> Int
     Raises:
         InputError: missing file, a colour image, or unknown ids.
     """
-    from PIL import Image
-
     path = Path(path)
-    if not path.is_file():
-        raise InputError("label map", expected="an existing file", received=str(path))
     if path.suffix.lower() == ".npy":
-        values = _load_npy(path)
+        values = read_array(path, subject="label map")
     else:
-        try:
-            with Image.open(path) as image:
-                values = np.array(image)
-        except OSError as error:
-            raise InputError(f"label map {path}", expected="an image", received=str(error)) from None
+        values = np.array(open_image(path, subject="label map"))
     if values.ndim != 2:
         raise InputError(
             f"label map {path}",

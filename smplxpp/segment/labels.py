@@ -190,7 +190,8 @@ def map_labels(
     name = "mapping" if isinstance(label_set, Mapping) else find_label_set(label_set).name
     mapping = label_set if isinstance(label_set, Mapping) else find_label_set(label_set).ours
     ids = np.asarray(ids)
-    if ids.dtype.kind not in "iub" and not (ids.dtype.kind == "f" and np.array_equal(ids, np.rint(ids))):
+    whole = ids.dtype.kind == "f" and np.array_equal(ids, np.rint(ids)) and (np.abs(ids) < 2**53).all()
+    if ids.dtype.kind not in "iub" and not whole:
         raise InputError("label ids", expected="integers", received=str(ids.dtype))
     unique, inverse = np.unique(ids.astype(np.int64), return_inverse=True)
     unknown = [int(u) for u in unique if int(u) not in mapping]
