@@ -69,7 +69,10 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
     """
     texture = document.entry("textures", use.get("index"))
     webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
-    image = document.entry("images", texture.get("source", webp.get("source")))
+    index = texture.get("source", webp.get("source"))
+    image = document.entry("images", index)
+    if index in document.pictures:
+        return document.pictures[index]
     if "bufferView" in image:
         data: bytes | None = bytes(document.view(image["bufferView"])[0])
         name = f"image {image.get('name', '')}".strip()
@@ -78,7 +81,8 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
         data = document.resource(name)
     if data is None:
         raise InputError("picture", expected="a file in the mesh file's folder", received=repr(name[:80]))
-    return np.array(decode_image(data, subject=f"picture {name[:80]!r}").convert("RGB"))
+    document.pictures[index] = np.array(decode_image(data, subject=f"picture {name[:80]!r}").convert("RGB"))
+    return document.pictures[index]
 
 
 def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> Float64[np.ndarray, "N 2"]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, parse_json
@@ -33,7 +34,7 @@ class GltfDocument:
 
     Attributes:
         path: of the file. subject: its name in messages. size: bytes of the file.
-        json: the document.
+        json: the document. pictures: kept by who decodes them, by the index of the image.
 
     Raises:
         InputError: no glTF 2.0, or a container whose lengths do not fit.
@@ -52,6 +53,8 @@ class GltfDocument:
             raise InputError(self.subject, expected="glTF 2.0", received=f"version {version or 'unknown'}")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
+        # Decoded pictures by their image; a file may use one many times.
+        self.pictures: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes | None]:
         """The JSON chunk and the binary one of a GLB."""

@@ -35,10 +35,18 @@ def read_gltf(path: Path) -> RawMesh:
     """
     document = GltfDocument(path)
     parts = _Parts(document)
-    for node, world in _world_nodes(document):
+    nodes = _world_nodes(document)
+    worlds = {id(node): world for node, world in nodes}
+    skins: dict[int, Float64[np.ndarray, "J 4 4"]] = {}
+    for node, world in nodes:
         if "mesh" in node:
             mesh = document.entry("meshes", node["mesh"])
-            joints = _joint_matrices(document, node) if "skin" in node else None
+            joints = None
+            if "skin" in node:
+                skin = document.number(node, "skin")
+                if skin not in skins:
+                    skins[skin] = _joint_matrices(document, skin, worlds)
+                joints = skins[skin]
             shared: dict[int, int] = {}
             for primitive in document.items(mesh, "primitives"):
                 parts.add(as_object(primitive, subject=f"{document.subject}: primitive"), world, joints, shared)
@@ -198,11 +206,18 @@ def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, 
     return out
 
 
-def _joint_matrices(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, "J 4 4"]:
-    """A skin's joints: their transforms to the world times their inverse bind matrices."""
-    skin = document.entry("skins", node["skin"])
+def _joint_matrices(
+    document: GltfDocument, index: int, worlds: dict[int, Float64[np.ndarray, "4 4"]]
+) -> Float64[np.ndarray, "J 4 4"]:
+    """A skin's joints: their transforms to the world times their inverse bind matrices.
+
+    Args:
+        document: the file.
+        index: of the skin.
+        worlds: the nodes' transforms by the identity of their JSON objects.
+    """
+    skin = document.entry("skins", index)
     joints = document.items(skin, "joints")
-    worlds = {id(entry): world for entry, world in _world_nodes(document)}
     try:
         out = np.stack([worlds[id(document.entry("nodes", joint))] for joint in joints])
     except (KeyError, ValueError):

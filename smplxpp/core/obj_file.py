@@ -43,7 +43,7 @@ def read_obj(path: Path) -> RawMesh:
     corners = _resolve(references[:, 0], lines.of_kind(b"v"), corner_lines)
     fans = fan_triangles(corners, sizes, subject=subject)
     require_indices(fans.faces, len(vertices), subject=subject)
-    if colors is None:
+    if colors is None and len(fans.faces):
         colors = _material_colors(path, lines, corners, references[:, 1], corner_lines, vertex_count=len(vertices))
     return RawMesh(vertices, fans.faces, colors, source_faces=fans.source_faces)
 
@@ -82,9 +82,9 @@ class _Lines:
             mask &= data[np.minimum(self.starts + k, len(data) - 1)] == byte
         return mask & IS_SPACE[data[np.minimum(self.starts + len(word), len(data) - 1)]]
 
-    def blocks(self, chosen: Int64[np.ndarray, " n"], word: bytes) -> list[tuple[bytes, Int64[np.ndarray, " m"]]]:
-        """The chosen lines without their first word and without comments, in blocks; where each line begins there."""
-        out: list[tuple[bytes, Int64[np.ndarray, " m"]]] = []
+    def blocks(self, chosen: Int64[np.ndarray, " n"], word: bytes) -> list[tuple[bytes, np.ndarray]]:
+        """The chosen lines without first words and comments, in blocks; (m,) where each line begins in its block."""
+        out: list[tuple[bytes, np.ndarray]] = []
         if not len(chosen):
             return out
         size = np.cumsum(self.ends[chosen] - self.starts[chosen])
@@ -129,8 +129,8 @@ def _read_vertices(lines: _Lines, subject: str) -> tuple[Float64[np.ndarray, "N 
     return vertices, color_bytes(colors, subject=subject)
 
 
-def _rows(lines: _Lines, word: bytes, subject: str) -> list[tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " m"]]]:
-    """The numbers of all lines of a kind, block by block, and how many are in each line."""
+def _rows(lines: _Lines, word: bytes, subject: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The numbers (n,) of all lines of a kind, block by block, and how many are in each line (m,)."""
     out = []
     for text, starts in lines.blocks(lines.of_kind(word), word):
         values = parse_numbers(text, subject=f"{subject}: {word.decode()} lines")

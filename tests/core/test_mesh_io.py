@@ -66,7 +66,7 @@ def test_nan_is_named_and_raw_arrays_stay_readable(tmp_path, mesh):
     ("name", "content", "words"),
     [
         ("scan.xyz", b"0 0 0", r"one of \.ply"),
-        ("scan.ply", b"ply\nnonsense", "readable mesh"),
+        ("scan.ply", b"ply\nnonsense", "end_header"),
         ("scan.obj", b"v 0 0 0\nv 1 0 0\n", "mesh"),
     ],
 )

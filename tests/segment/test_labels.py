@@ -136,3 +136,35 @@ def test_unknown_ids_of_a_file_are_reported_with_its_name(tmp_path):
     np.save(tmp_path / "mine.npy", np.array([0, 1, 77]))
     with pytest.raises(InputError, match=r"mine\.npy.*77"):
         read_labels(tmp_path / "mine.npy", vertex_count=3, face_count=1)
+
+
+def test_labels_of_polygons_reach_their_triangles(tmp_path):
+    source = np.array([0, 0, 1, 2, 2, 2])
+    np.save(tmp_path / "a.npy", np.array([3, 4, 5]))
+    counts = {"vertex_count": 10, "face_count": 6}
+    read = read_labels(tmp_path / "a.npy", **counts, source_faces=source)
+    np.testing.assert_array_equal(read, [3, 3, 4, 5, 5, 5])
+    with pytest.raises(InputError, match=r"10 labels.*or 6"):
+        read_labels(tmp_path / "a.npy", **counts)
+    with pytest.raises(InputError, match="tells vertices from faces"):
+        read_labels(tmp_path / "a.npy", vertex_count=3, face_count=6, source_faces=source)
+
+
+@pytest.mark.parametrize(("count", "words"), [(9, "merged vertices"), (12, "split vertices"), (1, "merged vertices")])
+def test_the_hint_says_what_the_other_tool_did(tmp_path, count: int, words: str):
+    np.save(tmp_path / "a.npy", np.zeros(count, int))
+    with pytest.raises(InputError, match=f"the tool that wrote them {words}"):
+        read_labels(tmp_path / "a.npy", vertex_count=10, face_count=16)
+
+
+def test_damaged_label_files_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", label=np.zeros(10, int))
+    np.save(tmp_path / "a.npy", np.zeros(10, int))
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({"label": [[1], [1, 2]]}))
+    for name in ("a.npz", "a.npy"):
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-9])
+    np.save(tmp_path / "b.npy", np.full(10, np.inf))
+    np.save(tmp_path / "c.npy", np.array(["skin"] * 10))
+    for name in ("a.npz", "a.npy", "a.pkl", "b.npy", "c.npy"):
+        with pytest.raises(InputError):
+            read_labels(tmp_path / name, vertex_count=10, face_count=16)

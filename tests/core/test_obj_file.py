@@ -1,0 +1,171 @@
+"""OBJ files as other tools write them: many materials, references of all kinds, missing pictures, long files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh_io import read_mesh, read_raw_mesh
+
+PLACES = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def _write(folder: Path, text: str) -> Path:
+    path = folder / "a.obj"
+    path.write_bytes(text.encode())
+    return path
+
+
+def test_materials_groups_and_seams_neither_split_nor_reorder(tmp_path: Path):
+    text = PLACES + "v 9 9 9\nvt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\n"
+    text += "o a\nusemtl one\nf 3/1/1 1/2/1 2/3/1\ng b\nusemtl two\nf 1/3/1 3/1/1 4/2/1\nusemtl one\nf 1/1 2/2 4/3\n"
+    raw = read_raw_mesh(_write(tmp_path, text))
+    np.testing.assert_array_equal(raw.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 9]])
+    np.testing.assert_array_equal(raw.faces, [[2, 0, 1], [0, 2, 3], [0, 1, 3]])
+    assert raw.source_faces is None and raw.vertex_colors is None
+
+
+def test_polygons_become_fans_in_their_place(tmp_path: Path):
+    raw = read_raw_mesh(_write(tmp_path, PLACES + "f 1 2 3\nf 1 2 3 4\nf 2 3 4\n"))
+    np.testing.assert_array_equal(raw.faces, [[0, 1, 2], [0, 1, 2], [0, 2, 3], [1, 2, 3]])
+    np.testing.assert_array_equal(raw.source_faces, [0, 1, 1, 2])
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        "f 1 2 3\nf 1 3 4",
+        "f 1// 2// 3//\nf 1//1 3//2 4//2",
+        "f 1/1/ 2/1/ 3/1/\nf 1/1 3 4//7",
+        "f -4 -3 -2\nf -4 -2 -1",
+        "f  1 2 \\\n 3\r\n\tf 1 3 4 # a remark, f 1 2 3",
+        "# f 4 4 4\nfoo f 1 2 3\nl 1 2\nf 1 2 3\nf 1 3 4\np 1",
+    ],
+)
+def test_references_of_all_kinds(tmp_path: Path, faces: str):
+    np.testing.assert_array_equal(read_raw_mesh(_write(tmp_path, PLACES + faces)).faces, [[0, 1, 2], [0, 2, 3]])
+
+
+def test_negative_references_count_from_their_line(tmp_path: Path):
+    raw = read_raw_mesh(_write(tmp_path, PLACES + "f -4 -3 -2\nv 5 5 5\nf -1 -2 -3\n"))
+    np.testing.assert_array_equal(raw.faces, [[0, 1, 2], [4, 3, 2]])
+
+
+def test_lone_returns_and_values_beside_the_coordinates(tmp_path: Path):
+    text = "v 0 0 0 1\rv 1e0 0 0 1\rv 1 1 0 1\rf 1 2 3\r"
+    np.testing.assert_array_equal(read_raw_mesh(_write(tmp_path, text)).vertices[2], [1, 1, 0])
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(1.0, 255), (255.0, 255), (0.5, 128)])
+def test_colours_follow_coordinates(tmp_path: Path, scale: float, expected: int):
+    text = "".join(f"v {k} {k * k} 0 {scale} 0 0\n" for k in range(3)) + "f 1 2 3\n"
+    np.testing.assert_array_equal(read_raw_mesh(_write(tmp_path, text)).vertex_colors[0], [expected, 0, 0])
+
+
+def test_colours_that_are_no_numbers_or_not_everywhere_are_said(tmp_path: Path):
+    with pytest.warns(GeometryWarning, match="NaN"):
+        raw = read_raw_mesh(_write(tmp_path, "v 0 0 0 nan 0 0\nv 1 0 0 1 1 1\nv 1 1 0 1 1 1\nf 1 2 3\n"))
+    assert raw.vertex_colors is None
+    with pytest.warns(GeometryWarning, match="colours of 1 of 3 vertices"):
+        raw = read_raw_mesh(_write(tmp_path, "v 0 0 0 1 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n"))
+    assert raw.vertex_colors is None
+
+
+TEXTURED = "mtllib a.mtl\n" + PLACES + "vt 0.1 0.1\nvt 0.9 0.9\nvt 1 0\nusemtl m\nf 1/1 2/2 3/3\nf 1/2 3/2 4/2\n"
+
+
+def test_the_picture_gives_a_vertex_the_colour_of_its_first_corner(tmp_path: Path):
+    colors = np.array([[[1, 0, 0], [2, 0, 0]], [[3, 0, 0], [4, 0, 0]]], np.uint8)
+    Image.fromarray(colors).save(tmp_path / "my picture.png")
+    (tmp_path / "a.mtl").write_text("newmtl\tm\t\nKd 0 0 1\nmap_Kd -clamp on -s 1 1 my picture.png\n")
+    raw = read_raw_mesh(_write(tmp_path, TEXTURED))
+    np.testing.assert_array_equal(raw.vertex_colors[:, 0], [3, 2, 4, 2])  # v is 0 at the picture's lower edge
+
+
+def test_names_of_other_machines_are_looked_for_beside_the_file(tmp_path: Path):
+    Image.fromarray(np.full((1, 1, 3), 7, np.uint8)).save(tmp_path / "p.png")
+    for name in ("C:\\Users\\me\\p.png", "/home/me/p.png", "../../p.png", ".\\p.png"):
+        (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
+        assert (read_raw_mesh(_write(tmp_path, TEXTURED)).vertex_colors == 7).all()
+
+
+def test_a_lost_picture_or_material_file_is_named_and_the_geometry_read(tmp_path: Path):
+    with pytest.warns(GeometryWarning, match=r"'a\.mtl' is not in its folder"):
+        assert read_mesh(_write(tmp_path, TEXTURED)).mesh.vertex_count == 4
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 1 1\nmap_Kd gone.png\n")
+    with pytest.warns(GeometryWarning, match=r"'gone\.png' is not in its folder"):
+        file = read_mesh(_write(tmp_path, TEXTURED))
+    assert file.mesh.face_count == 2 and file.vertex_colors is None
+
+
+def test_pictures_outside_the_folder_and_huge_ones_are_not_opened(tmp_path: Path):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    Image.fromarray(np.zeros((1, 1, 3), np.uint8)).save(tmp_path / "secret.png")
+    (inner / "a.mtl").write_text("newmtl m\nmap_Kd ../secret.png\n")
+    with pytest.warns(GeometryWarning, match="not in its folder"):
+        assert read_raw_mesh(_write(inner, TEXTURED)).vertex_colors is None
+    small = tmp_path / "small.bmp"
+    Image.fromarray(np.zeros((1, 1, 3), np.uint8)).save(small)
+    header = bytearray(small.read_bytes())
+    header[18:26] = (60000).to_bytes(4, "little") * 2
+    (inner / "huge.bmp").write_bytes(header)
+    (inner / "a.mtl").write_text("newmtl m\nmap_Kd huge.bmp\n")
+    with pytest.warns(GeometryWarning, match="3600000000 pixels|60000 x 60000 pixels"):
+        assert read_raw_mesh(_write(inner, TEXTURED)).vertex_colors is None
+
+
+def test_a_material_without_picture_gives_its_kd(tmp_path: Path):
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 0.5 0\n")
+    assert (read_raw_mesh(_write(tmp_path, TEXTURED)).vertex_colors == [255, 128, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "three numbers"),
+        ("v 0 0 zero\n", "the word 'zero'"),
+        ("v 0 0 1-2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "numbers"),
+        (PLACES + "f 1 2 5\n", r"indices in \[0, 4\)"),
+        (PLACES + "f 0 1 2\n", r"indices in \[-1"),
+        (PLACES + "f -5 1 2\n", r"indices in \[-1"),
+        (PLACES + "f 1 2 99999999999999999999\n", "whole numbers"),
+        (PLACES + "f 1 2 1.5\n", "whole numbers"),
+        (PLACES + "f 1 2 /3\n", "name a vertex"),
+        (PLACES, "triangle mesh"),
+        ("", "triangle mesh"),
+    ],
+)
+def test_damaged_files_say_what_is_wrong(tmp_path: Path, text: str, words: str):
+    with pytest.raises(InputError, match=words):
+        read_raw_mesh(_write(tmp_path, text))
+
+
+def test_faces_of_two_corners_are_left_out_and_counted(tmp_path: Path):
+    with pytest.warns(GeometryWarning, match="1 faces with fewer than three corners"):
+        raw = read_raw_mesh(_write(tmp_path, PLACES + "f 1 2\nf 1 2 3\n"))
+    np.testing.assert_array_equal(raw.source_faces, [1])
+
+
+def test_a_face_of_many_corners(tmp_path: Path):
+    count = 100_000
+    raw = read_raw_mesh(_write(tmp_path, PLACES + "f " + " ".join("1234"[k % 4] for k in range(count)) + "\n"))
+    assert len(raw.faces) == count - 2
+
+
+def test_files_longer_than_a_block_keep_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(0)
+    faces = rng.integers(0, 50, (200, 3))
+    vertices = rng.integers(0, 99, (50, 3))
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    for k, (a, b, c) in enumerate(faces + 1):
+        lines += [f"usemtl m{k % 3}", f"f {a} {b}//1 {c}/3"]
+    path = _write(tmp_path, "\n".join(lines))
+    monkeypatch.setattr("smplxpp.core.obj_file._BLOCK", 100)
+    raw = read_raw_mesh(path)
+    np.testing.assert_array_equal(raw.vertices, vertices)
+    np.testing.assert_array_equal(raw.faces, faces)
