@@ -69,7 +69,7 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
     """
     texture = document.entry("textures", use.get("index"))
     webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
-    index = texture.get("source", webp.get("source"))
+    index = document.number({"source": texture.get("source", webp.get("source"))}, "source")
     image = document.entry("images", index)
     if index in document.pictures:
         return document.pictures[index]
