@@ -14,6 +14,7 @@ from avatar.metrics.surface_quality import SurfaceQuality, surface_spread
 from avatar.metrics.view_quality import ViewQuality, mean_quality, spread_over_frames
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_number, as_object, as_text, read_json
 from smplxpp.core.json_values import jsonable
 from smplxpp.metrics.pose_error import PoseError
 
@@ -167,31 +168,36 @@ class EvalReport:
         Raises:
             InputError: missing, damaged or foreign file.
         """
-        try:
-            values = json.loads(Path(path).read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"file {path}", expected="an evaluation report", received=str(error)) from None
-        return EvalReport.from_dict(values if isinstance(values, dict) else {})
+        values = read_json(path, subject="evaluation report", remedy="evaluate again with this version")
+        return EvalReport.from_dict(as_object(values, subject=f"evaluation report {path}"))
 
 
 def _model(values: Mapping[str, Any]) -> ModelFigures:
     return ModelFigures(
         views={part: {key: _quality(view) for key, view in views.items()} for part, views in values["views"].items()},
         surfaces=_surfaces(values["surfaces"]),
-        speed=None if values["speed"] is None else Speed(**values["speed"]),
+        speed=None if values["speed"] is None else _speed(values["speed"]),
         parameters=dict(values["parameters"]),
         bytes=values["bytes"],
     )
 
 
+def _speed(values: Mapping[str, Any]) -> Speed:
+    _require_figures({name: value for name, value in values.items() if name != "device"})
+    as_text(values["device"], subject="evaluation report: device")
+    return Speed(**values)
+
+
 def _pose(values: Mapping[str, Any]) -> PoseError:
     # Distances of vertices that there are none of are null.
     figures = {name: float("nan") if value is None else value for name, value in values.items() if name != "frames"}
+    _require_figures(figures, finite=False)
     return PoseError(frames=int(values["frames"]), **figures)
 
 
 def _quality(values: Mapping[str, Any]) -> ViewQuality:
     # The figures that every view has are null only where they were infinite.
+    _require_figures(values)
     return ViewQuality(**{**values, **{k: float("inf") for k in ("psnr", "psnr_image") if values[k] is None}})
 
 
@@ -204,7 +210,15 @@ def _surfaces(values: Mapping[str, Any]) -> dict[str, Surfaces]:
 
 def _surface(values: Mapping[str, Any]) -> SurfaceQuality:
     figures = {name: value for name, value in values.items() if name != "labels"}
+    _require_figures(figures)
     return SurfaceQuality(**figures, labels={name: _surface(part) for name, part in values["labels"].items()})
+
+
+def _require_figures(values: Mapping[str, Any], *, finite: bool = True) -> None:
+    """Raise `InputError` for a figure that is neither a number nor null."""
+    for name, value in values.items():
+        if value is not None and not (not finite and isinstance(value, float)):
+            as_number(value, subject=f"evaluation report: {name}")
 
 
 def _add_spreads(out: dict[str, Any], surfaces: Mapping[str, Surfaces]) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.tables import FigureTable
@@ -30,6 +29,7 @@ from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOpti
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.image_file import open_image
 from smplxpp.core.json_values import jsonable
 
 RESULTS_FILE = "results.json"
@@ -201,5 +201,4 @@ def _write_strips(folder: Path, result: AblationResult) -> None:
 
 
 def _read(path: Path) -> np.ndarray:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
+    return np.asarray(open_image(path, subject="picture").convert("RGB"))

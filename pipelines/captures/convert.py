@@ -23,6 +23,8 @@ from smplxpp.capture.writers.description import write_description
 from smplxpp.capture.writers.keypoints import write_keypoints
 from smplxpp.core.atomic import atomic_path, atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_object, read_json
+from smplxpp.core.json_values import jsonable
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_between, require_choice, require_positive
@@ -182,10 +184,10 @@ def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
     root = capture.root.resolve()
     if out.resolve() == root or root in out.resolve().parents or out.resolve() in root.parents:
         raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
-    record = json.loads(json.dumps({"source": str(root), "format": capture.format, **asdict(config)}))
+    record = jsonable({"source": str(root), "format": capture.format, **asdict(config)})
     path = out / _RECORD
     if path.is_file():
-        stands = json.loads(path.read_text())
+        stands = as_object(read_json(path, subject="record of a conversion"), subject=f"record of a conversion {path}")
         if stands != record:
             differ = sorted(key for key in record if record[key] != stands.get(key))
             raise InputError(

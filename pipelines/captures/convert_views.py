@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
-from PIL import Image
 
 from smplxpp.capture import Capture
 from smplxpp.capture.window import Window
 from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
+from smplxpp.core.image_file import image_mode
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 
@@ -127,7 +127,6 @@ def _is_plain_mask(path: Path | None) -> bool:
     if path is None or path.suffix.lower() != ".png":
         return False
     try:
-        with Image.open(path) as image:
-            return image.mode == "L"
-    except (OSError, SyntaxError):
+        return image_mode(path) == "L"
+    except InputError:
         return False  # told when it is decoded

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json as jsonlib
 import logging
 import math
 from dataclasses import dataclass, field, replace
@@ -30,6 +29,7 @@ from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
 from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 
 log = logging.getLogger(__name__)
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
@@ -120,7 +120,7 @@ class Build:
                 step("report", True)
         if not self.json:
             Inspect(run_folder=self.out).run()
-        metrics = jsonlib.loads((self.out / "metrics.json").read_text())
+        metrics = read_json(self.out / "metrics.json", subject="metrics")
         failed = sum(check["status"] == "fail" for check in metrics["checks"])
         return {**metrics, "failed": failed, "exit_status": 0}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,8 +13,10 @@ from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
 from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, REFINE_STAGE, TEMPLATE_STAGES, TRAIN_STAGES
-from pipelines.runs.stage import is_finished, read_manifest
+from pipelines.runs.manifest import read_record
+from pipelines.runs.stage import MANIFEST, is_finished
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_list, as_object, read_json
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
 _STATES = {
@@ -72,12 +73,12 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         )
     checks = [CheckRow.of(record, stage=stage["stage"]) for stage in stages for record in stage.pop("records")]
     if not checks:
-        checks = [CheckRow.of(record) for record in metrics.get("checks", [])]
+        checks = _checks_of(metrics.get("checks"))
     unfinished = [stage["stage"] for stage in stages if stage["state"] != "done"]
     report = run / "report.html"
     summary = {
         "run": str(run),
-        "subject": metrics.get("subject"),
+        "subject": metrics["subject"] if isinstance(metrics.get("subject"), str) else None,
         "verdict": worst_status(checks) if checks else None,
         "counts": count_statuses(checks),
         "seconds": round(sum(stage["seconds"] or 0.0 for stage in stages), 3),
@@ -103,11 +104,11 @@ def _remedy(run: Path, stage: str) -> str:
 
 def _stage(run: Path, name: str) -> dict[str, Any]:
     folder = run / name
-    manifest = read_manifest(folder) or {}
+    manifest, problem = _manifest(folder)
     files = manifest.get("files", {})
     present = [folder / file for file in files if (folder / file).is_file()]
     if not manifest:
-        state = "unreadable" if (folder / "manifest.json").exists() else "missing"
+        state = "unreadable" if problem else "missing"
     else:
         whole = "done" if is_finished(manifest) else "unfinished"
         state = whole if len(present) == len(files) else "incomplete"
@@ -119,10 +120,22 @@ def _stage(run: Path, name: str) -> dict[str, Any]:
         "bytes": sum(path.stat().st_size for path in present),
         "files": len(present),
         "counts": count_statuses([CheckRow.of(record) for record in records]),
+        "problem": problem,
         "records": records,
         "inputs": manifest.get("inputs", {}),
         "digests": {f"{name}/{file}": digest for file, digest in files.items()},
     }
+
+
+def _manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """Read a stage's manifest, empty where there is none, and what is wrong with it."""
+    path = folder / MANIFEST
+    if not path.exists() and not path.is_symlink():
+        return {}, None
+    try:
+        return read_record(path), None
+    except InputError as error:
+        return {}, str(error)
 
 
 def _mark_outdated(stages: list[dict[str, Any]]) -> None:
@@ -141,13 +154,20 @@ def _mark_outdated(stages: list[dict[str, Any]]) -> None:
         digests |= own
 
 
+def _checks_of(records: Any) -> list[CheckRow]:
+    """The checks of a metrics.json; none of one that is damaged."""
+    try:
+        return [CheckRow.of(as_object(one, subject="check")) for one in as_list(records or [], subject="checks")]
+    except InputError:
+        return []
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     """Read the mapping in a JSON file; empty when it is missing or damaged, which a summary survives."""
     try:
-        content = jsonlib.loads(path.read_text())
-    except (OSError, ValueError):
+        return as_object(read_json(path), subject="metrics")
+    except InputError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all: bool) -> None:
@@ -174,6 +194,9 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
         "all", "", f"{summary['seconds']:.2f}", _size(sum(s["bytes"] for s in summary["stages"])), style="bold"
     )
     console.print(table)
+    for stage in summary["stages"]:
+        if stage["problem"]:
+            console.print(Text("unreadable ", style="red") + Text(stage["problem"]), soft_wrap=True)
     shown = [check for check in checks if show_all or check.status != "pass"]
     if shown:
         console.print()

@@ -21,6 +21,7 @@ from rich.progress import track
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
+from smplxpp.core.array_file import read_array, read_arrays
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_io import MeshFile, read_mesh
@@ -247,17 +248,13 @@ def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> Shaped[np.nd
                 f"labels of {mesh_path.name}", expected=f"one .npz or .npy in {given}", received=f"{len(same)}"
             )
         given = same[0]
-    try:
-        data = np.load(given, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"label file {given}", expected=".npy or .npz of plain arrays", received=str(error)) from None
-    if isinstance(data, np.ndarray):
-        return data
-    with data:
-        key = next((k for k in LABEL_KEYS if k in data), None)
-        if key is None:
-            raise InputError(f"label file {given}", expected=f"a key of {LABEL_KEYS}", received=str(sorted(data)))
-        return data[key]
+    if given.suffix.lower() == ".npy":
+        return read_array(given, subject="label file")
+    data = read_arrays(given, subject="label file")
+    key = next((k for k in LABEL_KEYS if k in data), None)
+    if key is None:
+        raise InputError(f"label file {given}", expected=f"a key of {LABEL_KEYS}", received=str(sorted(data)))
+    return data[key]
 
 
 def _csv(frames: list[dict[str, Any]]) -> str:

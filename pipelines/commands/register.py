@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Register:
         with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
             record = register_capture(self.out, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
-        content = jsonlib.loads((record.folder / "registration.json").read_text())
+        content = read_json(record.folder / "registration.json", subject="registration")
         if not self.json:
             _print(record, content, report)
         numbers = record.manifest["numbers"]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from avatar.data.views import read_view
 from pipelines.figures import colormap, encode_png, heat_colors
 from smplxpp.capture import Capture
 from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.image_file import open_image
 
 ERROR_LIMIT = 64
 """Difference of the worst channel, of 255, that the error's colours end at."""
@@ -41,8 +41,7 @@ def write_strip(path: Path, real: Picture, rendered: Picture) -> None:
 
 def read_strip(path: Path) -> tuple[Picture, Picture, Picture]:
     """Read photograph, rendering and error of a strip."""
-    with Image.open(path) as image:
-        strip = np.asarray(image.convert("RGB"))
+    strip = np.asarray(open_image(path, subject="picture").convert("RGB"))
     width = strip.shape[1] // 3
     return strip[:, :width], strip[:, width : 2 * width], strip[:, 2 * width :]
 

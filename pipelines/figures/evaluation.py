@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from pipelines.figures import body_cameras, caption, encode_png, render_heat, row
 from pipelines.figures.comparison import error_colors
 from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.image_file import open_image
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.metrics import point_to_surface
 
@@ -28,8 +28,7 @@ def write_tiles(path: Path, truth: UInt8[np.ndarray, "H W 3"], rendered: Sequenc
 
 def read_tiles(path: Path, count: int) -> tuple[UInt8[np.ndarray, "H W 3"], list[UInt8[np.ndarray, "H W 3"]]]:
     """Read photograph and `count` renderings of a picture that `write_tiles` wrote."""
-    with Image.open(path) as image:
-        strip = np.asarray(image.convert("RGB"))
+    strip = np.asarray(open_image(path, subject="picture").convert("RGB"))
     truth, *rendered, _ = np.split(strip, count + 2, axis=1)
     return truth, rendered
 

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Num
 
 from pipelines.runs.checks import Check
+from pipelines.runs.manifest import STATUSES, require_check
 from smplxpp.core.errors import InputError
 
-STATUSES = ("fail", "warn", "pass")  # worst first
 _SIGNATURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
@@ -42,10 +42,7 @@ class CheckRow:
     @staticmethod
     def of(check: Check | Mapping[str, Any], *, stage: str = "") -> CheckRow:
         """Make a row of a `Check`, or of its record in a manifest or in metrics.json."""
-        record = check.as_dict() if isinstance(check, Check) else check
-        missing = [key for key in ("name", "status") if key not in record]
-        if missing:
-            raise InputError("record of a check", expected="a name and a status", received=f"keys {sorted(record)}")
+        record = check.as_dict() if isinstance(check, Check) else require_check(check, subject="record of a check")
         value = record.get("value")
         return CheckRow(
             name=str(record["name"]),

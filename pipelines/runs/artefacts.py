@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipelines.runs.arrays import load_arrays
+from pipelines.runs.arrays import load_arrays, read_named, take
 from pipelines.runs.layout import (
     PARAMS,
     PARTS,
@@ -26,8 +27,9 @@ from smplxpp.core.skin_weights import SkinWeights
 
 def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
     """Read the repaired scan of a run: mesh, (N, 3) colours, (N,) index of each vertex in the user's file."""
-    arrays = load_arrays(run / SCAN)["scan"]
-    return TriangleMesh(arrays["vertices"], arrays["faces"]), arrays["colors"], arrays["source_vertex"]
+    arrays = load_arrays(run / SCAN).get("scan", {})
+    found = take(arrays, "vertices", "faces", "colors", "source_vertex", path=run / SCAN)
+    return TriangleMesh(found["vertices"], found["faces"]), found["colors"], found["source_vertex"]
 
 
 def load_params_of_run(run: Path) -> BodyParams:
@@ -47,14 +49,13 @@ def load_stacked_params(path: Path) -> tuple[tuple[int, ...], BodyParams]:
 
 def load_scan_labels(run: Path) -> np.ndarray:
     """Read the (F,) labels of the scan's faces."""
-    with np.load(run / SCAN_LABELS) as labels:
-        return labels["face_labels"]
+    return read_named(run / SCAN_LABELS, "face_labels")[0]
 
 
 def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:
     """Read the fitted body in the reference frame, and its (J, 4, 4) `posed_from_rest`."""
-    with np.load(run / POSED_BODY) as data:
-        return body.mesh(data["vertices"]), data["posed_from_rest"]
+    vertices, posed_from_rest = read_named(run / POSED_BODY, "vertices", "posed_from_rest")
+    return body.mesh(vertices), posed_from_rest
 
 
 def load_cleaned_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
@@ -68,14 +69,17 @@ def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]
 
 
 def _parts(file: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    groups = load_arrays(file)
+    needed = ("vertices", "faces", "label", "source_vertex", "colors")
+    groups = {name: take(arrays, *needed, path=file) for name, arrays in load_arrays(file).items()}
     return {name: (TriangleMesh(a["vertices"], a["faces"]), a) for name, a in groups.items()}
 
 
 def load_weights(run: Path) -> dict[str, SkinWeights]:
     """Read the parts' skin weights."""
     out = {}
-    for name, arrays in load_arrays(run / WEIGHTS).items():
+    names = [field.name for field in fields(SkinWeights)]
+    for name, found in load_arrays(run / WEIGHTS).items():
+        arrays = take(found, *names, path=run / WEIGHTS)
         joint_count, policies = int(arrays.pop("joint_count")), tuple(arrays.pop("policies").tolist())
         kept: dict[str, Any] = dict(arrays)
         out[name] = SkinWeights(**kept, joint_count=joint_count, policies=policies)

@@ -30,11 +30,11 @@ from typing import Any, Literal
 from pipelines.runs.checks import Check
 from pipelines.runs.code import code_of
 from pipelines.runs.digests import GEOMETRY, sha256_file, versions
+from pipelines.runs.manifest import SCHEMA, read_record
 from smplxpp.core.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_values import jsonable
 
-SCHEMA = 2
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3
 Decision = Literal["skip", "resume", "redo"]
@@ -271,10 +271,9 @@ def _manifest(stage: Stage, output: StageOutput, folder: Path, seconds: float) -
 
 def _record(path: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
+        return read_record(path)
+    except InputError:
         return None
-    return content if isinstance(content, dict) and content.get("schema") == SCHEMA else None
 
 
 def _intact(folder: Path, manifest: Mapping[str, Any]) -> bool:

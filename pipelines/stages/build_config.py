@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE_STAGES
+from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from smplxpp.clean import WebConfig
 from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.json_file import read_json
 from smplxpp.core.labels import LABELS
 
 
@@ -115,10 +117,13 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
 def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
     """What `save_build` wrote; None where there is none of this version. Optional inputs that are gone are left out."""
     try:
-        content = json.loads((run / BUILD_FILE).read_text())
+        content = read_json(run / BUILD_FILE)
         choices = content["config"]
+        require_plain_fields(BuildConfig, choices, subject=BUILD_FILE)
+        require_plain_fields(WebConfig, choices.get("webs", {}), subject=BUILD_FILE)
         config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
         values = {"protocol": None, **content["inputs"]}  # builds from before there were protocols had none
+        require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
         found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
         found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         for name in ("labels", "cameras", "motion"):
@@ -126,5 +131,5 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
                 found[name] = None
         found["label_maps"] = {name: Path(path) for name, path in values["label_maps"].items()}
         return BuildInputs(**found), config
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.layout import REGISTER_FILE
+from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.json_file import as_list, as_numbers, as_text, read_json
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,13 @@ def save_register(run: Path, inputs: RegisterInputs) -> None:
 def load_register(run: Path) -> RegisterInputs | None:
     """What `save_register` wrote; None where there is none of this version."""
     try:
-        values: dict[str, Any] = json.loads((run / REGISTER_FILE).read_text())
+        values: dict[str, Any] = dict(read_json(run / REGISTER_FILE))
+        require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
+        as_numbers(values["frames"] or [], (None,), subject="frames")
+        hold_out = [as_text(name, subject="hold_out") for name in as_list(values["hold_out"], subject="hold_out")]
         values |= {key: Path(values[key]) for key in _PATHS if values[key] is not None}
         frames = values["frames"]
-        values |= {"frames": None if frames is None else tuple(frames), "hold_out": tuple(values["hold_out"])}
+        values |= {"frames": None if frames is None else tuple(frames), "hold_out": tuple(hold_out)}
         return RegisterInputs(**values)
     except (OSError, ValueError, KeyError, TypeError):
         return None

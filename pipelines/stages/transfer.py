@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.figures.colors import blend_joint_colors
-from pipelines.runs.arrays import save_arrays
+from pipelines.runs.arrays import read_named, save_arrays
 from pipelines.runs.artefacts import (
     load_cleaned_parts,
     load_posed_body,
@@ -90,8 +90,7 @@ def _without_webs(
     found anew once it is cut; what remains of a web shows then.
     """
     posed, posed_from_rest = load_posed_body(run, body)
-    with np.load(run / POSED_BODY) as data:
-        at_rest = body.mesh(data["rest_vertices"])
+    at_rest = body.mesh(read_named(run / POSED_BODY, "rest_vertices")[0])
     source = np.arange(part.vertex_count)
     weights = transfer_weights(posed, body.weights, part, config=settings)
     for _ in range(config.rounds):

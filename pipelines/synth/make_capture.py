@@ -28,7 +28,9 @@ from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
+from smplxpp.core.array_file import read_arrays
 from smplxpp.core.atomic import atomic_folder, atomic_write_text
+from smplxpp.core.json_file import read_json
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
@@ -153,7 +155,7 @@ def add_tracked_inputs(root: Path, *, seed: int, progress: Progress = lambda wha
     write_tracked_keypoints(root, capture, body, params, seed=seed, progress=lambda share: progress("keypoints", share))
     wrong = write_estimated_labels(root, capture, seed=seed, progress=lambda share: progress("labels", share))
     path = root / "manifest.json"
-    manifest = json.loads(path.read_text()) | {"protocols": protocols()}
+    manifest = read_json(path, subject="manifest") | {"protocols": protocols()}
     atomic_write_text(path, json.dumps(manifest, indent=1) + "\n")
     return {"labels_estimated_wrong_percent": 100 * wrong}
 
@@ -185,8 +187,7 @@ def _rig(person: Person, take: Take, config: SynthConfig) -> list[RigCamera]:
 def _write_geometry(
     folder: Path, topology_file: Path, take: Take, hidden: Bool[np.ndarray, " M"], config: SynthConfig
 ) -> None:
-    with np.load(topology_file, allow_pickle=False) as data:
-        arrays = {name: data[name] for name in data.files}
+    arrays = read_arrays(topology_file, subject="person")
     arrays |= {"face_hidden": hidden, "pin": take.attachment.astype(np.float32)}
     save_compact(folder / "topology.npz", arrays)
     for frame in range(0, config.frames, config.truth_step):

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
 from smplxpp.body import load_body
+from smplxpp.core.array_file import read_arrays
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
@@ -29,11 +30,10 @@ def load_person(topology_file: Path) -> Person:
             received=str(topology_file),
             remedy="run in a checkout, or name the folder with --person",
         )
-    with np.load(topology_file, allow_pickle=False) as data:
-        missing = [name for name in _NEEDED if name not in data.files]
-        if missing:
-            raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(data.files))
-        arrays = {name: data[name] for name in _NEEDED}
+    arrays = read_arrays(topology_file, subject="person", keys=_NEEDED)
+    missing = [name for name in _NEEDED if name not in arrays]
+    if missing:
+        raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(arrays))
     parts = tuple(arrays["part_names"].tolist())
     if parts != PART_NAMES:
         raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))
@@ -51,10 +51,8 @@ def load_person(topology_file: Path) -> Person:
 
 def face_landmarks() -> Float[np.ndarray, "51 3"]:
     """Return the face landmarks on the open body's T-pose at the person's shape; dlib's order from 17."""
-    with (
-        resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path,
-        np.load(path, allow_pickle=False) as data,
-    ):
-        shaped = data["v_template"] + data["shapedirs"][..., : len(PERSON_BETAS)] @ PERSON_BETAS
-        corners = shaped[data["f"][data["lmk_faces_idx"]]]
-        return np.einsum("lk,lkx->lx", data["lmk_bary_coords"], corners)
+    with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path:
+        data = read_arrays(path, subject="open body")
+    shaped = data["v_template"] + data["shapedirs"][..., : len(PERSON_BETAS)] @ PERSON_BETAS
+    corners = shaped[data["f"][data["lmk_faces_idx"]]]
+    return np.einsum("lk,lkx->lx", data["lmk_bary_coords"], corners)

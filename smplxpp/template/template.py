@@ -21,9 +21,11 @@ from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.core.validation import require_choice
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
+from smplxpp.template.template_checks import check_arrays, metadata_of
 
 # The name of the part that comes first.
 BODY_PART = "body"
+_BUILD_AGAIN = "the file is damaged or no template: build it again"
 # How the template's own arrays are kept, and in its file.
 _DTYPES = {
     "vertices": np.float64,
@@ -240,7 +242,7 @@ class Template:
         Raises:
             InputError: missing, damaged or foreign file, or one of a newer version.
         """
-        arrays = read_arrays(path, subject="template file", remedy="the file is damaged or no template: build it again")
+        arrays = read_arrays(path, subject="template file", remedy=_BUILD_AGAIN)
         schema = arrays.pop(template_arrays.SCHEMA_KEY, None)
         if schema is None:
             raise InputError(
@@ -248,27 +250,28 @@ class Template:
                 expected="a file written by Template.save",
                 received=f"an npz with keys {sorted(arrays)[:6]}",
             )
-        if int(schema) > template_arrays.SCHEMA:
+        version = schema.item() if schema.shape == () and schema.dtype.kind in "iu" else 0
+        if not 1 <= version <= template_arrays.SCHEMA:
             raise InputError(
                 f"template file {path}",
                 expected=f"a file of version {template_arrays.SCHEMA} or older",
-                received=f"version {int(schema)}",
-                remedy="update smplxpp",
+                received=f"version {version}" if version else f"{schema.dtype} of shape {schema.shape}",
+                remedy="update smplxpp" if version > template_arrays.SCHEMA else _BUILD_AGAIN,
             )
         try:
             return _from_arrays(arrays)
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except InputError as error:
             raise InputError(
-                f"template file {path}",
-                expected="all arrays of a template",
-                received=f"{type(error).__name__}: {error}",
+                f"template file {path}: {error.subject.removeprefix('template: ')}",
+                expected=error.expected,
+                received=error.received,
+                remedy=error.remedy or _BUILD_AGAIN,
             ) from None
 
 
 def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Template:
-    metadata = json.loads(str(arrays["metadata"]))
+    check_arrays(arrays)
+    metadata = metadata_of(arrays)
     return Template(
         body=template_arrays.body_from_arrays(arrays, name=metadata.get("body", "template")),
         weights=template_arrays.weights_from_arrays(arrays),

@@ -20,6 +20,7 @@ from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
+from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.core.errors import InputError
 from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
 
@@ -124,8 +125,27 @@ def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path):
     assert load_build(tmp_path) == (inputs, config)
     motion.unlink()
     assert load_build(tmp_path) == (replace(inputs, motion=None), config)
-    (tmp_path / "build.json").write_text("{}")
+    good = json.loads((tmp_path / "build.json").read_text())
+    wrong: list[object] = [{}, [], 3, "words", {"config": 1, "inputs": 2}]
+    for part in good:
+        wrong.append({**good, part: []})
+        wrong += [{**good, part: {**good[part], name: [[1]]}} for name in good[part]]
+    for content in wrong:
+        (tmp_path / "build.json").write_text(json.dumps(content))
+        assert load_build(tmp_path) is None, content
+    (tmp_path / "build.json").write_text("[" * 50_000)
     assert load_build(tmp_path) is None
+
+
+def test_a_registration_is_remembered_and_other_records_are_none(tmp_path):
+    inputs = RegisterInputs(capture=tmp_path, frames=(1, 2), hold_out=("A",))
+    save_register(tmp_path, inputs)
+    assert load_register(tmp_path) == inputs
+    good = json.loads((tmp_path / "register.json").read_text())
+    wrong: list[object] = [{}, [], 3, "words", *({**good, name: {"a": [1]}} for name in good)]
+    for content in wrong:
+        (tmp_path / "register.json").write_text(json.dumps(content))
+        assert load_register(tmp_path) is None, content
 
 
 @pytest.mark.slow

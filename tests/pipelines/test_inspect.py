@@ -110,3 +110,48 @@ def test_a_training_that_the_time_stopped_is_unfinished(run, capsys):
     assert summary["stages"][-1]["state"] == "unfinished" and summary["unfinished"] == [BUILD_STAGES[-1]]
     Inspect(run).run()
     assert "unfinished" in capsys.readouterr().out
+
+
+WRONG = [
+    ("numbers", [1], "numbers: expected an object"),
+    ("files", {"data.bin": 3}, "files: data.bin: expected a text"),
+    ("files", {"../../data.bin": "0" * 64}, "names within the stage"),
+    ("files", {"/dev/zero": "0" * 64}, "names within the stage"),
+    ("inputs", ["a"], "inputs: expected an object"),
+    ("seconds", "long", "seconds: expected a finite number"),
+    ("seconds", float("nan"), "seconds: expected a finite number"),
+    ("checks", {"a": 1}, "checks: expected a list"),
+    ("checks", ["good"], "check: expected an object"),
+    ("checks", [{"name": "a", "status": "grand"}], "status: expected fail or warn or pass"),
+    ("checks", [{"name": "a", "status": "pass", "value": "much"}], "value: expected a finite number"),
+    ("schema", [], "version 2"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "words"), WRONG)
+def test_a_manifest_of_another_kind_is_a_row_that_says_so(name, value, words, run, capsys):
+    path = run / BUILD_STAGES[1] / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    summary, _ = summarise_run(run)
+    states = [stage["state"] for stage in summary["stages"]]
+    assert states == ["done", "unreadable", *["done"] * (len(states) - 2)]
+    assert words in summary["stages"][1]["problem"] and BUILD_STAGES[1] in summary["stages"][1]["problem"]
+    Inspect(run).run()
+    shown = " ".join(capsys.readouterr().out.split())
+    assert words in shown and "p95 error" in shown
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'"words"', b"\xff\xfe", b"9" * 6000, b"null", b"{}"])
+def test_bytes_that_are_no_manifest(content, run):
+    (run / BUILD_STAGES[0] / "manifest.json").write_bytes(content)
+    assert summarise_run(run)[0]["stages"][0]["state"] == "unreadable"
+
+
+@pytest.mark.parametrize(
+    "metrics", [[], 3, {"subject": ["a"]}, {"checks": 3}, {"checks": [3]}, {"checks": [{"name": 1}]}]
+)
+def test_metrics_of_another_kind_are_none(metrics, tmp_path):
+    add_stage(tmp_path, BUILD_STAGES[0])
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    summary, checks = summarise_run(tmp_path)
+    assert summary["subject"] is None and checks == []

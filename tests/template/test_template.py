@@ -171,12 +171,26 @@ def _rewritten(source, target, **changes) -> None:
         ({"smplxpp_template_schema": None}, "written by Template.save"),
         ({"smplxpp_template_schema": np.int64(99)}, "version 99.*[Uu]pdate"),
         ({"vertices": None}, "template"),
-        ({"weights_joint_indices": None}, "all arrays of a template"),
-        ({"metadata": np.array("{")}, "all arrays of a template"),
+        ({"weights_joint_indices": None}, "weights_joint_indices: expected integers with 2 axes, received none"),
+        ({"metadata": np.array("{")}, "metadata: expected JSON"),
         ({"scan_index": np.zeros(3)}, "scan_index"),
         ({"faces": np.array([[0, 1, 10**7]])}, "faces"),
         ({"vertices": np.full((3, 3), np.nan)}, "template"),
         ({"part_names": np.array(["shirt", "body"])}, "part_names"),
+        ({"smplxpp_template_schema": np.array([1, 2])}, "version 1 or older"),
+        ({"smplxpp_template_schema": np.array("one")}, "version 1 or older"),
+        ({"metadata": np.array("[1]")}, "metadata: expected an object"),
+        ({"metadata": np.array('{"body": 3}')}, "metadata body: expected a text"),
+        ({"metadata": np.array(3)}, "metadata: expected texts"),
+        ({"betas": np.array(["a"])}, "betas: expected floats"),
+        ({"faces": np.zeros((3, 3))}, "faces: expected integers"),
+        ({"vertex_labels": np.zeros((2, 2), int)}, "vertex_labels: expected integers with 1 axes"),
+        ({"parents": np.array([1, 0])}, "parents: expected a tree"),
+        ({"parents": np.array([-1, 5])}, r"parents: expected joints in \[0, 2\)"),
+        ({"parents": np.zeros(0, int)}, "no joints"),
+        ({"weights_joint_count": np.int64(10**9)}, "weights: expected 22777 vertices"),
+        ({"weights_matched": np.ones(3, bool)}, "weights_matched: expected 22777"),
+        ({"joint_regressor": np.full((1, 1), np.inf)}, "template file"),
     ],
 )
 def test_foreign_newer_and_incomplete_files(tmp_path, template, changes, message):
@@ -184,6 +198,31 @@ def test_foreign_newer_and_incomplete_files(tmp_path, template, changes, message
     _rewritten(tmp_path / "good.npz", tmp_path / "bad.npz", **changes)
     with pytest.raises(InputError, match=message):
         Template.load(tmp_path / "bad.npz")
+
+
+def test_weights_and_skeletons_that_make_no_sense(tmp_path, template):
+    template.save(tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as data:
+        arrays = {name: data[name] for name in data.files}
+    indices, weights, parents = (
+        arrays[f"{name}"] for name in ("weights_joint_indices", "weights_joint_weights", "parents")
+    )
+    circle = parents.copy()
+    circle[[1, 2]] = 2, 1
+    for changes, message in (
+        ({"weights_joint_indices": indices + len(parents)}, "joints in"),
+        ({"weights_joint_indices": indices[:, :1]}, "weights: expected"),
+        ({"weights_joint_weights": weights * np.nan}, "rows that sum to 1"),
+        ({"weights_joint_weights": weights * 2}, "rows that sum to 1"),
+        ({"parents": circle}, "joint 1 above itself"),
+        ({"parents": np.r_[parents[0], [99] * (len(parents) - 1)]}, "parents"),
+        ({"shape_basis": arrays["shape_basis"] * np.nan}, "body.shapedirs: expected finite"),
+        ({"vertex_part": arrays["vertex_part"] + 99}, "vertex_part: expected indices"),
+    ):
+        _rewritten(tmp_path / "good.npz", tmp_path / "bad.npz", **changes)
+        with pytest.raises(InputError, match=message) as caught:
+            Template.load(tmp_path / "bad.npz")
+        assert str(tmp_path / "bad.npz") in caught.value.subject
 
 
 def test_damaged_files(tmp_path, template):

@@ -23,7 +23,7 @@ from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
-from pipelines.runs.arrays import load_arrays
+from pipelines.runs.arrays import load_arrays, read_named
 from pipelines.runs.artefacts import load_cleaned_parts, load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
 from pipelines.runs.layout import (
@@ -32,6 +32,7 @@ from pipelines.runs.layout import (
     EVALUATE_STAGE,
     REFINE_STAGE,
     REGISTER_STAGE,
+    SCAN_LABELS,
     TEMPLATE_STAGES,
 )
 from pipelines.runs.stage import StageRecord, require_stage
@@ -161,8 +162,7 @@ def _sheet(
 def _scan_section(
     run: Path, scan: TriangleMesh, colors: UInt8[np.ndarray, "N 3"], cameras: list[Camera], checks: tuple[CheckRow, ...]
 ) -> Section:
-    with np.load(run / "20_segment" / "labels.npz") as data:
-        labels, confidence = data["face_labels"], data["confidence"]
+    labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
         for camera in cameras

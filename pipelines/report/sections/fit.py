@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
+from avatar.training.engine.metrics_log import read_metrics
 from pipelines.figures import encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
@@ -105,8 +105,7 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 def _curves(path: Path) -> tuple[Curve, ...]:
     """Quality over the time spent in steps."""
-    entries = [json.loads(line) for line in path.read_text().splitlines()]
-    found = [entry for entry in entries if entry["kind"] == "evaluation"]
+    found = [entry for entry in read_metrics(path) if entry["kind"] == "evaluation"]
     if len(found) < 2:
         return ()
     seconds = np.array([entry["seconds"] for entry in found])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pipelines.figures import body_cameras, caption, encode_jpeg, encode_png, re
 from pipelines.figures.heat_strip import heat_strip
 from pipelines.figures.skeleton import body_on_photograph, draw_bones
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
+from pipelines.runs.arrays import read_named
 from pipelines.runs.artefacts import load_stacked_params
 from pipelines.runs.layout import REGISTER_STAGE
 from pipelines.runs.stage import StageRecord
@@ -27,6 +27,7 @@ from smplxpp.body.model import PosedBody
 from smplxpp.capture import Capture, find_scans
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import read_json
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 
@@ -54,7 +55,7 @@ class _Fits:
 
 def register_section(run: Path, record: StageRecord) -> Section:
     """Show a registration from its files; without its capture there are no photographs."""
-    content = json.loads((record.folder / "registration.json").read_text())
+    content = read_json(record.folder / "registration.json", subject="registration")
     inputs = load_register(run)
     pictures: list[Picture] = []
     if inputs is not None:
@@ -63,8 +64,8 @@ def register_section(run: Path, record: StageRecord) -> Section:
             pictures = _pictures(inputs, fits, content)
         except InputError:  # the capture is no longer where it was: figures remain
             pictures = []
-    with np.load(record.folder / "confidence.npz") as data:
-        pictures.append(_confidence_picture(data["confidence"], data["joint_names"].tolist(), data["frames"]))
+    named = read_named(record.folder / "confidence.npz", "confidence", "joint_names", "frames")
+    pictures.append(_confidence_picture(named[0], named[1].tolist(), named[2]))
     found, absent = content["frames"], content["absent"]
     seen = content["seen"]
     what = [f"keypoints of {len(seen['keypoints'])} cameras"] if seen["keypoints"] else []

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from avatar.training.engine.metrics_log import read_metrics
 from pipelines.figures import encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
@@ -81,7 +81,7 @@ def training_section(record: StageRecord) -> Section:
     stage, numbers = record.folder.name, record.manifest["numbers"]
     title, what = _TITLES[stage]
     pictures, comparisons = _pictures(record.folder)
-    lines = _entries(record.folder / "metrics.jsonl")
+    lines = read_metrics(record.folder / "metrics.jsonl")
     return Section(
         title=title,
         text=(what, _how(numbers), _files(numbers)),
@@ -175,11 +175,6 @@ def _curves(lines: list[dict[str, Any]], *, held_out: bool) -> tuple[Curve, ...]
         ]
         curves.append(Curve("loss", {"training": (np.array(mean[0]), np.array(mean[1]))}, "seconds"))
     return tuple(curves)
-
-
-def _entries(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a log; none where training ended before its first step."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def _seconds(line: Mapping[str, Any]) -> float:
