@@ -215,6 +215,40 @@ def test_torch_stays_in_the_body_room():
         assert found == []
 
 
+# What opens files of others without looking at what they ask for -> where it may stand.
+DOORS: dict[str, set[str]] = {
+    "np.load": {"smplxpp/core/mesh_io.py", "smplxpp/segment/label_files.py"},
+    "np.memmap": set(),
+    "np.fromfile": set(),
+    "json.load": set(),
+    "json.loads": {"smplxpp/core/json_file.py"},
+    "pickle.load": set(),
+    "pickle.loads": set(),
+    "Image.open": {
+        "smplxpp/core/image_file.py",
+        "smplxpp/capture/readers/neus2.py",
+        "smplxpp/segment/label_files.py",
+    },
+    "zipfile.ZipFile": {"smplxpp/core/array_file.py"},
+    "safe_open": {"avatar/gaussians/tensor_file.py"},
+    "load_file": set(),  # of safetensors
+    "torch.load": {"avatar/losses/perceptual.py"},  # weights of a metric, tensors alone
+}
+
+
+def test_files_are_opened_by_their_doors():
+    """Sizes, depths and types of what a file holds are looked at in one place a format."""
+    found: dict[str, set[str]] = {call: set() for call in DOORS}
+    for package in PACKAGES:
+        for path in sources(package):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call):
+                    words = ast.unparse(node.func).split(".")
+                    for call in {words[-1], ".".join(words[-2:])} & DOORS.keys():
+                        found[call].add(path.relative_to(ROOT).as_posix())
+    assert {call: files - DOORS[call] for call, files in found.items() if files - DOORS[call]} == {}
+
+
 def test_plain_pickle_is_never_loaded():
     unpickles = {"pickle.load", "pickle.loads", "pickle.Unpickler"}
     for package in PACKAGES:

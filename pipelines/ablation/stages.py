@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import load, save
+import torch
+from safetensors.torch import save
 from torch import Tensor
 
 from avatar.baselines.avatar_base import Baseline
 from avatar.baselines.build import BaselineConfig, make_baseline
 from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
+from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.training.engine.device import fixed_seed
@@ -108,7 +110,7 @@ class BaselineStage(ModelStage):
 
     def read_by(self, trainer: Trainer, path: Path) -> Baseline:
         model = self._untrained(trainer)
-        model.load_state_dict(load(path.read_bytes()))  # casts what is in half precision
+        read_baseline(path, model)
         return model.eval()
 
     def write_player(self, path: Path, model: Any) -> None:
@@ -120,6 +122,25 @@ class BaselineStage(ModelStage):
         if self.config.null_share:
             show_null_code(model)
         return model
+
+
+def read_baseline(path: Path, model: Baseline) -> None:
+    """Give a baseline the state that `write_baseline` wrote; what is in half precision is cast.
+
+    Raises:
+        InputError: a missing or damaged file, tensors that are not the model's, or not finite.
+    """
+    subject = f"baseline {path}"
+    tensors = open_tensor_file(path, subject=subject, header=None).tensors()
+    own: Mapping[str, Tensor] = model.state_dict()
+    # A player's file has integers for bools.
+    given = {
+        name: value.bool() if name in own and own[name].dtype == torch.bool else value
+        for name, value in tensors.items()
+    }
+    require_like(given, own, subject=subject)
+    require_finite(given, subject=subject)
+    model.load_state_dict({name: given[name] for name in own})
 
 
 def write_baseline(path: Path, model: Baseline, *, compact: bool = False) -> None:

@@ -25,7 +25,7 @@ def test_groups_come_back(tmp_path):
 
 def test_what_lacks_an_array_is_named(tmp_path):
     np.savez(tmp_path / "a.npz", vertices=np.eye(3))
-    with pytest.raises(InputError, match="array labels, received a file without it.*delete the stage"):
+    with pytest.raises(InputError, match=r"array labels, received a file without it.*delete the stage"):
         read_named(tmp_path / "a.npz", "vertices", "labels")
     with pytest.raises(InputError, match="arrays in groups, received vertices"):
         load_arrays(tmp_path / "a.npz")
