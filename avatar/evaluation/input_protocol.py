@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import shown
 from smplxpp.core.validation import require_choice, require_known
 
 NOT_KNOWN, EXACT, TRACKED, MIXED = "not known", "exact", "tracked", "mixed"
@@ -61,6 +63,12 @@ class InputProtocol:
         # The name is said beside the fields and follows from them.
         known = {f.name for f in fields(InputProtocol)} | {"name"}
         require_known("inputs of an evaluation", values, known)
+        for field in fields(InputProtocol):
+            value = values.get(field.name, field.default)
+            if value is not None and not isinstance(value, int if str(field.type).startswith("int") else str):
+                raise InputError(
+                    f"inputs of an evaluation: {field.name}", expected=str(field.type), received=shown(value)
+                )
         return InputProtocol(**{key: value for key, value in values.items() if key != "name"})
 
     @property

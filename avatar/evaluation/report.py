@@ -14,11 +14,12 @@ from avatar.metrics.surface_quality import SurfaceQuality, surface_spread
 from avatar.metrics.view_quality import ViewQuality, mean_quality, spread_over_frames
 from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_number, as_object, as_text, read_json
+from smplxpp.core.json_file import as_integer, as_number, as_object, as_text, read_json
 from smplxpp.core.json_values import jsonable
 from smplxpp.metrics.pose_error import PoseError
 
 SCHEMA = 1
+_SUBJECT = "evaluation report"
 SKINNING_ALONE = "skinning alone"
 """Row of the template that follows its joints, beside the models' meshes."""
 SURFACE_SETS: Mapping[str, str] = {"training": "training frames", "held_out": "held-out frames"}
@@ -138,11 +139,11 @@ class EvalReport:
             )
         try:
             return EvalReport(
-                capture=values["capture"],
-                metric=values["metric"],
+                capture=as_text(values["capture"], subject=f"{_SUBJECT}: capture"),
+                metric=None if values["metric"] is None else as_text(values["metric"], subject=f"{_SUBJECT}: metric"),
                 models={name: _model(model) for name, model in values["models"].items()},
                 skinning_alone=_surfaces(values["skinning_alone"]),
-                conventions=dict(values["conventions"]),
+                conventions=_texts(values["conventions"]),
                 inputs=InputProtocol.from_dict(values.get("inputs", {})),
                 refined_poses={name: _model(model) for name, model in values.get("refined_poses", {}).items()},
                 poses={name: _pose(error) for name, error in values.get("poses", {}).items()},
@@ -174,17 +175,34 @@ class EvalReport:
 
 def _model(values: Mapping[str, Any]) -> ModelFigures:
     return ModelFigures(
-        views={part: {key: _quality(view) for key, view in views.items()} for part, views in values["views"].items()},
+        views={
+            part: {_view(key): _quality(view) for key, view in views.items()} for part, views in values["views"].items()
+        },
         surfaces=_surfaces(values["surfaces"]),
         speed=None if values["speed"] is None else _speed(values["speed"]),
-        parameters=dict(values["parameters"]),
-        bytes=values["bytes"],
+        parameters={
+            name: as_integer(count, subject=f"{_SUBJECT}: parameters", least=0)
+            for name, count in values["parameters"].items()
+        },
+        bytes=None if values["bytes"] is None else as_integer(values["bytes"], subject=f"{_SUBJECT}: bytes", least=0),
     )
+
+
+def _view(key: str) -> str:
+    """The name of a view, if it is one: see `view_key`."""
+    camera, _, frame = key.rpartition("_")
+    if not camera or not frame.isdecimal():
+        raise InputError(f"{_SUBJECT}: view", expected="CAMERA_FRAME", received=repr(key[:80]))
+    return key
+
+
+def _texts(values: Mapping[str, Any]) -> dict[str, str]:
+    return {name: as_text(value, subject=f"{_SUBJECT}: {name}") for name, value in values.items()}
 
 
 def _speed(values: Mapping[str, Any]) -> Speed:
     _require_figures({name: value for name, value in values.items() if name != "device"})
-    as_text(values["device"], subject="evaluation report: device")
+    as_text(values["device"], subject=f"{_SUBJECT}: device")
     return Speed(**values)
 
 
@@ -218,7 +236,7 @@ def _require_figures(values: Mapping[str, Any], *, finite: bool = True) -> None:
     """Raise `InputError` for a figure that is neither a number nor null."""
     for name, value in values.items():
         if value is not None and not (not finite and isinstance(value, float)):
-            as_number(value, subject=f"evaluation report: {name}")
+            as_number(value, subject=f"{_SUBJECT}: {name}")
 
 
 def _add_spreads(out: dict[str, Any], surfaces: Mapping[str, Surfaces]) -> None:

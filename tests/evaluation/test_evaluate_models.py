@@ -122,6 +122,33 @@ def test_reports_from_before_counts_and_inputs_are_read(found):
         EvalReport.from_dict(values)
 
 
+def leaves(value: object, path: tuple = ()) -> list[tuple]:
+    """The paths to everything in nested mappings."""
+    inner = (
+        [leaf for key, one in value.items() for leaf in leaves(one, (*path, key))] if isinstance(value, dict) else []
+    )
+    return [path, *inner] if path else inner
+
+
+@pytest.mark.parametrize("wrong", ["words", [1], {"a": 1}, {"a": {"b": []}}, True, 1e400, None])
+def test_reports_with_values_of_another_kind_are_refused_or_can_be_used(wrong, found):
+    values = json.loads(json.dumps(found.report.as_dict()))
+    refused = 0
+    for path in leaves(values):
+        changed = json.loads(json.dumps(values))
+        place = changed
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = wrong
+        try:
+            report = EvalReport.from_dict(changed)
+        except InputError:
+            refused += 1
+            continue
+        json.dumps(report.as_dict())
+    assert refused > (10 if wrong is None else 40)
+
+
 def test_counts_and_spread_over_frames():
     views = {
         view_key("A", 1): ViewQuality(20.0, 30.0, 0.90),

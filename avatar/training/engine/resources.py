@@ -15,7 +15,7 @@ from smplxpp.core.errors import InputError
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
 """In the words of CUDA's libraries and of the CPU allocators, which have no exception of their own."""
-NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def peak_memory(device: str = "cpu") -> dict[str, int]:
