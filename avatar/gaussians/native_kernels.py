@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from smplxpp.native import native_library
+from smplxpp.core.errors import InputError
+from smplxpp.native import address, native_library, thread_count
 
 _LOCAL = ("barycentric", "normal_offset", "offset", "log_scales", "quats")
 _FRAMES = ("corners", "rotations", "frame_quats", "lengths")
@@ -50,16 +51,16 @@ class FramesFunction(torch.autograd.Function):
         vertices, faces = vertices.contiguous(), faces.contiguous()
         batch, V, F = vertices.shape[:-2], vertices.shape[-2], len(faces)
         out = [vertices.new_empty((*batch, F, *tail)) for tail in ((3, 3), (3, 3), (4,), ())]
-        library = native_library()
-        library.smplxpp_frames_forward.restype = ctypes.c_int64
-        degenerate = library.smplxpp_frames_forward(
-            _pointer(vertices),
-            _pointer(faces),
+        degenerate = ctypes.c_int64()
+        native_library().smplxpp_frames_forward(
+            address(vertices),
+            address(faces, "int64"),
             *map(ctypes.c_int64, (batch.numel(), V, F)),
-            *map(_pointer, out),
+            *map(address, out),
+            ctypes.byref(degenerate),
             _threads(),
         )
-        count = torch.tensor(degenerate)
+        count = torch.tensor(degenerate.value)
         ctx.mark_non_differentiable(count)
         ctx.save_for_backward(vertices, faces, out[1])
         ctx.set_materialize_grads(False)
@@ -73,9 +74,11 @@ class FramesFunction(torch.autograd.Function):
         given = _contiguous(gradients[:4])
         out = torch.zeros_like(vertices)
         native_library().smplxpp_frames_backward(
-            *map(_pointer, (vertices, faces, rotations, *given)),
+            address(vertices),
+            address(faces, "int64"),
+            *map(address, (rotations, *given)),
             *map(ctypes.c_int64, (batch.numel(), V, len(faces))),
-            _pointer(out),
+            address(out),
             _threads(),
         )
         return out, None
@@ -88,10 +91,11 @@ class WorldFunction(torch.autograd.Function):
     def forward(ctx: Any, thickness: float, face: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         face, inputs = face.contiguous(), tuple(t.contiguous() for t in inputs)
         lengths = inputs[-1]
+        _check_frames(dict(zip(_FRAMES, inputs[len(_LOCAL) :], strict=True)))
         batch = lengths.shape[:-1]
         out = [lengths.new_empty((*batch, len(face), width)) for width in (3, 4, 3, 3)]
         native_library().smplxpp_world_forward(
-            ctypes.byref(_binding(thickness, face, inputs)), *map(_pointer, out), _threads()
+            ctypes.byref(_binding(thickness, face, inputs)), *map(address, out), _threads()
         )
         ctx.save_for_backward(face, *inputs)
         ctx.thickness = thickness
@@ -109,7 +113,7 @@ class WorldFunction(torch.autograd.Function):
         frames = [torch.zeros_like(t) if want else None for t, want in zip(inputs, wanted, strict=True)][len(_LOCAL) :]
         native_library().smplxpp_world_backward(
             ctypes.byref(_binding(ctx.thickness, face, inputs)),
-            ctypes.byref(_BindingGradients(*map(_pointer, (*given, *local, *frames)))),
+            ctypes.byref(_BindingGradients(*map(address, (*given, *local, *frames)))),
             _threads(),
         )
         return None, None, *local, *frames
@@ -124,11 +128,12 @@ class ColorsFunction(torch.autograd.Function):
         sh, cameras = inputs[2], inputs[4]
         out = sh.new_empty((len(cameras), len(face), 3))
         native_library().smplxpp_colors_forward(
-            *map(_pointer, (face, *inputs)),
+            address(face, "int64"),
+            *map(address, inputs),
             ctypes.c_int64(len(face)),
             ctypes.c_int64(len(cameras)),
             sh.shape[1],
-            _pointer(out),
+            address(out),
             _threads(),
         )
         ctx.save_for_backward(face, *inputs)
@@ -148,10 +153,11 @@ class ColorsFunction(torch.autograd.Function):
         to_cameras = cameras.new_zeros((threads, *cameras.shape)) if wanted[4] else None
         gradient = gradient.contiguous()
         native_library().smplxpp_colors_backward(
-            *map(_pointer, (face, *inputs, gradient)),
+            address(face, "int64"),
+            *map(address, (*inputs, gradient)),
             *map(ctypes.c_int64, (len(face), len(rotations), len(cameras))),
             sh.shape[1],
-            *map(_pointer, (to_dc, to_sh, to_means, to_rotations, to_cameras)),
+            *map(address, (to_dc, to_sh, to_means, to_rotations, to_cameras)),
             threads,
         )
         return None, to_rotations, to_dc, to_sh, to_means, None if to_cameras is None else to_cameras.sum(0)
@@ -160,16 +166,21 @@ class ColorsFunction(torch.autograd.Function):
 def _binding(thickness: float, face: Tensor, inputs: Sequence[Tensor]) -> _Binding:
     lengths = inputs[-1]
     sizes = (len(face), lengths.shape[-1], lengths.shape[:-1].numel())
-    return _Binding(*map(_pointer, (face, *inputs)), *sizes, thickness)
+    return _Binding(address(face, "int64"), *map(address, inputs), *sizes, thickness)
+
+
+def _check_frames(frames: dict[str, Tensor]) -> None:
+    for name, tail in zip(_FRAMES, ((3, 3), (3, 3), (4,), ()), strict=True):
+        expected = (*frames["lengths"].shape, *tail)
+        if frames[name].shape != expected:
+            raise InputError(
+                f"frames: {name}", expected=f"shape {expected}", received=f"shape {tuple(frames[name].shape)}"
+            )
 
 
 def _contiguous(tensors: tuple[Tensor | None, ...]) -> list[Tensor | None]:
     return [None if t is None else t.contiguous() for t in tensors]
 
 
-def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
-
 def _threads() -> int:
-    return torch.get_num_threads()
+    return thread_count(torch.get_num_threads())

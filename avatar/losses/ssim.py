@@ -21,7 +21,7 @@ from torch import Tensor
 from avatar.losses.checks import check_images, mean, total_weight
 from avatar.render.memory import pooled_empty
 from smplxpp.core.errors import InputError
-from smplxpp.native import native_library
+from smplxpp.native import address, check_size, native_library, thread_count
 
 WINDOW = 11
 """Pixels on a side of the window."""
@@ -172,16 +172,13 @@ def _call(
         swapped, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
         return swapped, values, None, by_y
     B, H, W, C = x.shape
+    check_size(W, H, "images of SSIM")
     values, by_x, by_y = (pooled_empty(*x.shape) if wanted else None for wanted in (map_, grad_x, grad_y))
     value = ctypes.c_double()
-
-    def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
-        return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
     native_library().smplxpp_ssim(
-        pointer(x),
-        pointer(y),
-        pointer(weight),
+        address(x),
+        address(y),
+        address(weight),
         C if weight is not None and weight.dim() == 4 else 1,
         int(weight is not None and weight.dim() > 2),
         ctypes.c_float(scale),
@@ -191,10 +188,10 @@ def _call(
         C,
         border,
         ctypes.byref(value),
-        pointer(values),
-        pointer(by_x),
-        pointer(by_y),
-        torch.get_num_threads(),
+        address(values),
+        address(by_x),
+        address(by_y),
+        thread_count(torch.get_num_threads()),
     )
     return value.value, values, by_x, by_y
 

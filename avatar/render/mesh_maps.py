@@ -23,6 +23,7 @@ from avatar.render.barycentrics import barycentrics_reference, interpolate_refer
 from avatar.render.native_maps import BarycentricFunction, InterpolateFunction
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.native import thread_count
 from smplxpp.raster import MeshMaps, rasterize_triangles
 
 if TYPE_CHECKING:
@@ -98,10 +99,10 @@ def mesh_maps(
     """
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
     _check(vertices, faces, cameras)
-    points, corners = vertices.detach().double().cpu().numpy(), faces.int().cpu()
+    points, corners = vertices.detach().double().cpu().numpy(), faces.int().cpu().contiguous()
     views = []
     for c in cameras:
-        seen = rasterize_triangles(points, corners.numpy(), c, near=near, threads=torch.get_num_threads())
+        seen = rasterize_triangles(points, corners.numpy(), c, near=near, threads=thread_count(torch.get_num_threads()))
         views.append(_view(vertices, corners, seen, c))
     stacked = views[0] if isinstance(camera, Camera) else [torch.stack(maps) for maps in zip(*views, strict=True)]
     maps = MeshMapsTensor(faces.to(vertices.device).long(), len(vertices), *stacked)

@@ -9,13 +9,17 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from avatar.render.list_limit import list_bytes, too_many_entries
 from avatar.render.settings import RasterSettings
-from smplxpp.native import native_library
+from smplxpp.native import OverLimitError, address, native_library, thread_count
 
 STAGES = ("project", "sort", "bin", "blend", "unblend", "chain")
 """Stages of a forward (the first four) and a backward pass, as they are timed."""
 IDLE_BYTES = 2 << 30
 """Workspaces beyond this much memory are freed rather than kept for the next call."""
+
+BYTES_OF_ENTRY = 24
+"""What an entry of the tile lists takes while they are made: a note of 12, twice while its list grows."""
 
 _POINTER = ctypes.c_void_p
 
@@ -76,12 +80,28 @@ class Workspace:
             _POOL.give_back(self._library, self._handle)
 
     def forward(self, view: CameraCall, outputs: tuple[Tensor, ...], seconds: ctypes.Array | None = None) -> None:
-        """Write image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N)."""
+        """Write image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N).
+
+        Raises:
+            InputError: the lists of Gaussians by tile would need more memory than they may have.
+            MemoryError: there is none.
+        """
         with self._lock:
-            failed = self._library.gaussian_forward(
-                self._handle, view.scene, view.camera, *map(address, outputs), torch.get_num_threads(), seconds
-            )
-        _check_memory(failed)
+            most = list_bytes()
+            try:
+                self._library.gaussian_forward(
+                    self._handle,
+                    view.scene,
+                    view.camera,
+                    *map(address, outputs),
+                    most // BYTES_OF_ENTRY,
+                    thread_count(torch.get_num_threads()),
+                    seconds,
+                )
+            except OverLimitError:
+                _, _, means2d, radii, _ = outputs
+                size = (view.camera.width, view.camera.height)
+                raise too_many_entries(means2d, radii, size, most, BYTES_OF_ENTRY) from None
 
     def backward(
         self,
@@ -98,9 +118,11 @@ class Workspace:
         The last two may be None. `accumulate` says whether to add to the first four, and to the features', what is
         otherwise written; the pose's is always added to.
         """
-        target = _Gradients(*map(address, gradients), *accumulate)
+        *to_tensors, to_pose, to_background = gradients
+        addresses = [*map(address, to_tensors), address(to_pose, "float64"), address(to_background)]
+        target = _Gradients(*addresses, *accumulate)
         with self._lock:
-            failed = self._library.gaussian_backward(
+            self._library.gaussian_backward(
                 self._handle,
                 view.scene,
                 view.camera,
@@ -108,10 +130,9 @@ class Workspace:
                 address(grad_image),
                 address(grad_alpha),
                 target,
-                torch.get_num_threads(),
+                thread_count(torch.get_num_threads()),
                 seconds,
             )
-        _check_memory(failed)
 
     def counts(self) -> tuple[int, int, int]:
         """Count visible Gaussians, entries of all tile lists and visits of blocks in the last forward pass."""
@@ -132,16 +153,17 @@ class _Pool:
             for position in reversed(range(len(self._idle))):
                 if self._idle[position][0] is library:
                     return self._idle.pop(position)[1]
-        handle = library.gaussian_workspace_new()
-        if not handle:
-            raise MemoryError("no memory for a workspace of the rasteriser")
-        return handle
+        handle = _POINTER()
+        library.gaussian_workspace_new(ctypes.byref(handle))
+        assert handle.value is not None  # else the library has raised
+        return handle.value
 
     def give_back(self, library: ctypes.CDLL, handle: int) -> None:
         # The garbage collector may call this in the middle of `take`: no lock, and nothing but an append.
-        size = library.gaussian_workspace_bytes(handle)
-        if size + self.idle_bytes <= IDLE_BYTES:
-            self._idle.append((library, handle, size))
+        size = ctypes.c_int64()
+        library.gaussian_workspace_bytes(handle, ctypes.byref(size))
+        if size.value + self.idle_bytes <= IDLE_BYTES:
+            self._idle.append((library, handle, size.value))
         else:
             library.gaussian_workspace_free(handle)
 
@@ -153,31 +175,15 @@ class _Pool:
 _POOL = _Pool()
 
 
-def address(tensor: Tensor | None) -> int | None:
-    """Return where a tensor's numbers begin."""
-    return None if tensor is None else tensor.data_ptr()
-
-
-def _check_memory(failed: int) -> None:
-    if failed:
-        raise MemoryError(
-            "no memory for the tile lists of the rasteriser: fewer or smaller Gaussians, or a smaller image"
-        )
-
-
 @cache
 def _library(level: str | None) -> ctypes.CDLL:
     library = native_library(level)
     pointer, scene, camera, gradients = _POINTER, *map(ctypes.POINTER, (_Scene, _Camera, _Gradients))
-    library.gaussian_workspace_new.restype = pointer
-    library.gaussian_workspace_new.argtypes = []
+    library.gaussian_workspace_new.argtypes = [pointer]
     library.gaussian_workspace_free.argtypes = [pointer]
-    library.gaussian_workspace_free.restype = None
-    library.gaussian_workspace_bytes.argtypes = [pointer]
-    library.gaussian_workspace_bytes.restype = ctypes.c_int64
+    library.gaussian_workspace_bytes.argtypes = [pointer, pointer]
     library.gaussian_counts.argtypes = [pointer, pointer]
-    library.gaussian_counts.restype = None
     view = (pointer, scene, camera)
-    library.gaussian_forward.argtypes = (*view, *[pointer] * 5, ctypes.c_int32, pointer)
+    library.gaussian_forward.argtypes = (*view, *[pointer] * 5, ctypes.c_int64, ctypes.c_int32, pointer)
     library.gaussian_backward.argtypes = (*view, *[pointer] * 3, gradients, ctypes.c_int32, pointer)
     return library

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from torch.autograd.function import once_differentiable
 from avatar.render.barycentrics import ray_from_pixel
 from avatar.render.memory import pooled_empty
 from smplxpp.core.camera import Camera
-from smplxpp.native import native_library
+from smplxpp.core.errors import InputError
+from smplxpp.native import address, native_library, thread_count
 from smplxpp.raster import MeshMaps
 
 
@@ -37,13 +39,16 @@ class BarycentricFunction(torch.autograd.Function):
         gradients = [None if g is None else g.contiguous() for g in (grad_barycentric, grad_depth)]
         grad_points = torch.empty_like(points)
         native_library().smplxpp_barycentric_backward(
-            *map(_pointer, (points, faces, face_id, *gradients, np.ascontiguousarray(ray_from_pixel(camera)))),
+            address(points, "float64"),
+            *(address(array, "int32") for array in (faces, face_id)),
+            *map(address, gradients),
+            address(np.ascontiguousarray(ray_from_pixel(camera)), "float64"),
             int(camera.orthographic),
             camera.width,
             ctypes.c_int64(face_id.size),
             ctypes.c_int64(len(points)),
-            _pointer(grad_points),
-            torch.get_num_threads(),
+            address(grad_points, "float64"),
+            thread_count(torch.get_num_threads()),
         )
         return (grad_points @ pose[:3, :3]).to(vertices.dtype), None, None, None
 
@@ -53,14 +58,18 @@ class InterpolateFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, barycentric: Tensor, faces: Tensor, face_id: Tensor) -> Tensor:
+        if barycentric.shape != (*face_id.shape, 3):
+            raise InputError(
+                "barycentrics", expected=f"shape {(*face_id.shape, 3)}", received=f"shape {tuple(barycentric.shape)}"
+            )
         inputs = [t.contiguous() for t in (values, faces, face_id, barycentric)]
         ctx.save_for_backward(*inputs)
         out = pooled_empty(*face_id.shape, values.shape[1])
         native_library().smplxpp_interpolate(
-            *map(_pointer, inputs),
-            *map(ctypes.c_int64, (face_id.numel(), values.shape[1])),
-            _pointer(out),
-            torch.get_num_threads(),
+            *_addresses(inputs),
+            *map(ctypes.c_int64, (face_id.numel(), len(values), len(faces), values.shape[1])),
+            address(out),
+            thread_count(torch.get_num_threads()),
         )
         return out
 
@@ -72,16 +81,16 @@ class InterpolateFunction(torch.autograd.Function):
         grad_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
         grad_barycentric = pooled_empty(*barycentric.shape) if ctx.needs_input_grad[1] else None
         native_library().smplxpp_interpolate_backward(
-            *map(_pointer, (*inputs, grad.contiguous())),
+            *_addresses(inputs),
+            address(grad.contiguous()),
             *map(ctypes.c_int64, (face_id.numel(), *values.shape)),
-            _pointer(grad_values),
-            _pointer(grad_barycentric),
-            torch.get_num_threads(),
+            address(grad_values),
+            address(grad_barycentric),
+            thread_count(torch.get_num_threads()),
         )
         return grad_values, grad_barycentric, None, None
 
 
-def _pointer(array: Tensor | np.ndarray | None) -> ctypes.c_void_p:
-    if array is None:
-        return ctypes.c_void_p(None)
-    return ctypes.c_void_p(array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
+def _addresses(inputs: Sequence[Tensor]) -> list[ctypes.c_void_p]:
+    """Values, faces, face ids and barycentrics as the kernels take them."""
+    return [address(t, dtype) for t, dtype in zip(inputs, ("float32", "int32", "int32", "float32"), strict=True)]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-import os
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer, Num
 
 from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.native import native_library
+from smplxpp.native import address, check_size, native_library, thread_count
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,13 @@ class MeshMaps:
 def rasterize_mesh(mesh: TriangleMesh, camera: Camera, *, near: float = 1e-3, threads: int | None = None) -> MeshMaps:
     """Rasterise `mesh` through `camera` with a z-buffer; both sides of every face are drawn.
 
-    A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads`.
+    A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads` (None: up to
+    8).
+
+    Raises:
+        InputError: `near` is not finite, `threads` below 1, an image beyond 65536 pixels a side.
     """
-    return rasterize_triangles(mesh.vertices, mesh.faces, camera, near=near, threads=threads)
+    return _rasterize(mesh.vertices, mesh.faces, camera, near, threads)
 
 
 def rasterize_triangles(
@@ -61,27 +66,49 @@ def rasterize_triangles(
     near: float = 1e-3,
     threads: int | None = None,
 ) -> MeshMaps:
-    """`rasterize_mesh` for arrays that the caller has checked: vertices (N, 3) finite, faces (M, 3) within them."""
+    """`rasterize_mesh` for arrays: vertices (N, 3), faces (M, 3). A face with a corner that is not finite is left out.
+
+    Raises:
+        InputError: as `rasterize_mesh`; other shapes or types; faces that point beyond the vertices.
+    """
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            raise InputError(
+                f"mesh {name}",
+                expected=f"{'numbers' if name == 'vertices' else 'integers'} of shape (N, 3)",
+                received=f"{array.dtype} of shape {array.shape}",
+            )
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError(
+            "mesh faces",
+            expected=f"indices in [0, {len(vertices)})",
+            received=f"indices in [{faces.min()}, {faces.max()}]",
+        )
+    return _rasterize(vertices, faces, camera, near, threads)
+
+
+def _rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera, near: float, threads: int | None) -> MeshMaps:
+    if not math.isfinite(near):
+        raise InputError("near", expected="a finite distance in metres", received=repr(near))
+    threads = thread_count(threads)
+    check_size(camera.width, camera.height, f"camera {camera.name!r}: image size")
     screen = np.ascontiguousarray(camera.screen_from_world(vertices), dtype=np.float64)
     faces = np.ascontiguousarray(faces, dtype=np.int32)
     height, width = camera.height, camera.width
     face_id = np.empty((height, width), np.int32)
     barycentric = np.empty((height, width, 3), np.float32)
     depth = np.empty((height, width), np.float32)
-
-    def pointer(array: np.ndarray) -> ctypes.c_void_p:
-        return ctypes.c_void_p(array.ctypes.data)
-
     native_library().smplxpp_zbuffer(
-        pointer(screen),
-        pointer(faces),
+        address(screen, "float64"),
+        address(faces, "int32"),
         ctypes.c_int64(len(faces)),
         ctypes.c_double(near if not camera.orthographic else -np.inf),
         width,
         height,
-        pointer(face_id),
-        pointer(barycentric),
-        pointer(depth),
-        threads or min(8, os.cpu_count() or 1),
+        address(face_id, "int32"),
+        address(barycentric),
+        address(depth),
+        threads,
     )
     return MeshMaps(face_id, barycentric, depth)

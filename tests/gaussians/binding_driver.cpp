@@ -16,14 +16,15 @@ struct Gradients {
     float *barycentric, *normal_offset, *offset, *log_scales, *local_quats, *corners, *rotations, *frame_quats, *lengths;
 };
 extern "C" {
-int64_t smplxpp_frames_forward(const float*, const int64_t*, int64_t, int64_t, int64_t, float*, float*, float*, float*, int);
-void smplxpp_frames_backward(const float*, const int64_t*, const float*, const float*, const float*, const float*,
+int32_t smplxpp_frames_forward(const float*, const int64_t*, int64_t, int64_t, int64_t, float*, float*, float*, float*, int64_t*,
+                               int);
+int32_t smplxpp_frames_backward(const float*, const int64_t*, const float*, const float*, const float*, const float*,
                              const float*, int64_t, int64_t, int64_t, float*, int);
-void smplxpp_world_forward(const Binding*, float*, float*, float*, float*, int);
-void smplxpp_world_backward(const Binding*, const Gradients*, int);
-void smplxpp_colors_forward(const int64_t*, const float*, const float*, const float*, const float*, const float*, int64_t,
+int32_t smplxpp_world_forward(const Binding*, float*, float*, float*, float*, int);
+int32_t smplxpp_world_backward(const Binding*, const Gradients*, int);
+int32_t smplxpp_colors_forward(const int64_t*, const float*, const float*, const float*, const float*, const float*, int64_t,
                             int64_t, int, float*, int);
-void smplxpp_colors_backward(const int64_t*, const float*, const float*, const float*, const float*, const float*,
+int32_t smplxpp_colors_backward(const int64_t*, const float*, const float*, const float*, const float*, const float*,
                              const float*, int64_t, int64_t, int64_t, int, float*, float*, float*, float*, float*, int);
 }
 
@@ -44,8 +45,9 @@ static void run(int64_t N, int64_t F, int64_t V, int64_t B, int64_t C, int K, in
     auto vertices = numbers(3 * V * B, degenerate ? 0 : 1);
     const auto faces = indices(3 * F, V), face = indices(N, F);
     std::vector<float> corners(9 * B * F), rotations(9 * B * F), frame_quats(4 * B * F), lengths(B * F);
-    const int64_t flat = smplxpp_frames_forward(vertices.data(), faces.data(), B, V, F, corners.data(), rotations.data(),
-                                                frame_quats.data(), lengths.data(), threads);
+    int64_t flat = 0;
+    smplxpp_frames_forward(vertices.data(), faces.data(), B, V, F, corners.data(), rotations.data(), frame_quats.data(),
+                           lengths.data(), &flat, threads);
     if (degenerate && flat != B * F) std::puts("triangles without area were missed");
     for (float x : rotations)
         if (!std::isfinite(x)) std::puts("a rotation is not finite");

@@ -10,10 +10,11 @@
 using namespace smplxpp::gaussian;
 
 extern "C" {
-void* gaussian_workspace_new();
-void gaussian_workspace_free(void*);
-int64_t gaussian_workspace_bytes(const void*);
-int32_t gaussian_forward(void*, const Scene*, const Camera*, float*, float*, float*, float*, float*, int32_t, double*);
+int32_t gaussian_workspace_new(void**);
+int32_t gaussian_workspace_free(void*);
+int32_t gaussian_workspace_bytes(const void*, int64_t*);
+int32_t gaussian_forward(void*, const Scene*, const Camera*, float*, float*, float*, float*, float*, int64_t, int32_t,
+                         double*);
 int32_t gaussian_backward(void*, const Scene*, const Camera*, const float*, const float*, const float*, const Gradients*, int32_t, double*);
 }
 
@@ -68,7 +69,7 @@ void run(const Case& c, void* workspace, int threads, unsigned seed) {
     const Scene scene = {N, c.channels, 0, means.data(), quats.data(), scales.data(), opacities.data(), features.data()};
     const Camera camera = {c.width, c.height, 0.01f, 1e10f, 0.3f, 0, view.data(), K.data(), c.background ? background.data() : nullptr};
     std::vector<float> image(pixels * c.channels), alpha(pixels), means2d(2 * N), radii(2 * N), depths(N);
-    if (gaussian_forward(workspace, &scene, &camera, image.data(), alpha.data(), means2d.data(), radii.data(), depths.data(), threads, nullptr)) {
+    if (gaussian_forward(workspace, &scene, &camera, image.data(), alpha.data(), means2d.data(), radii.data(), depths.data(), INT64_MAX, threads, nullptr)) {
         std::printf("%s: no memory\n", c.name);
         return;
     }
@@ -90,12 +91,15 @@ void run(const Case& c, void* workspace, int threads, unsigned seed) {
 }  // namespace
 
 int main() {
-    void* workspace = gaussian_workspace_new();
+    void* workspace = nullptr;
+    gaussian_workspace_new(&workspace);
     for (int threads : {1, 3}) {
         for (const Case& c : CASES) run(c, workspace, threads, 7);
     }
     for (unsigned seed = 0; seed < 20; ++seed) run(CASES[11], workspace, 2, seed);
-    const bool sane = gaussian_workspace_bytes(workspace) > 0;
+    int64_t bytes = 0;
+    gaussian_workspace_bytes(workspace, &bytes);
+    const bool sane = bytes > 0;
     gaussian_workspace_free(workspace);
     std::printf(sane ? "done\n" : "no workspace\n");
     return sane ? 0 : 1;

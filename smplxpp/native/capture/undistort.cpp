@@ -126,9 +126,9 @@ void undistort(const Image& source, int channels, bool use_nearest, const Lens& 
 // inverse: 2x3, from output pixels to the plane z = 1; K: 2x3, from the distorted plane to source pixels;
 // model and lens: 0, k1..k6, p1, p2 (rational); 1, k1..k4, reach (fisheye); 2, omega, slope (field of view);
 // channels 1 or 3.
-SMPLXPP_EXPORT void smplxpp_undistort_image(const uint8_t* source, int source_width, int source_height, int channels,
-                                            const double* inverse, const double* K, int model, const double* lens,
-                                            int use_nearest, uint8_t* out, int width, int height) {
+SMPLXPP_EXPORT int32_t smplxpp_undistort_image(const uint8_t* source, int source_width, int source_height, int channels,
+                                               const double* inverse, const double* K, int model, const double* lens,
+                                               int use_nearest, uint8_t* out, int width, int height) { return smplxpp::guarded([&] {
     const Image image{source, source_width, source_height};
     if (model == 0)
         undistort(image, channels, use_nearest, Rational(lens), inverse, K, out, width, height);
@@ -136,4 +136,4 @@ SMPLXPP_EXPORT void smplxpp_undistort_image(const uint8_t* source, int source_wi
         undistort(image, channels, use_nearest, Fisheye(lens), inverse, K, out, width, height);
     else
         undistort(image, channels, use_nearest, FieldOfView(lens), inverse, K, out, width, height);
-}
+}); }

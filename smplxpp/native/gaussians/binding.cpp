@@ -17,6 +17,7 @@
 namespace {
 
 using namespace smplxpp::binding;
+using smplxpp::guarded;
 using smplxpp::run_threads;
 
 constexpr float kMinEdge = 1e-6f;
@@ -148,9 +149,10 @@ void colors_backward(const int64_t* face, const float* rotations, const float* d
 }  // namespace
 
 // Frames of F triangles of B poses: vertices (B,V,3), faces (F,3) -> corners (B,F,3,3), rotations (B,F,3,3), quats (B,F,4),
-// lengths (B,F). Returns the number of triangles without area.
-SMPLXPP_EXPORT int64_t smplxpp_frames_forward(const float* vertices, const int64_t* faces, int64_t B, int64_t V, int64_t F,
-                                              float* corners, float* rotations, float* quats, float* lengths, int threads) {
+// lengths (B,F), and the number of triangles without area.
+SMPLXPP_EXPORT int32_t smplxpp_frames_forward(const float* vertices, const int64_t* faces, int64_t B, int64_t V, int64_t F,
+                                              float* corners, float* rotations, float* quats, float* lengths,
+                                              int64_t* without_area, int threads) { return guarded([&] {
     std::vector<int64_t> degenerate(threads, 0);
     run_threads(threads, [&](int t) {
         for (int64_t i = share(B * F, t, threads), end = share(B * F, t + 1, threads); i < end; ++i) {
@@ -169,16 +171,15 @@ SMPLXPP_EXPORT int64_t smplxpp_frames_forward(const float* vertices, const int64
             lengths[i] = std::max(frame.mean_edge, kMinEdge);
         }
     });
-    int64_t total = 0;
-    for (int64_t count : degenerate) total += count;
-    return total;
-}
+    *without_area = 0;
+    for (int64_t count : degenerate) *without_area += count;
+}); }
 
 // Adds to g_vertices (B,V,3). Gradients that are null are 0.
-SMPLXPP_EXPORT void smplxpp_frames_backward(const float* vertices, const int64_t* faces, const float* rotations,
+SMPLXPP_EXPORT int32_t smplxpp_frames_backward(const float* vertices, const int64_t* faces, const float* rotations,
                                             const float* g_corners, const float* g_rotations, const float* g_quats,
                                             const float* g_lengths, int64_t B, int64_t V, int64_t F, float* g_vertices,
-                                            int threads) {
+                                            int threads) { return guarded([&] {
     std::vector<float> to_corners(9 * B * F);
     run_threads(threads, [&](int t) {
         for (int64_t i = share(B * F, t, threads), end = share(B * F, t + 1, threads); i < end; ++i) {
@@ -213,7 +214,7 @@ SMPLXPP_EXPORT void smplxpp_frames_backward(const float* vertices, const int64_t
     for (int64_t i = 0; i < B * F; ++i)
         for (int k = 0; k < 3; ++k)
             add(g_vertices + 3 * (V * (i / F) + faces[3 * (i % F) + k]), load(to_corners.data() + 9 * i + 3 * k));
-}
+}); }
 
 // The arrays of bound Gaussians and of B poses of the frames, see avatar/gaussians.
 struct SmplxppBinding {
@@ -225,8 +226,8 @@ struct SmplxppBinding {
 };
 
 // means (B,N,3), quats (B,N,4), scales (B,N,3), normals (B,N,3).
-SMPLXPP_EXPORT void smplxpp_world_forward(const SmplxppBinding* in, float* means, float* quats, float* scales, float* normals,
-                                          int threads) {
+SMPLXPP_EXPORT int32_t smplxpp_world_forward(const SmplxppBinding* in, float* means, float* quats, float* scales, float* normals,
+                                          int threads) { return guarded([&] {
     for_gaussians(in->face, in->N, in->F, false, threads, [&](int64_t i, int) {
         const float u = in->barycentric[2 * i], v = in->barycentric[2 * i + 1];
         Vec local = load(in->offset + 3 * i);
@@ -249,7 +250,7 @@ SMPLXPP_EXPORT void smplxpp_world_forward(const SmplxppBinding* in, float* means
             store(normals + 3 * o, (1.0f / (w * w + x * x + y * y + z * z)) * axis);
         }
     });
-}
+}); }
 
 // Gradients in (of what the forward pass gives) and out (of what it takes); null: 0, or not asked for. Those of the
 // frames are added to.
@@ -259,7 +260,7 @@ struct SmplxppBindingGradients {
     float *corners, *rotations, *frame_quats, *lengths;
 };
 
-SMPLXPP_EXPORT void smplxpp_world_backward(const SmplxppBinding* in, const SmplxppBindingGradients* g, int threads) {
+SMPLXPP_EXPORT int32_t smplxpp_world_backward(const SmplxppBinding* in, const SmplxppBindingGradients* g, int threads) { return guarded([&] {
     const bool to_frames = g->corners || g->rotations || g->frame_quats || g->lengths;
     for_gaussians(in->face, in->N, in->F, to_frames, threads, [&](int64_t i, int) {
         const float u = in->barycentric[2 * i], v = in->barycentric[2 * i + 1];
@@ -317,21 +318,21 @@ SMPLXPP_EXPORT void smplxpp_world_backward(const SmplxppBinding* in, const Smplx
         if (g->log_scales) g->log_scales[2 * i] = gs1, g->log_scales[2 * i + 1] = gs2;
         if (g->local_quats) std::copy(gr, gr + 4, g->local_quats + 4 * i);
     });
-}
+}); }
 
 // Colours (C,N,3) of Gaussians seen from cameras (C,3); sh (N,K,3) with K = 0, 3, 8 or 15, rotations (F,3,3).
-SMPLXPP_EXPORT void smplxpp_colors_forward(const int64_t* face, const float* rotations, const float* dc, const float* sh,
+SMPLXPP_EXPORT int32_t smplxpp_colors_forward(const int64_t* face, const float* rotations, const float* dc, const float* sh,
                                            const float* means, const float* cameras, int64_t N, int64_t C, int K,
-                                           float* colors, int threads) {
+                                           float* colors, int threads) { return guarded([&] {
     const auto run = K == 0 ? colors_forward<0> : K == 3 ? colors_forward<3> : K == 8 ? colors_forward<8> : colors_forward<15>;
     run(face, rotations, dc, sh, means, cameras, N, C, colors, threads);
-}
+}); }
 
 // Gradients that are null are not asked for. g_rotations (F,3,3) and g_cameras (threads,C,3) are added to.
-SMPLXPP_EXPORT void smplxpp_colors_backward(const int64_t* face, const float* rotations, const float* dc, const float* sh,
+SMPLXPP_EXPORT int32_t smplxpp_colors_backward(const int64_t* face, const float* rotations, const float* dc, const float* sh,
                                             const float* means, const float* cameras, const float* g_colors, int64_t N,
                                             int64_t F, int64_t C, int K, float* g_dc, float* g_sh, float* g_means,
-                                            float* g_rotations, float* g_cameras, int threads) {
+                                            float* g_rotations, float* g_cameras, int threads) { return guarded([&] {
     const auto run = K == 0 ? colors_backward<0> : K == 3 ? colors_backward<3> : K == 8 ? colors_backward<8> : colors_backward<15>;
     run(face, rotations, dc, sh, means, cameras, g_colors, N, F, C, {g_dc, g_sh, g_means, g_rotations, g_cameras}, threads);
-}
+}); }

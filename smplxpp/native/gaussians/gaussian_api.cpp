@@ -1,15 +1,13 @@
 // The C interface of the Gaussian rasteriser: one camera a call; see gaussian.hpp for the structures.
 #include <chrono>
-#include <new>
 
 #include "gaussians/gaussian.hpp"
 #include "common/parallel.hpp"
 
 using namespace smplxpp::gaussian;
+using smplxpp::guarded;
 
 namespace {
-
-constexpr int DONE = 0, OUT_OF_MEMORY = 1;
 
 // Seconds of each stage, added to `out` where it is given.
 class StageClock {
@@ -26,16 +24,6 @@ private:
     std::chrono::steady_clock::time_point last_;
 };
 
-template <class Work>
-int32_t guarded(Work&& work) {
-    try {
-        work();
-        return DONE;
-    } catch (...) {  // only allocations throw
-        return OUT_OF_MEMORY;
-    }
-}
-
 }  // namespace
 
 size_t Workspace::bytes() const {
@@ -45,23 +33,33 @@ size_t Workspace::bytes() const {
     return sum;
 }
 
-SMPLXPP_EXPORT void* gaussian_workspace_new() { return new (std::nothrow) Workspace(); }
-SMPLXPP_EXPORT void gaussian_workspace_free(void* workspace) { delete (Workspace*)workspace; }
-SMPLXPP_EXPORT int64_t gaussian_workspace_bytes(const void* workspace) { return (int64_t)((const Workspace*)workspace)->bytes(); }
+SMPLXPP_EXPORT int32_t gaussian_workspace_new(void** workspace) {
+    return guarded([&] { *workspace = new Workspace(); });
+}
+SMPLXPP_EXPORT int32_t gaussian_workspace_free(void* workspace) {
+    return guarded([&] { delete (Workspace*)workspace; });
+}
+SMPLXPP_EXPORT int32_t gaussian_workspace_bytes(const void* workspace, int64_t* bytes) {
+    return guarded([&] { *bytes = (int64_t)((const Workspace*)workspace)->bytes(); });
+}
 
 // Counts of the last forward pass: visible Gaussians, entries of all tile lists, visits of blocks.
-SMPLXPP_EXPORT void gaussian_counts(const void* workspace, int64_t counts[3]) {
-    const Workspace& w = *(const Workspace*)workspace;
-    counts[0] = w.visible;
-    counts[1] = w.tile_start[w.tiles()];
-    counts[2] = 0;
-    for (int64_t t = 0; t < w.tiles(); ++t) counts[2] += w.tile_work[t];
+SMPLXPP_EXPORT int32_t gaussian_counts(const void* workspace, int64_t counts[3]) {
+    return guarded([&] {
+        const Workspace& w = *(const Workspace*)workspace;
+        counts[0] = w.visible;
+        counts[1] = w.tiles() ? w.tile_start[w.tiles()] : 0;
+        counts[2] = 0;
+        for (int64_t t = 0; t < w.tiles(); ++t) counts[2] += w.tile_work[t];
+    });
 }
 
 // image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2), depths (N). The workspace then holds what
-// gaussian_backward needs, until the next forward pass. seconds: project, sort, bin, blend; may be null.
+// gaussian_backward needs, until the next forward pass. most_hits: entries that the tile lists may have, else OVER_LIMIT,
+// with means2d, radii and depths written. seconds: project, sort, bin, blend; may be null.
 SMPLXPP_EXPORT int32_t gaussian_forward(void* workspace, const Scene* scene, const Camera* camera, float* image, float* alpha,
-                                        float* means2d, float* radii, float* depths, int32_t threads, double* seconds) {
+                                        float* means2d, float* radii, float* depths, int64_t most_hits, int32_t threads,
+                                        double* seconds) {
     return guarded([&] {
         Workspace& w = *(Workspace*)workspace;
         StageClock clock(seconds);
@@ -71,7 +69,7 @@ SMPLXPP_EXPORT int32_t gaussian_forward(void* workspace, const Scene* scene, con
         clock.lap();
         sort_by_depth(scene->count, depths, radii, w, threads);
         clock.lap();
-        bin(w, threads);
+        bin(w, most_hits, threads);
         clock.lap();
         blend(*scene, *camera, w, image, alpha, threads);
         clock.lap();

@@ -1,6 +1,7 @@
 // Lists of Gaussians by tile, front to back: each thread walks its share of the depth order and notes (tile, Gaussian,
 // blocks); a counting sort by tile that takes the threads' notes in turn keeps the order, whatever their number.
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 
 #include "gaussians/gaussian.hpp"
@@ -14,6 +15,7 @@ namespace {
 constexpr int STRIPS = LANES;   // strips of BLOCK rows that are looked at together
 constexpr int STRIPS_PER_TILE = TILE / BLOCK;
 constexpr int AHEAD = 16;       // Gaussians whose ellipse is fetched into the cache before its turn
+constexpr int64_t LOOK_EVERY = 1 << 16;  // entries between two looks at the limit
 
 // Columns of blocks [first, last] that the ellipse touches in each of 16 strips from `strip` on; first > last where none.
 struct Columns {
@@ -83,17 +85,19 @@ inline Workspace::Emission* emit_tile_row(const int32_t* first, const int32_t* l
 
 }  // namespace
 
-void bin(Workspace& w, int threads) {
+// Throws OverLimit where the lists would have more than `most_hits` entries: large Gaussians, many of them, could fill any
+// memory. Threads look now and then, so that the limit is not exact.
+void bin(Workspace& w, int64_t most_hits, int threads) {
     const int64_t tiles = w.tiles();
     if (w.emissions.size() < (size_t)threads) w.emissions.resize(threads);
     std::vector<int64_t> emitted(threads);
+    std::atomic<int64_t> noted{0};
     int32_t* counts = w.counts.reserve(threads * tiles);
-    Failure failure;
-    run_threads(threads, [&](int t) { failure.guard([&] {
+    run_threads(threads, [&](int t) {
         int32_t* histogram = counts + t * tiles;
         std::fill(histogram, histogram + tiles, 0);
         Buffer<Workspace::Emission>& notes = w.emissions[t];
-        int64_t used = 0;
+        int64_t used = 0, counted = 0;
         Columns columns;
         for (int64_t k = w.visible * t / threads, end = w.visible * (t + 1) / threads; k < end; ++k) {
             if (k + AHEAD < end) __builtin_prefetch(&w.ellipses[(uint32_t)w.order[k + AHEAD]]);
@@ -112,12 +116,15 @@ void bin(Workspace& w, int threads) {
                     Workspace::Emission* out = notes.grow(used + w.tiles_x, used) + used;
                     out = emit_tile_row(columns.first + r, columns.last + r, (int64_t)row * w.tiles_x, hit, histogram, out);
                     used = out - notes.data();
+                    if (used - counted > LOOK_EVERY) {
+                        if ((noted += used - counted) > most_hits) throw OverLimit();
+                        counted = used;
+                    }
                 }
             }
         }
         emitted[t] = used;
-    }); });
-    failure.rethrow();
+    });
     int64_t* start = w.tile_start.reserve(tiles + 1);
     int64_t* place = w.histogram.reserve(threads * tiles);
     int64_t sum = 0;

@@ -198,8 +198,7 @@ template <int D, bool MORE>
 void blend_tiles(const Scene& scene, const Camera& camera, Workspace& w, float* image, float* alpha, int threads) {
     constexpr int64_t DEALT = 4;  // neighbouring tiles share Gaussians
     std::atomic<int64_t> next{0};
-    Failure failure;
-    run_threads(threads, [&](int) { failure.guard([&] {
+    run_threads(threads, [&](int) {
         auto thread = std::make_unique<Thread>();
         if (MORE) thread->more.reserve((int64_t)BLOCKS * LANES * (scene.channels - ROW_CHANNELS));
         for (;;) {
@@ -207,8 +206,7 @@ void blend_tiles(const Scene& scene, const Camera& camera, Workspace& w, float* 
             if (begin >= end) break;
             for (int64_t tile = begin; tile < end; ++tile) blend_tile<D, MORE>(scene, camera, w, *thread, tile, image, alpha);
         }
-    }); });
-    failure.rethrow();
+    });
 }
 
 }  // namespace

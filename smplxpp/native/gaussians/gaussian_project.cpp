@@ -20,23 +20,13 @@ bool project_one(const Projection& camera, const float* mean, const float* quat,
     mean2d[0] = camera.fx * point.x * point.inv_z + camera.cx;
     mean2d[1] = camera.fy * point.y * point.inv_z + camera.cy;
     const Footprint f = camera.footprint(point, quat, scale);
-    // The determinant by the Cauchy-Binet formula: a sum of squares, where xx * yy - xy^2 would cancel.
-    const float n0 = f.u[1] * f.v[2] - f.u[2] * f.v[1], n1 = f.u[2] * f.v[0] - f.u[0] * f.v[2],
-                n2 = f.u[0] * f.v[1] - f.u[1] * f.v[0];
-    const float uu = f.u[0] * f.u[0] + f.u[1] * f.u[1] + f.u[2] * f.u[2],
-                uv = f.u[0] * f.v[0] + f.u[1] * f.v[1] + f.u[2] * f.v[2],
-                vv = f.v[0] * f.v[0] + f.v[1] * f.v[1] + f.v[2] * f.v[2];
-    const float eps = camera.eps2d, xx = uu + eps, yy = vv + eps;
-    const float det = n0 * n0 + n1 * n1 + n2 * n2 + eps * (uu + vv) + eps * eps;
-    if (!(det > 0.0f && det < 1e37f)) return false;
-    const float s = 0.5f * LOG2_E;
-    ellipse.a = std::sqrt(s * yy / det);
-    ellipse.b = -ellipse.a * uv / yy;
-    ellipse.c = std::sqrt(s / yy);
+    const Factor factor(f, camera.eps2d);
+    if (!(factor.det > 0 && factor.det < 1e37)) return false;
+    ellipse.a = (float)factor.a, ellipse.b = (float)factor.b, ellipse.c = (float)factor.c;
     ellipse.log_opacity = std::log2(opacity);
-    const float reach = std::max(ellipse.log_opacity - LOG2_ALPHA_MIN, 0.0f) / s;  // p^2 + q^2 on the outline, over s
-    radius[0] = std::sqrt(reach * xx);
-    radius[1] = std::sqrt(reach * yy);
+    const float reach = std::max(ellipse.log_opacity - LOG2_ALPHA_MIN, 0.0f) / (0.5f * LOG2_E);  // p^2 + q^2 on the outline, over s
+    radius[0] = std::sqrt(reach * (float)factor.xx);
+    radius[1] = std::sqrt(reach * (float)factor.yy);
     if (!(mean2d[0] + radius[0] > 0 && mean2d[0] - radius[0] < camera.width) ||
         !(mean2d[1] + radius[1] > 0 && mean2d[1] - radius[1] < camera.height))
         return false;

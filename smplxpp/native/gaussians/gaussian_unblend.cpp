@@ -255,12 +255,11 @@ void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const
     const RowOwners owners(w, cut);
     const int64_t rows = assign_rows(scene.count, radii, w, owners, threads), stride = (int64_t)LANES * row_groups(scene.channels);
     w.rows.reserve(rows * stride);
-    Failure failure;
     run_threads(threads, [&](int t) {
         const int64_t begin = rows * t / threads, end = rows * (t + 1) / threads;
         std::fill(w.rows.data() + begin * stride, w.rows.data() + end * stride, 0.0f);
     });
-    run_threads(threads, [&](int t) { failure.guard([&] {
+    run_threads(threads, [&](int t) {
         auto thread = std::make_unique<Thread>();
         thread->plane = (int64_t)LANES * std::max<int64_t>(scene.channels, D);
         thread->gradient.reserve(BLOCKS * thread->plane);
@@ -268,8 +267,7 @@ void unblend_tiles(const Scene& scene, const Camera& camera, Workspace& w, const
         for (int64_t tile = cut[t]; tile < cut[t + 1]; ++tile) {
             unblend_tile<D, MORE>(scene, camera, w, *thread, t, tile, owners, grad_image, grad_alpha);
         }
-    }); });
-    failure.rethrow();
+    });
 }
 
 }  // namespace

@@ -250,10 +250,10 @@ private:
 
 // `batch` pairs of images (H,W,C). `sum` receives the sum over all of scale * weight * SSIM, grad_x and grad_y its
 // gradient, `map` SSIM itself. weight_batch: 1 when each image of the batch has its own weights. grad_y needs grad_x too.
-SMPLXPP_EXPORT void smplxpp_ssim(
+SMPLXPP_EXPORT int32_t smplxpp_ssim(
     const float* x, const float* y, const float* weight, int weight_channels, int weight_batch, float scale,
     int batch, int height, int width, int channels, int border,
-    double* sum, float* map, float* grad_x, float* grad_y, int threads) {
+    double* sum, float* map, float* grad_x, float* grad_y, int threads) { return smplxpp::guarded([&] {
     // Tiles of nearly equal size.
     const int across = std::max(1, int(ptrdiff_t(width) * channels / kTileFloats)), down = (height + kTileRows - 1) / kTileRows;
     const int columns = (width + across - 1) / across, rows = (height + down - 1) / down;
@@ -273,4 +273,4 @@ SMPLXPP_EXPORT void smplxpp_ssim(
     });
     *sum = 0;
     for (double s : sums) *sum += s;
-}
+}); }

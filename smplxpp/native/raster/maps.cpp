@@ -49,10 +49,11 @@ double dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
 }  // namespace
 
-// out (pixels, D) = values (V, D) at the barycentrics; 0 on the background.
-SMPLXPP_EXPORT void smplxpp_interpolate(
+// out (pixels, D) = values (V, D) at the barycentrics; 0 on the background. Faces (F, 3) and face ids are looked at.
+SMPLXPP_EXPORT int32_t smplxpp_interpolate(
     const float* values, const int32_t* faces, const int32_t* face_id, const float* barycentric, int64_t pixels,
-    int64_t D, float* out, int threads) {
+    int64_t V, int64_t F, int64_t D, float* out, int threads) { return smplxpp::guarded([&] {
+    smplxpp::check_indices(faces, 3 * F, V);
     deal(pixels, threads, [&](int64_t first, int64_t last, int) {
         for (int64_t i = first; i < last; ++i) {
             float* __restrict o = out + i * D;
@@ -60,18 +61,19 @@ SMPLXPP_EXPORT void smplxpp_interpolate(
                 std::fill_n(o, D, 0.0f);
                 continue;
             }
+            if (face_id[i] >= F) throw std::out_of_range("face");
             const int32_t* corner = faces + 3 * int64_t(face_id[i]);
             const float *a = values + corner[0] * D, *b = values + corner[1] * D, *c = values + corner[2] * D;
             const float u = barycentric[3 * i], v = barycentric[3 * i + 1], w = barycentric[3 * i + 2];
             for (int64_t d = 0; d < D; ++d) o[d] = u * a[d] + v * b[d] + w * c[d];
         }
     });
-}
+}); }
 
 // Gradient of `out` above to values (V, D), where grad_values is given, and to the barycentrics, where grad_barycentric is.
-SMPLXPP_EXPORT void smplxpp_interpolate_backward(
+SMPLXPP_EXPORT int32_t smplxpp_interpolate_backward(
     const float* values, const int32_t* faces, const int32_t* face_id, const float* barycentric, const float* grad_out,
-    int64_t pixels, int64_t V, int64_t D, float* grad_values, float* grad_barycentric, int threads) {
+    int64_t pixels, int64_t V, int64_t D, float* grad_values, float* grad_barycentric, int threads) { return smplxpp::guarded([&] {
     const auto by_corner = [&](int64_t first, int64_t last, auto&& visit) {
         for (int64_t i = first; i < last; ++i)
             if (face_id[i] >= 0)
@@ -94,15 +96,15 @@ SMPLXPP_EXPORT void smplxpp_interpolate_backward(
             });
         });
     }
-}
+}); }
 
 // Gradient of barycentrics and depth (each may be null) to the corners `points` (V,3) in the camera's frame, at fixed
 // pixels and faces. `ray_from_pixel` is the row-major inverse of the intrinsics. With r the ray of the pixel and a, b, c the
 // corners (their z replaced by 1 for parallel rays), w_a = r . (b x c) and so on, the barycentrics are w / sum(w).
-SMPLXPP_EXPORT void smplxpp_barycentric_backward(
+SMPLXPP_EXPORT int32_t smplxpp_barycentric_backward(
     const double* points, const int32_t* faces, const int32_t* face_id, const float* grad_barycentric,
     const float* grad_depth, const double* ray_from_pixel, int orthographic, int width, int64_t pixels, int64_t V,
-    double* grad_points, int threads) {
+    double* grad_points, int threads) { return smplxpp::guarded([&] {
     const double* m = ray_from_pixel;
     deal_and_sum(pixels, threads, 3 * V, grad_points, [&](int64_t first, int64_t last, double* sum) {
         for (int64_t i = first; i < last; ++i) {
@@ -137,4 +139,4 @@ SMPLXPP_EXPORT void smplxpp_barycentric_backward(
             }
         }
     });
-}
+}); }

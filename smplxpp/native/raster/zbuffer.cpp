@@ -91,9 +91,9 @@ void raster_rows(const double* screen, const int32_t* faces, int64_t first, int6
 
 }  // namespace
 
-SMPLXPP_EXPORT void smplxpp_zbuffer(
+SMPLXPP_EXPORT int32_t smplxpp_zbuffer(
     const double* screen, const int32_t* faces, int64_t face_count, double near, int width, int height,
-    int32_t* face_id, float* barycentric, float* depth, int threads) {
+    int32_t* face_id, float* barycentric, float* depth, int threads) { return smplxpp::guarded([&] {
     const Target target{width, height, face_id, barycentric, depth};
     const int bands = (height + kBandRows - 1) / kBandRows;
 
@@ -138,4 +138,4 @@ SMPLXPP_EXPORT void smplxpp_zbuffer(
             raster_rows(screen, faces, start[size_t(b)], start[size_t(b) + 1], order.data(), near, y0, y1, target);
         }
     });
-}
+}); }

@@ -1,0 +1,43 @@
+// How every exported function of the library ends: with a number, whatever was thrown, since an exception that crossed the
+// C interface would end the process. smplxpp/native/__init__.py says them again, and turns them into Python's exceptions.
+#pragma once
+#include <cstdint>
+#include <new>
+#include <stdexcept>
+
+#define SMPLXPP_EXPORT extern "C" __attribute__((visibility("default")))
+
+namespace smplxpp {
+
+constexpr int32_t DONE = 0, OUT_OF_MEMORY = 1, OUT_OF_RANGE = 2, OVER_LIMIT = 3, FAILED = 4;
+
+// More work than the caller allows.
+struct OverLimit {};
+
+template <class Work>
+int32_t guarded(Work&& work) noexcept {
+    try {
+        work();
+        return DONE;
+    } catch (const std::bad_alloc&) {
+        return OUT_OF_MEMORY;
+    } catch (const std::length_error&) {  // a vector longer than any memory
+        return OUT_OF_MEMORY;
+    } catch (const std::out_of_range&) {
+        return OUT_OF_RANGE;
+    } catch (const OverLimit&) {
+        return OVER_LIMIT;
+    } catch (...) {
+        return FAILED;
+    }
+}
+
+// Every index in [0, bound), or std::out_of_range.
+template <class Index>
+void check_indices(const Index* indices, int64_t count, int64_t bound) {
+    bool outside = false;
+    for (int64_t i = 0; i < count; ++i) outside |= (uint64_t)(int64_t)indices[i] >= (uint64_t)bound;
+    if (outside) throw std::out_of_range("index");
+}
+
+}  // namespace smplxpp
