@@ -150,7 +150,7 @@ def test_stages_do_not_import_each_other(stage):
     ("room", "reaches"),
     [
         ("core", set()),
-        ("native", set()),
+        ("native", {"core"}),
         ("raster", {"core", "native"}),
         ("skinning", {"core"}),
         ("body", {"core", "skinning"}),

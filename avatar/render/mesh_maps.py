@@ -169,3 +169,10 @@ def _check(vertices: Tensor, faces: Tensor, cameras: list[Camera]) -> None:
     sizes = {(c.width, c.height) for c in cameras}
     if len(sizes) != 1:
         raise InputError("cameras of mesh maps", expected="one or more of one image size", received=f"sizes {sizes}")
+    for c in cameras:
+        if c.K[0, 0] * c.K[1, 1] - c.K[0, 1] * c.K[1, 0] == 0:
+            raise InputError(
+                f"camera {c.name!r} of mesh maps",
+                expected="focal lengths that are not 0",
+                received=str(c.K[:2].tolist()),
+            )

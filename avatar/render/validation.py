@@ -16,13 +16,24 @@ from torch import Tensor
 
 from avatar.render.settings import RasterSettings
 from smplxpp.core.errors import InputError
+from smplxpp.native import MOST_SIDE
 
+FEATURE_MAX = 1e20
+"""Largest feature in single precision: gradients are sums over pixels of its products, and would overflow beyond."""
 QUAT_NORM_MIN = 1e-12
 """A shorter quaternion has no direction that could be trusted."""
 ROTATION_TOLERANCE = 1e-3
 """Largest accepted entry of R R^T - I: float32 matrices multiplied along a chain pass, a scale or a shear does not."""
 SKEW_TOLERANCE = 1e-6
 """Skew accepted as rounding, as a share of the focal length."""
+
+_RANGES = {
+    "scales": (math.ulp(0.0), math.inf),
+    "opacities": (0.0, 1.0),
+    "features": (-FEATURE_MAX, FEATURE_MAX),
+    "background": (-FEATURE_MAX, FEATURE_MAX),
+}
+"""What a quick look clears: least and greatest value, both included."""
 
 
 def checked_settings(settings: RasterSettings) -> RasterSettings:
@@ -33,8 +44,8 @@ def checked_settings(settings: RasterSettings) -> RasterSettings:
     """
     for name in ("width", "height"):
         value = getattr(settings, name)
-        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
-            raise InputError(name, expected="an integer of 1 or more, in pixels", received=repr(value))
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not 1 <= int(value) <= MOST_SIDE:
+            raise InputError(name, expected=f"an integer of 1 to {MOST_SIDE}, in pixels", received=repr(value))
     for name in ("near", "far", "eps2d"):
         if not isinstance(getattr(settings, name), numbers.Real) or not math.isfinite(getattr(settings, name)):
             raise InputError(name, expected="a finite number", received=repr(getattr(settings, name)))
@@ -88,6 +99,8 @@ def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
 def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> None:
     """Require finite numbers, positive scales, opacities in [0, 1], quaternions that are not 0, usable cameras.
 
+    Features and background of single precision may not exceed `FEATURE_MAX`.
+
     Raises:
         InputError: names the argument and how many of its rows are at fault.
     """
@@ -132,11 +145,9 @@ def _suspects(values: Mapping[str, Tensor]) -> list[str]:
     """
     filled = {name: value for name, value in values.items() if value.numel() > 0}
     looks: dict[str, tuple[Tensor, ...]] = {
-        name: (value.sum(),) for name, value in filled.items() if name not in ("scales", "opacities")
+        name: tuple(torch.aminmax(value)) if name in _RANGES else (value.sum(),) for name, value in filled.items()
     }
     if "means" in filled:
-        looks["scales"] = tuple(torch.aminmax(filled["scales"]))
-        looks["opacities"] = tuple(torch.aminmax(filled["opacities"]))
         looks["quats"] += (filled["quats"][:, 0].abs().min(),)
     flat = [stat for stats in looks.values() for stat in stats]
     answers = iter(torch.stack(flat).tolist() if flat else [])
@@ -147,10 +158,9 @@ def _suspects(values: Mapping[str, Tensor]) -> list[str]:
 def _is_clear(name: str, stats: list[float]) -> bool:
     if not all(math.isfinite(stat) for stat in stats):
         return False
-    if name == "scales":
-        return stats[0] > 0
-    if name == "opacities":
-        return stats[0] >= 0 and stats[1] <= 1
+    if name in _RANGES:
+        low, high = _RANGES[name]
+        return low <= stats[0] and stats[1] <= high
     # A quaternion with a first component is not 0; the others deserve the exact look.
     return name != "quats" or stats[1] >= QUAT_NORM_MIN
 
@@ -160,6 +170,9 @@ def _check_exactly(name: str, value: Tensor) -> None:
     if not finite.all():
         count = int((~finite).sum())
         raise InputError(name, expected="finite numbers", received=f"{count} of {value.numel()} NaN or infinite")
+    if name in ("features", "background") and value.dtype == torch.float32:
+        bad = (value.abs() > FEATURE_MAX).flatten()
+        _raise_if_any(name, bad, f"magnitudes up to {FEATURE_MAX:g} in single precision", "larger")
     if name == "scales":
         _raise_if_any(name, (value <= 0).any(-1), "positive standard deviations in metres", "zero or negative")
     elif name == "opacities":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,7 +12,7 @@ from jaxtyping import Float, Float64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import as_numbers
 from smplxpp.core.validation import require_choice
-from smplxpp.native import native_library
+from smplxpp.native import address, check_size, native_library
 
 OPENCV, FISHEYE, FOV = LENS_MODELS = ("opencv", "fisheye", "fov")
 """Names of the models, as `dist_model` of cameras.json says them."""
@@ -244,35 +243,44 @@ def undistort(
     """The image that a pinhole camera would have taken; bilinear, black where the source does not reach.
 
     Args:
-        image: (H, W) or (H, W, 3) uint8, as the lens drew it.
+        image: (H, W) or (H, W, C) uint8, as the lens drew it.
         distortion: the lens.
         source_K: (3, 3) intrinsics of `image`, pixel centres at +0.5.
         target_K: (3, 3) intrinsics of the result.
         size: width and height of the result.
         nearest: take the nearest pixel, for labels.
+
+    Raises:
+        InputError: an image without pixels or beyond 65536 a side; intrinsics that cannot be inverted.
     """
     image = np.ascontiguousarray(image, dtype=np.uint8)
-    channels = 1 if image.ndim == 2 else image.shape[2]
     width, height = size
+    for columns, rows in ((image.shape[1], image.shape[0]), size):
+        check_size(columns, rows, "image to undistort")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels not in (1, 3):  # the kernel knows grey and colour
+        planes = [
+            undistort(plane, distortion, source_K=source_K, target_K=target_K, size=size, nearest=nearest)
+            for plane in np.moveaxis(image, 2, 0)
+        ]
+        return np.stack(planes, axis=2) if planes else np.empty((height, width, 0), np.uint8)
+    if np.linalg.det(target_K) == 0:
+        raise InputError("intrinsics of the undistorted image", expected="focal lengths that are not 0", received="0")
     out = np.empty((height, width, *image.shape[2:]), dtype=np.uint8)
     inverse = np.ascontiguousarray(np.linalg.inv(target_K)[:2], dtype=np.float64)
     K = np.ascontiguousarray(np.asarray(source_K)[:2], dtype=np.float64)
     lens = np.ascontiguousarray(distortion.native_parameters(), dtype=np.float64)
-
-    def pointer(array: np.ndarray) -> ctypes.c_void_p:
-        return ctypes.c_void_p(array.ctypes.data)
-
     native_library().smplxpp_undistort_image(
-        pointer(image),
+        address(image, "uint8"),
         image.shape[1],
         image.shape[0],
         channels,
-        pointer(inverse),
-        pointer(K),
+        address(inverse, "float64"),
+        address(K, "float64"),
         distortion.native_id,
-        pointer(lens),
+        address(lens, "float64"),
         int(nearest),
-        pointer(out),
+        address(out, "uint8"),
         width,
         height,
     )

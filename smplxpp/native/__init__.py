@@ -1,7 +1,7 @@
 """Loads the package's native library (see CMakeLists.txt), built once for every instruction set it may meet.
 
-Every function of it returns a status (`common/status.hpp`), which becomes an exception here: callers have nothing to look
-at. What a caller hands over goes through `address`, and a number of threads through `thread_count`.
+Every function of it returns a status (`common/status.hpp`), which becomes an exception here: callers have nothing to
+look at. What a caller hands over goes through `address`, and a number of threads through `thread_count`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 LEVELS = ("avx512", "avx2", "generic")
 """Builds of the library, the best first."""
 
-INTERFACE = 2
+INTERFACE = 3
 """What `smplxpp_interface` of a library that fits these sources answers."""
 MOST_THREADS = min(256, max(16, 4 * (os.cpu_count() or 1)))
 """More threads than this are not started, whatever was asked for."""
@@ -59,7 +59,7 @@ class _Library(ctypes.CDLL):
 
     def __getitem__(self, name: str) -> Any:
         function = super().__getitem__(name)
-        function.errcheck = _check_status
+        function.errcheck = _check_status  # type: ignore[assignment]
         return function
 
 
@@ -172,8 +172,9 @@ def native_library(level: str | None = None) -> ctypes.CDLL:
                     return library
                 stale = f"{path} was built from other sources than these. "
     raise ImportError(
-        f"{stale}The native library smplxpp_native_{level or 'generic'}.so was not found in {[str(f) for f in _folders()]}. "
-        "Install the package with a C++17 compiler at hand: pip install . (Debian: apt install g++)"
+        f"{stale}The native library smplxpp_native_{level or 'generic'}.so was not found in "
+        f"{[str(f) for f in _folders()]}. Install the package with a C++17 compiler at hand: "
+        "pip install . (Debian: apt install g++)"
     )
 
 

@@ -49,8 +49,8 @@ class MeshMaps:
 def rasterize_mesh(mesh: TriangleMesh, camera: Camera, *, near: float = 1e-3, threads: int | None = None) -> MeshMaps:
     """Rasterise `mesh` through `camera` with a z-buffer; both sides of every face are drawn.
 
-    A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads` (None: up to
-    8).
+    A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads` (None: up
+    to 8).
 
     Raises:
         InputError: `near` is not finite, `threads` below 1, an image beyond 65536 pixels a side.

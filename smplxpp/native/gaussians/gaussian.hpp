@@ -115,7 +115,7 @@ struct Workspace {
 
 void project(const Scene&, const Camera&, Workspace&, float* means2d, float* radii, float* depths, int threads);
 void sort_by_depth(int64_t count, const float* depths, const float* radii, Workspace&, int threads);
-void bin(Workspace&, int64_t most_hits, int threads);
+void bin(Workspace&, int64_t count, const float* radii, int64_t most_hits, int threads);
 void blend(const Scene&, const Camera&, Workspace&, float* image, float* alpha, int threads);
 void unblend(const Scene&, const Camera&, Workspace&, const float* radii, const float* grad_image, const float* grad_alpha, int threads);
 void sum_background(const Scene&, const Workspace&, const float* grad_image, float* grad_background, int threads);

@@ -69,7 +69,7 @@ SMPLXPP_EXPORT int32_t gaussian_forward(void* workspace, const Scene* scene, con
         clock.lap();
         sort_by_depth(scene->count, depths, radii, w, threads);
         clock.lap();
-        bin(w, most_hits, threads);
+        bin(w, scene->count, radii, most_hits, threads);
         clock.lap();
         blend(*scene, *camera, w, image, alpha, threads);
         clock.lap();

@@ -1,7 +1,6 @@
 // Lists of Gaussians by tile, front to back: each thread walks its share of the depth order and notes (tile, Gaussian,
 // blocks); a counting sort by tile that takes the threads' notes in turn keeps the order, whatever their number.
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 
 #include "gaussians/gaussian.hpp"
@@ -15,7 +14,6 @@ namespace {
 constexpr int STRIPS = LANES;   // strips of BLOCK rows that are looked at together
 constexpr int STRIPS_PER_TILE = TILE / BLOCK;
 constexpr int AHEAD = 16;       // Gaussians whose ellipse is fetched into the cache before its turn
-constexpr int64_t LOOK_EVERY = 1 << 16;  // entries between two looks at the limit
 
 // Columns of blocks [first, last] that the ellipse touches in each of 16 strips from `strip` on; first > last where none.
 struct Columns {
@@ -83,46 +81,78 @@ inline Workspace::Emission* emit_tile_row(const int32_t* first, const int32_t* l
     return out;
 }
 
+// Calls visit(columns.first, columns.last, row of tiles, hit) for the Gaussians [begin, end) of the depth order, front to back,
+// and the rows of tiles that each may touch.
+template <class Visit>
+void visit_rows(const Workspace& w, int64_t begin, int64_t end, Visit&& visit) {
+    Columns columns;
+    for (int64_t k = begin; k < end; ++k) {
+        if (k + AHEAD < end) __builtin_prefetch(&w.ellipses[(uint32_t)w.order[k + AHEAD]]);
+        const uint32_t gaussian = (uint32_t)w.order[k];
+        const Outline outline(w.ellipses[gaussian]);
+        // Rows whose centre lies within the outline, clamped as floats: an int would overflow.
+        const float top = std::max(outline.y - outline.half_height - 0.5f, 0.0f);
+        const float bottom = std::min(outline.y + outline.half_height - 0.5f, w.height - 1.0f);
+        if (!(top <= bottom)) continue;
+        const int first_row = (int)top / TILE, last_row = (int)bottom / TILE, last_strip = (int)bottom / BLOCK;
+        for (int strip = first_row * STRIPS_PER_TILE; strip <= last_strip; strip += STRIPS) {
+            outline.columns(strip, w.width, columns);
+            for (int r = 0; r < STRIPS && strip + r <= last_strip; r += STRIPS_PER_TILE) {
+                const int row = (strip + r) / STRIPS_PER_TILE;
+                const Hit hit = {gaussian, 0, (uint8_t)std::min(row - first_row, 255), (uint8_t)std::min(last_row - row, 255)};
+                visit(columns.first + r, columns.last + r, row, hit);
+            }
+        }
+    }
+}
+
+// Tiles in the boxes of the Gaussians: no fewer than their lists have entries, and quickly counted.
+double tiles_in_boxes(int64_t count, const float* radii, const Workspace& w) {
+    double sum = 0;
+    for (int64_t i = 0; i < count; ++i) {
+        const float across = std::min(radii[2 * i] / (TILE / 2) + 2.0f, (float)w.tiles_x);
+        const float down = std::min(radii[2 * i + 1] / (TILE / 2) + 2.0f, (float)w.tiles_y);
+        sum += radii[2 * i] > 0 ? across * down : 0.0f;
+    }
+    return sum;
+}
+
+// Entries that the lists will have.
+int64_t count_entries(const Workspace& w, int threads) {
+    std::vector<int64_t> counted(threads, 0);
+    run_threads(threads, [&](int t) {
+        int64_t sum = 0;
+        visit_rows(w, w.visible * t / threads, w.visible * (t + 1) / threads, [&](const int32_t* first, const int32_t* last, int, Hit) {
+            const int begin = std::min(std::min(first[0], first[1]), std::min(first[2], first[3])) / STRIPS_PER_TILE;
+            const int end = std::max(std::max(last[0], last[1]), std::max(last[2], last[3]));
+            if (end >= 0) sum += end / STRIPS_PER_TILE - begin + 1;
+        });
+        counted[t] = sum;
+    });
+    int64_t sum = 0;
+    for (int64_t share : counted) sum += share;
+    return sum;
+}
+
 }  // namespace
 
-// Throws OverLimit where the lists would have more than `most_hits` entries: large Gaussians, many of them, could fill any
-// memory. Threads look now and then, so that the limit is not exact.
-void bin(Workspace& w, int64_t most_hits, int threads) {
+// Throws OverLimit where the lists would have more than `most_hits` entries: large Gaussians, many of them, fill any memory.
+void bin(Workspace& w, int64_t count, const float* radii, int64_t most_hits, int threads) {
+    if (tiles_in_boxes(count, radii, w) > (double)most_hits && count_entries(w, threads) > most_hits) throw OverLimit();
     const int64_t tiles = w.tiles();
     if (w.emissions.size() < (size_t)threads) w.emissions.resize(threads);
     std::vector<int64_t> emitted(threads);
-    std::atomic<int64_t> noted{0};
     int32_t* counts = w.counts.reserve(threads * tiles);
     run_threads(threads, [&](int t) {
         int32_t* histogram = counts + t * tiles;
         std::fill(histogram, histogram + tiles, 0);
         Buffer<Workspace::Emission>& notes = w.emissions[t];
-        int64_t used = 0, counted = 0;
-        Columns columns;
-        for (int64_t k = w.visible * t / threads, end = w.visible * (t + 1) / threads; k < end; ++k) {
-            if (k + AHEAD < end) __builtin_prefetch(&w.ellipses[(uint32_t)w.order[k + AHEAD]]);
-            const uint32_t gaussian = (uint32_t)w.order[k];
-            const Outline outline(w.ellipses[gaussian]);
-            // Rows whose centre lies within the outline, clamped as floats: an int would overflow.
-            const float top = std::max(outline.y - outline.half_height - 0.5f, 0.0f);
-            const float bottom = std::min(outline.y + outline.half_height - 0.5f, w.height - 1.0f);
-            if (!(top <= bottom)) continue;
-            const int first_row = (int)top / TILE, last_row = (int)bottom / TILE, last_strip = (int)bottom / BLOCK;
-            for (int strip = first_row * STRIPS_PER_TILE; strip <= last_strip; strip += STRIPS) {
-                outline.columns(strip, w.width, columns);
-                for (int r = 0; r < STRIPS && strip + r <= last_strip; r += STRIPS_PER_TILE) {
-                    const int row = (strip + r) / STRIPS_PER_TILE;
-                    const Hit hit = {gaussian, 0, (uint8_t)std::min(row - first_row, 255), (uint8_t)std::min(last_row - row, 255)};
-                    Workspace::Emission* out = notes.grow(used + w.tiles_x, used) + used;
-                    out = emit_tile_row(columns.first + r, columns.last + r, (int64_t)row * w.tiles_x, hit, histogram, out);
-                    used = out - notes.data();
-                    if (used - counted > LOOK_EVERY) {
-                        if ((noted += used - counted) > most_hits) throw OverLimit();
-                        counted = used;
-                    }
-                }
-            }
-        }
+        int64_t used = 0;
+        const auto emit = [&](const int32_t* first, const int32_t* last, int row, Hit hit) {
+            Workspace::Emission* out = notes.grow(used + w.tiles_x, used) + used;
+            used = emit_tile_row(first, last, (int64_t)row * w.tiles_x, hit, histogram, out) - notes.data();
+        };
+        visit_rows(w, w.visible * t / threads, w.visible * (t + 1) / threads, emit);
         emitted[t] = used;
     });
     int64_t* start = w.tile_start.reserve(tiles + 1);
