@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, Num, UInt8
@@ -13,6 +13,9 @@ from smplxpp.core.image_file import decode_image
 from smplxpp.core.json_file import as_number, as_numbers, as_text
 from smplxpp.core.raw_mesh import warn
 from smplxpp.core.texture import sample_texture
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 
 def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
@@ -70,9 +73,11 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
     texture = document.entry("textures", use.get("index"))
     webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
     index = document.number({"source": texture.get("source", webp.get("source"))}, "source")
+    return document.pictures.get(index, lambda: _decoded(document, index))
+
+
+def _decoded(document: GltfDocument, index: int) -> Image:
     image = document.entry("images", index)
-    if index in document.pictures:
-        return document.pictures[index]
     if "bufferView" in image:
         data: bytes | None = bytes(document.view(image["bufferView"])[0])
         name = f"image {image.get('name', '')}".strip()
@@ -81,8 +86,7 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
         data = document.resource(name)
     if data is None:
         raise InputError("picture", expected="a file in the mesh file's folder", received=repr(name[:80]))
-    document.pictures[index] = np.array(decode_image(data, subject=f"picture {name[:80]!r}").convert("RGB"))
-    return document.pictures[index]
+    return decode_image(data, subject=f"picture {name[:80]!r}")
 
 
 def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> Float64[np.ndarray, "N 2"]:

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, parse_json
 from smplxpp.core.raw_mesh import read_bytes
-from smplxpp.core.texture import beside
+from smplxpp.core.texture import Pictures, beside
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -34,7 +33,7 @@ class GltfDocument:
 
     Attributes:
         path: of the file. subject: its name in messages. size: bytes of the file.
-        json: the document. pictures: kept by who decodes them, by the index of the image.
+        json: the document. pictures: those decoded, by the index of the image.
 
     Raises:
         InputError: no glTF 2.0, or a container whose lengths do not fit.
@@ -53,8 +52,7 @@ class GltfDocument:
             raise InputError(self.subject, expected="glTF 2.0", received=f"version {version or 'unknown'}")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
-        # Decoded pictures by their image; a file may use one many times.
-        self.pictures: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
+        self.pictures = Pictures(self.subject)
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes | None]:
         """The JSON chunk and the binary one of a GLB."""

@@ -22,6 +22,8 @@ from smplxpp.core.texture import LOST
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # A file may show one mesh many times over; beyond its own bytes only this many vertices and faces are made of it.
 _MOST_SHARED = 1_000_000
+# And primitives that share vertices may look at them this often in all.
+_MOST_VISITS = 1_000_000_000
 
 
 def read_gltf(path: Path) -> RawMesh:
@@ -63,7 +65,7 @@ class _Parts:
         self._colored: list[np.ndarray] = []
         self._faces: list[Int64[np.ndarray, "m 3"]] = []
         self._starts: list[int] = []
-        self._count = self._made = self._left_out = 0
+        self._count = self._made = self._visits = self._left_out = 0
 
     def add(
         self,
@@ -89,6 +91,8 @@ class _Parts:
             shared[position] = self._add_vertices(attributes, position, world, joints)
         part = shared[position]
         count = len(self._vertices[part])
+        self._visits += count
+        self._charge(0)
         if "indices" in primitive:
             indices = document.accessor(primitive["indices"])
             if indices.dtype.kind not in "iu" or indices.shape[1] != 1:
@@ -136,11 +140,11 @@ class _Parts:
         """Refuse a small file that repeats its meshes beyond all memory."""
         self._made += elements
         most = max(_MOST_SHARED, self._document.size + self._document.file_bytes)
-        if self._made > most:
+        if self._made > most or self._visits > _MOST_VISITS:
             raise InputError(
                 self._document.subject,
                 expected=f"at most {most} vertices and faces from a file of this size",
-                received="nodes that repeat its meshes beyond them",
+                received="nodes or primitives that repeat its meshes beyond them",
             )
 
     def joined(self) -> RawMesh:

@@ -17,7 +17,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.number_text import IS_SPACE, as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.obj_material import Material, read_materials
 from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices, warn
-from smplxpp.core.texture import LOST, sample_texture
+from smplxpp.core.texture import LOST, Pictures, sample_texture
 
 # Lines that are numbers are read together up to this many bytes, so that the work space stays small.
 _BLOCK = 1 << 24
@@ -192,27 +192,31 @@ def _material_colors(
     if not uses or not libraries:
         return None
     materials = read_materials(path, [name for _, name in libraries])
-    names = sorted({name for _, name in uses})
-    found = [materials.get(name, Material()) for name in names]
-    if all(material.color is None and material.picture is None for material in found):
-        return None
+    names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
     corners = np.where((corners >= 0) & (corners < vertex_count), corners, 0)  # of faces that were left out
     vertices, first = np.unique(corners, return_index=True)
     use = np.searchsorted([line for line, _ in uses], corner_lines[first]) - 1
-    used = np.array([names.index(name) for _, name in uses])[use]
-    colors = np.full((vertex_count, 3), LOST, np.uint8)
+    used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
     rows = _rows(lines, b"vt", f"mesh file {path}")
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
     index = _resolve(uv_references[first], lines.of_kind(b"vt"), corner_lines[first])
     index = np.where(index < len(uv), index, -1)
-    for k, material in enumerate(found):
-        chosen = (used == k) & (use >= 0)
-        if material.color is not None:
-            colors[vertices[chosen]] = material.color
+    colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
+    pictures = Pictures(f"mesh file {path}")
+    order = np.argsort(used, kind="stable")
+    bounds = np.searchsorted(used[order], np.arange(len(names) + 1))
+    for (name, _), start, end in zip(names.items(), bounds[:-1], bounds[1:], strict=True):
+        material, chosen = materials.get(name, Material()), order[start:end]
         if material.picture is not None:
-            chosen &= index >= 0
-            colors[vertices[chosen]] = sample_texture(material.picture, uv[index[chosen]])
-    return colors
+            picture = pictures.beside(path, material.picture)
+            chosen = chosen[index[chosen] >= 0]
+            if picture is not None:
+                colors[vertices[chosen]] = sample_texture(picture, uv[index[chosen]])
+                found = True
+        elif material.color is not None:
+            colors[vertices[chosen]] = material.color
+            found = True
+    return colors if found else None
 
 
 def _first_two(values: Float64[np.ndarray, " n"], counts: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from smplxpp.core.raw_mesh import read_bytes, warn
-from smplxpp.core.texture import beside, read_picture
+from smplxpp.core.texture import beside
 
 # How many numbers follow an option of a picture's name.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}
@@ -19,56 +19,50 @@ _MOST_BYTES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A material's colour: `color` (3,) of its `Kd`, `picture` (H, W, 3) of its `map_Kd`; None for what it lacks."""
+    """A material's colour: `color` (3,) of its `Kd`, `picture` the name in its `map_Kd`; None for what it lacks.
+
+    Beside a picture `Kd` is a factor and no colour: it is left out.
+    """
 
     color: UInt8[np.ndarray, " 3"] | None = None
-    picture: UInt8[np.ndarray, "H W 3"] | None = None
+    picture: str | None = None
 
 
 def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
-    """The materials of an OBJ file by name; what is missing or damaged is left out with a warning.
-
-    A picture that cannot be read takes the material's `Kd` with it, which then is a factor and no colour.
+    """The materials of an OBJ file by name; a file that is missing or no text is left out with a warning.
 
     Args:
         path: of the OBJ file.
         libraries: what follows `mtllib`, a line an entry: a name with blanks in it, or several names.
     """
     out: dict[str, Material] = {}
-    pictures: dict[str, UInt8[np.ndarray, "H W 3"] | None] = {}
+    seen: set[Path] = set()
     for entry in dict.fromkeys(libraries):
-        names = [entry] if beside(path, entry) is not None else entry.split()
-        for name in names:
+        for name in [entry] if beside(path, entry) is not None else entry.split():
             found = beside(path, name)
             if found is None:
-                warn(f"mesh file {path}: colours of its materials are lost: {name!r} is not in its folder")
-                continue
-            text = read_bytes(found, subject="material file", limit=_MOST_BYTES).decode("utf-8", "replace")
-            for material, (color, picture) in _parse(text).items():
-                if picture is None:
-                    out[material] = Material(color)
-                    continue
-                if picture not in pictures:
-                    pictures[picture] = read_picture(path, picture)
-                out[material] = Material(picture=pictures[picture])
+                warn(f"mesh file {path}: colours of its materials are lost: {name[:200]!r} is not in its folder")
+            elif found not in seen:
+                seen.add(found)
+                data = read_bytes(found, subject="material file", limit=_MOST_BYTES)
+                out |= _parse(data.decode("utf-8", "replace"))
     return out
 
 
-def _parse(text: str) -> dict[str, tuple[UInt8[np.ndarray, " 3"] | None, str | None]]:
-    """Each material's `Kd` as 8-bit RGB, and the name of its picture."""
-    out: dict[str, tuple[UInt8[np.ndarray, " 3"] | None, str | None]] = {}
+def _parse(text: str) -> dict[str, Material]:
+    out: dict[str, Material] = {}
     name = ""
     for line in text.splitlines():
         words = line.split(None, 1) + ["", ""]
         keyword, rest = words[0].lower(), words[1].strip()
-        color, picture = out.get(name, (None, None))
+        known = out.get(name, Material())
         if keyword == "newmtl":
             name = rest
-            out[name] = (None, None)
-        elif keyword == "kd":
-            out[name] = (_kd(rest), picture)
+            out[name] = Material()
+        elif keyword == "kd" and known.picture is None:
+            out[name] = Material(_kd(rest))
         elif keyword == "map_kd" and rest:
-            out[name] = (color, _without_options(rest))
+            out[name] = Material(picture=_without_options(rest))
     return out
 
 

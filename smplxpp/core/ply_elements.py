@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
@@ -194,7 +195,7 @@ def _read_even(
 ) -> Columns | None:
     """An element all of whose rows are as its first one is; None where they are not."""
     sizes = [_cells_of(cells, p, length) for p, length in zip(element.properties, lengths, strict=True)]
-    starts = [start + sum(sizes[:k]) for k in range(len(sizes))]
+    starts = list(accumulate(sizes[:-1], initial=start))
     for p, length, at in zip(element.properties, lengths, starts, strict=True):
         if p.length_type is not None:
             stored = p.length_type if cells.byte_order else "f8"

@@ -12,7 +12,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.number_text import as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
 from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices
-from smplxpp.core.texture import LOST, read_picture, sample_texture
+from smplxpp.core.texture import LOST, Pictures, sample_texture
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
@@ -109,9 +109,8 @@ def _read_header(data: bytes, subject: str) -> tuple[str, list[Element], list[st
                 raise InputError(f"{subject}: header", expected="lines of a PLY header", received=repr(line[:80]))
     if byte_order is None:
         raise InputError(f"{subject}: header", expected=f"a format of {', '.join(_ORDERS)}", received="none")
-    for name in (e[0] for e in elements):
-        if [e[0] for e in elements].count(name) > 1:
-            raise InputError(f"{subject}: header", expected="each element once", received=f"two elements {name}")
+    if len({name for name, _, _ in elements}) < len(elements):
+        raise InputError(f"{subject}: header", expected="each element once", received="two of one name")
     for name, _, properties in elements:
         if len({p.name for p in properties}) < len(properties):
             raise InputError(f"{subject}: header", expected="each property once", received=f"two alike of {name}")
@@ -130,7 +129,9 @@ def _ascii_cells(text: bytes, rows: int, subject: str) -> Cells:
 def _vertices(vertex: Columns, subject: str) -> Float64[np.ndarray, "N 3"]:
     axes = [vertex.get(axis) for axis in "xyz"]
     if not all(isinstance(column, np.ndarray) for column in axes):
-        raise InputError(f"{subject}: vertices", expected="properties x, y and z", received=", ".join(vertex) or "none")
+        raise InputError(
+            f"{subject}: vertices", expected="properties x, y and z", received=", ".join(vertex)[:200] or "none"
+        )
     return np.stack([np.asarray(column, np.float64) for column in axes], axis=1)
 
 
@@ -165,11 +166,11 @@ def _picture_colors(
             page = np.repeat(number, corners.lengths)[first]
         else:
             page = page[vertices]
-    pictures = [read_picture(path, name) for name in names]
-    if all(picture is None for picture in pictures):
-        return None
-    colors = np.full((vertex_count, 3), LOST, np.uint8)
-    for k, picture in enumerate(pictures):
+    colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
+    pictures = Pictures(f"mesh file {path}")
+    for k in np.unique(page[(page >= 0) & (page < len(names))]):
+        picture = pictures.beside(path, names[int(k)])
         if picture is not None:
             colors[vertices[page == k]] = sample_texture(picture, coordinates[page == k])
-    return colors
+            found = True
+    return colors if found else None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -12,8 +14,13 @@ from smplxpp.core.image_file import open_image
 from smplxpp.core.paths import path_inside, regular_file
 from smplxpp.core.raw_mesh import warn
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 # The colour of a vertex that has none in a file of which others have.
 LOST = 128
+# A hundred pictures of 4096 x 4096 are fewer.
+_MOST_DECODED = 2_000_000_000
 
 
 def beside(path: Path, name: str) -> Path | None:
@@ -31,17 +38,43 @@ def beside(path: Path, name: str) -> Path | None:
     return None
 
 
-def read_picture(path: Path, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The picture that a mesh file names; None, with a warning, where it is missing or cannot be used."""
-    found = beside(path, name)
-    if found is None:
-        warn(f"mesh file {path}: its colours are lost: the picture {name!r} is not in its folder")
-        return None
-    try:
-        return np.array(open_image(found).convert("RGB"))
-    except InputError as error:
-        warn(f"mesh file {path}: its colours are lost: {error}")
-        return None
+class Pictures:
+    """The pictures of a mesh file, one in memory at a time, and in all no more pixels than real files have.
+
+    Args:
+        subject: the mesh file, for messages.
+    """
+
+    def __init__(self, subject: str) -> None:
+        self._subject, self._pixels = subject, 0
+        self._key: object = None
+        self._last = np.empty((0, 0, 3), np.uint8)
+
+    def get(self, key: object, decode: Callable[[], Image]) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture of a key: the last one again, or decoded.
+
+        Raises:
+            InputError: what `decode` raises, or a file that asks for more pixels than it may.
+        """
+        if self._key is None or key != self._key:
+            if self._pixels > _MOST_DECODED:
+                raise InputError(self._subject, expected=f"at most {_MOST_DECODED} pixels of pictures", received="more")
+            picture = np.array(decode().convert("RGB"))
+            self._key, self._last = key, picture
+            self._pixels += picture.shape[0] * picture.shape[1]
+        return self._last
+
+    def beside(self, path: Path, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The picture that a mesh file names; None, with a warning, where it is missing or cannot be used."""
+        found = beside(path, name)
+        if found is None:
+            warn(f"{self._subject}: its colours are lost: the picture {name[:200]!r} is not in its folder")
+            return None
+        try:
+            return self.get(found, lambda: open_image(found))
+        except InputError as error:
+            warn(f"{self._subject}: its colours are lost: {error}")
+            return None
 
 
 def sample_texture(
