@@ -20,6 +20,7 @@ from smplxpp.core.raw_mesh import RawMesh, require_indices, warn
 from smplxpp.core.texture import LOST
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_MOVING = {"matrix", "translation", "rotation", "scale"}
 # A file may show one mesh many times over; beyond its own bytes only this many vertices and faces are made of it.
 _MOST_SHARED = 1_000_000
 # And primitives that share vertices may look at them this often in all.
@@ -186,7 +187,7 @@ def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[n
             raise InputError(f"{document.subject}: nodes", expected="a tree", received=f"node {index} twice")
         seen.add(index)
         with np.errstate(all="ignore"):
-            world = parent @ _local(document, node)
+            world = parent @ _local(document, node) if _MOVING & node.keys() else parent
         found.append((node, world))
         stack += [(child, world) for child in reversed(document.items(node, "children"))]
     return found
