@@ -12,15 +12,18 @@ from smplxpp.capture.capture import Capture
 from smplxpp.capture.recording import Problem
 from smplxpp.core.errors import InputError
 
+# So many cameras, whose pictures' upper edges have this mean along an axis, say which one points up.
+_AGREEING_CAMERAS, _UPRIGHT = 3, 0.8
+
 
 def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
     """Everything that would stop a view or a frame from being used, each with its file.
 
-    Missing: cameras without images, frames that not every camera has, images without a mask where others have one,
-    frames without parameters. Unusable: parameters and keypoints that cannot be read or hold NaN; with `decode` (which
-    reads every file) damaged images, masks, label and normal maps, ones of another size than the calibration's, and
-    images that are not on the declared background. `capture.without(problems)` leaves out what is named, and then has
-    no problems but those of the whole capture.
+    The world: cameras that agree on another axis up than +y. Missing: cameras without images, frames that not every
+    camera has, images without a mask where others have one, frames without parameters. Unusable: parameters and
+    keypoints that cannot be read or hold NaN; with `decode` (which reads every file) damaged images, masks, label and
+    normal maps, ones of another size than the calibration's, and images that are not on the declared background.
+    `capture.without(problems)` leaves out what is named, and then has no problems but those of the whole capture.
 
     Args:
         capture: as opened; its own `problems` come first.
@@ -29,7 +32,7 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
     found = list(capture.problems)
     told = {(problem.camera, problem.frame) for problem in found}
     found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in told]
-    found += [*_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
+    found += [*_other_way_up(capture), *_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
     if decode:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):
@@ -52,6 +55,20 @@ def _missing_images(capture: Capture) -> Iterator[Problem]:
         elif seen:
             for row in np.flatnonzero(used & ~table[:, column]):
                 yield Problem(f"camera {names[row]}: no image of frame {frame}", names[row], frame)
+
+
+def _other_way_up(capture: Capture) -> Iterator[Problem]:
+    """A world with another axis up: pictures are upright, their upper edges say it; those of rigs on their side do not."""
+    if len(capture.cameras) < _AGREEING_CAMERAS:
+        return
+    up = -np.mean([camera.cam_from_world[1, :3] for camera in capture.cameras.values()], axis=0)
+    axis = int(np.abs(up).argmax())
+    if abs(up[axis]) > _UPRIGHT and (axis, up[axis] > 0) != (1, True):
+        name = ("+" if up[axis] > 0 else "-") + "xyz"[axis]
+        yield Problem(
+            f"the upper edges of the cameras' pictures point along {name} of the world, "
+            "where +y is expected: turn cameras and parameters (docs/captures.md)"
+        )
 
 
 def _missing_masks(capture: Capture) -> Iterator[Problem]:

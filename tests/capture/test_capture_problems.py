@@ -211,3 +211,20 @@ def test_a_folder_of_two_layouts_is_ambiguous(rig):
     with pytest.raises(InputError, match=r"simple and easymocap.*format="):
         open_capture(rig)
     assert open_capture(rig, format="simple").format == "simple"
+
+
+@pytest.mark.parametrize(("turn", "seen"), [([0, 2, 1], "+z"), ([1, 0, 2], "+x")])
+def test_a_world_with_another_axis_up_is_told(rig, turn, seen):
+    content = json.loads((rig / "cameras.json").read_text())
+    # A permutation of two axes, one of them negated, is a rotation.
+    world = np.eye(3)[turn] * [[1], [1], [-1]] if seen == "+x" else np.eye(3)[turn] * [[1], [-1], [1]]
+    for camera in content["cameras"]:
+        camera["R"] = (np.array(camera["R"]) @ world).tolist()
+    (rig / "cameras.json").write_text(json.dumps(content))
+    sign = -np.mean([c.cam_from_world[1, :3] for c in open_capture(rig).cameras.values()], axis=0)
+    expected = f"{'+' if sign['xyz'.index(seen[1])] > 0 else '-'}{seen[1]}"
+    found = messages(rig, decode=False)
+    assert len(found) == 1 and f"point along {expected} of the world, where +y is expected" in found[0]
+    content["cameras"] = content["cameras"][:2]
+    (rig / "cameras.json").write_text(json.dumps(content))
+    assert not any("of the world" in message for message in messages(rig, decode=False))

@@ -42,7 +42,7 @@ def test_easymocap_leaves_out_a_camera_called_none(tmp_path):
     capture = open_capture(root)
     assert list(capture.cameras) == ["A", "B", "C"]
     problems = find_problems(capture, decode=False)
-    assert [problem.message for problem in problems] == ["camera none: left out, as EasyMocap itself does"]
+    assert [problem.message for problem in problems] == ["camera none, which EasyMocap itself drops: left aside"]
     assert len(capture.without(problems).views()) == 6
 
 

@@ -19,6 +19,8 @@ _KINDS = (
     (r"no image of frame \d+$|: named in .*, but missing$", "image-missing"),
     (r"is outside of the undistorted one$", "lens-loss"),
     (r": left aside$", "left-aside"),
+    (r"where \+y is expected", "world-up"),
+    (r"name the model that they were fitted with", "params-body"),
     (r"^no masks: ", "masks-none"),
     (r"no mask( of frame \d+)?$", "mask-missing"),
     (r"no (label|normal) of frame \d+$", "map-missing"),

@@ -51,6 +51,11 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "params-angles": ("parameters", "fail", "write rotation vectors in radians"),
     "params-units": ("parameters", "fail", "write cameras and parameters in metres, in one world"),
     "params-jump": ("parameters", "fail", "fit these frames anew, or check that frames are numbered in time's order"),
+    "world-up": (
+        "calibration",
+        "warn",
+        "turn cameras and parameters, so that y points up (`smplxpp params convert --up` for the latter)",
+    ),
     "calibration": (
         "calibration",
         "fail",

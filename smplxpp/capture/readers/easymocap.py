@@ -81,7 +81,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         params=_params(root, options),
         problems=()
         if len(names) == len(listed)
-        else (Problem(f"camera {_NO_CAMERA}: left out, as EasyMocap itself does"),),
+        else (Problem(f"camera {_NO_CAMERA}, which EasyMocap itself drops: left aside"),),
         keypoints=found_keypoints(root / "annots", cameras, format="easymocap", person=options.person),
     )
 

@@ -31,8 +31,6 @@ _MATTES = ("mattings", "matting", "mattes", "masks", "mask", "alphas", "alpha", 
 _TRIED_FILES = 3
 # y down, as OpenCV's cameras have it, to y up.
 _TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
-# Cosine from which on cameras stand on their heads: rigs of cameras on their sides are not judged.
-_UPSIDE_DOWN = 0.5
 
 
 def detect(root: Path) -> bool:
@@ -74,7 +72,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         background=_background(declared),
         params=params,
         fps=_FPS,
-        problems=(*problems, *_standing(cameras)),
+        problems=tuple(problems),
     )
 
 
@@ -145,19 +143,6 @@ def _images(root: Path, cameras: Mapping[str, Any]) -> dict[str, Path]:
         expected=f"a folder with folders of images named {', '.join(list(cameras)[:3])}, ..., such as images/",
         received=", ".join(name + (" (mattes)" if name in _MATTES else "") for name in subfolders(root)) or "no folder",
     )
-
-
-def _standing(cameras: Mapping[str, Camera]) -> list[Problem]:
-    """Say it if most cameras stand on their heads: then the world was turned, or left, that should not have been."""
-    image_up = np.mean([-camera.cam_from_world[1, 1] for camera in cameras.values()]) if cameras else 1.0
-    if image_up > -_UPSIDE_DOWN:
-        return []
-    return [
-        Problem(
-            "the cameras stand upside down: TalkBody4D's world has y down and is turned; say in capture.json "
-            f'what points up in this one, {{"format": "{NAME}", "up": "y"}} or "-y"'
-        )
-    ]
 
 
 def _params(root: Path, options: ReaderOptions, up: UpAxis) -> tuple[ParamSource | None, list[Problem]]:
