@@ -58,7 +58,7 @@ def _missing_images(capture: Capture) -> Iterator[Problem]:
 
 
 def _other_way_up(capture: Capture) -> Iterator[Problem]:
-    """A world with another axis up: pictures are upright, their upper edges say it; those of rigs on their side do not."""
+    """A world with another axis up: pictures are upright, their upper edges say it; rigs on their side do not."""
     if len(capture.cameras) < _AGREEING_CAMERAS:
         return
     up = -np.mean([camera.cam_from_world[1, :3] for camera in capture.cameras.values()], axis=0)
