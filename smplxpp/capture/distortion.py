@@ -21,6 +21,8 @@ _NEWTON_STEPS = 12
 _BISECTIONS = 60
 # The farthest from the axis that a pinhole is asked to show: at 90 degrees its picture would have no end.
 _WIDEST = np.radians(89.0)
+# A telephoto lens has large ones, since its radii are small.
+_LARGEST = 1e12
 _NO_LENS_REMEDY = "calibrate without thin prism and tilt, or undistort the images beforehand"
 
 
@@ -64,6 +66,8 @@ class Distortion(ABC):
         """
         require_choice(f"{subject}: model of the lens", model, LENS_MODELS)
         values = as_numbers(coefficients, subject=f"{subject}: distortion").ravel()
+        if np.abs(values).max(initial=0.0) > _LARGEST:
+            raise _misfit(subject, f"coefficients of at most {_LARGEST:g}", values)
         if model == FISHEYE:
             return FisheyeDistortion.from_coefficients(values, subject=subject)
         if model == FOV:
@@ -174,7 +178,7 @@ class FisheyeDistortion(_RadialDistortion):
     def reach(self) -> float:
         """The angle from the axis, in radians, up to which the lens is one to one, at most 89 degrees."""
         slope = [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.k, strict=True))]
-        roots = np.asarray(np.polynomial.Polynomial(slope).trim().roots(), dtype=np.complex128)
+        roots = np.asarray(np.polynomial.Polynomial(slope).trim(1e-15).roots(), dtype=np.complex128)
         turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
         return float(min(_WIDEST, np.sqrt(turns).min(initial=_WIDEST)))
 

@@ -21,7 +21,8 @@ def lost_share(camera: Camera, distortion: Distortion) -> float:
     x, y = np.meshgrid(middles * camera.width, middles * camera.height)
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
     K, size = camera.K, (camera.width, camera.height)
-    seen = distortion.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T) @ K[:2, :2].T + K[:2, 2]
+    with np.errstate(over="ignore", invalid="ignore"):  # principal points far away
+        seen = distortion.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T) @ K[:2, :2].T + K[:2, 2]
     return float(1.0 - ((seen >= 0) & (seen <= size)).all(axis=1).mean())  # NaN is outside
 
 

@@ -51,7 +51,7 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
     if np.abs(rotation).max() > 2 or not (
         np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     ):
-        raise InputError(f"{subject}: R", expected="a rotation matrix", received=f"{rotation.round(4).tolist()}")
+        raise InputError(f"{subject}: R", expected="a rotation matrix", received=f"{rotation.tolist()}")
     if not (intrinsics[2, 2] and intrinsics[[0, 1], [0, 1]].min() > 0 and not intrinsics[2, :2].any()):
         raise InputError(
             f"{subject}: K",

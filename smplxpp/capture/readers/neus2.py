@@ -1,31 +1,34 @@
-"""NeuS2 (Wang et al. 2023) and Instant-NGP: `transform*.json`, one for each moment, and RGBA images."""
+"""NeuS2 (Wang et al. 2023), Instant-NGP, nerfstudio, Blender's NeRF scenes: `transform*.json` and images."""
 
 from __future__ import annotations
 
-import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
-from smplxpp.capture.readers.common import chosen_params, inverted, pinhole, required
+from smplxpp.capture.readers.common import chosen_params, required
 from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.transforms_camera import frame_camera
+from smplxpp.capture.readers.transforms_images import NamedImage, find_image, mask_beside, places, same_camera
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.image_file import image_mode, image_size
+from smplxpp.core.json_file import as_list, as_number, as_object, as_text, read_json
 
 NAME = "neus2"
 LOOKS_FOR = "transform*.json, there or in train/ and test/"
 _SETS = ("", "train", "test")
-# Camera axes of OpenGL (y up, z backwards) in OpenCV's.
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# Parts that are held out, as files and nerfstudio's lists call them.
+_HELD_OUT = ("test", "val")
+_MOST_DIGITS = 18
+_TRAIN, _TEST, _NEITHER = "train", "test", ""
 
 
 def detect(root: Path) -> bool:
@@ -34,46 +37,63 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a scene. Every image is a view; the number that ends a JSON file's name is its frame, else 0.
+    """Find a scene. Every image is a view; `places` says which camera and frame it is.
 
     `from_na` (its presence, as in NeuS2) means camera axes of OpenCV, otherwise they are OpenGL's; both are
-    camera-to-world in the units of the data: `scale` and `offset` concern the trainer's unit cube alone. Test files
-    hold the held-out cameras and frames.
+    camera-to-world in the axes and units of the data: `scale` and `offset` concern the trainer's unit cube alone. Files
+    and lists of test and val hold the held-out cameras and frames.
 
     Raises:
-        InputError: broken files, a camera that moves between frames.
+        InputError: broken files, lenses that are none of ours, images outside of the folder, a camera that moves
+            between frames.
     """
+    problems: list[Problem] = []
+    images: list[NamedImage] = []
+    for path in _moments(root):
+        content = as_object(read_json(path), subject=f"file {path}")
+        images += _images(root, path, content, problems)
+        problems += _scale_note(path, content)
+    if not images:
+        received = problems[0].message if problems else "none"
+        raise InputError(f"capture {root}", expected="frames with images in transform*.json", received=received)
+    problems += _dynamic_masks(root, images)
     cameras: dict[str, Camera] = {}
     distortions: dict[str, Distortion] = {}
-    names: dict[str, dict[int, str]] = {}
-    tested: dict[bool, set[tuple[str, int]]] = {True: set(), False: set()}
-    problems: list[Problem] = []
-    for path in _moments(root):
-        content = read_json(path)
-        frame = _frame_of(path)
-        for entry in required(content, "frames", source=f"file {path}"):
-            file = path.parent / required(entry, "file_path", source=f"file {path}")
-            if not file.suffix:
-                file = file.with_suffix(".png")
-            name = _camera_name(file.stem, frame)
-            camera, distortion = _camera(name, content, entry, path)
-            _keep(cameras, name, camera, path)
-            if distortion is not None:
-                distortions[name] = distortion
-            if not file.is_file():
-                problems.append(Problem(f"{file}: named in {path.name}, but missing", name, frame))
-                continue
-            names.setdefault(name, {})[frame] = os.path.relpath(file, root)
-            tested["test" in (path.parent.name, path.stem.rpartition("_")[2])].add((name, frame))
-    images = {name: FileSeries.from_names(root, files) for name, files in names.items()}
+    files: dict[str, dict[str, dict[int, str]]] = {"image": {}, "mask": {}}
+    parts: dict[str, set[tuple[str, int]]] = {_TRAIN: set(), _TEST: set(), _NEITHER: set()}
+    for image, (name, frame) in zip(images, places(images, subject=f"capture {root}"), strict=True):
+        camera = replace(image.camera, name=name)
+        known = cameras.setdefault(name, camera)
+        if not same_camera(known, camera):
+            raise InputError(
+                f"file {image.source}: camera {name}",
+                expected="the pose and intrinsics it has in the other frames",
+                received="others",
+                remedy="a capture's cameras stand still: give moving cameras names of their own",
+            )
+        if image.lens is not None:
+            distortions[name] = image.lens
+        if not image.exists:
+            problems.append(Problem(f"{root / image.path}: named in {image.source.name}, but missing", name, frame))
+            continue
+        files["image"].setdefault(name, {})[frame] = str(image.path)
+        if image.mask is not None:
+            files["mask"].setdefault(name, {})[frame] = str(image.mask)
+        parts[image.part].add((name, frame))
+    series = {
+        kind: {name: FileSeries.from_names(root, names) for name, names in by_camera.items()}
+        for kind, by_camera in files.items()
+    }
+    if not series["mask"] and _has_alpha(series["image"]):
+        series["mask"] = series["image"]
     return Recording(
         name=root.name,
         root=root,
         format=NAME,
         cameras=cameras,
         distortions=distortions,
-        files={"image": images, "mask": images} if _has_alpha(images) else {"image": images},
-        splits=_splits(cameras, tested),
+        files={kind: by_camera for kind, by_camera in series.items() if by_camera or kind == "image"},
+        splits=_splits(cameras, parts),
         params=chosen_params(options),
         problems=tuple(problems),
     )
@@ -83,71 +103,91 @@ def _moments(root: Path) -> list[Path]:
     return [path for folder in _SETS for path in sorted((root / folder).glob("transform*.json"))]
 
 
-def _frame_of(path: Path) -> int:
-    match = re.search(r"_(\d+)$", path.stem)
-    return int(match[1]) if match else 0
+def _images(root: Path, path: Path, content: Mapping[str, Any], problems: list[Problem]) -> list[NamedImage]:
+    """The images of one file; those without a size, said or in a whole image, are named in `problems` alone."""
+    found = []
+    frame = _frame_of(path)
+    listed = _listed_parts(root, path, content)
+    default = _TEST if {path.parent.name, path.stem.rpartition("_")[2]} & set(_HELD_OUT) else _TRAIN
+    for index, entry in enumerate(as_list(required(content, "frames", source=f"file {path}"), subject=f"file {path}")):
+        source = f"file {path}: frame {index}"
+        name = as_text(required(as_object(entry, subject=source), "file_path", source=source), subject=source)
+        source = f"file {path}: {name[:200]}"
+        image = find_image(root, path.parent, name, subject=source)
+        try:
+            size = _size(root / image, {**content, **entry})
+        except InputError as error:
+            problems.append(Problem(str(error)))
+            continue
+        camera, lens = frame_camera(content, entry, size, name=image.name, source=source)
+        mask = mask_beside(root, image)
+        if entry.get("mask_path") is not None:
+            mask = find_image(root, path.parent, as_text(entry["mask_path"], subject=source), subject=source)
+        if mask is not None and not os.path.isfile(root / mask):
+            mask = None
+        time = None if entry.get("time") is None else as_number(entry["time"], subject=f"{source}: time")
+        part = default if listed is None else listed.get(str(image), _NEITHER)
+        exists = os.path.isfile(root / image)
+        found.append(NamedImage(image, exists, mask, camera, lens, frame, time, part, path))
+    return found
 
 
-def _camera_name(stem: str, frame: int) -> str:
-    """The image's name without the frame's number at its end (`image_c_003_f_000280` -> `image_c_003`)."""
-    match = re.fullmatch(r"(?P<name>.*?)[_-]?(?:f|frame)?[_-]?(?P<number>\d+)", stem)
-    return match["name"] if match and match["name"] and int(match["number"]) == frame else stem
+def _frame_of(path: Path) -> int | None:
+    match = re.search(r"_([0-9]+)$", path.stem)
+    if match is not None and len(match[1]) > _MOST_DIGITS:
+        raise InputError(f"file {path}", expected=f"a number of at most {_MOST_DIGITS} digits", received=match[1][:80])
+    return None if match is None else int(match[1])
 
 
-def _camera(name: str, content: Mapping[str, Any], entry: Any, path: Path) -> tuple[Camera, Distortion | None]:
-    source = f"file {path}: {entry.get('file_path')}"
-    values = {**content, **entry}
-    width, height = (int(required(values, key, source=source)) for key in ("w", "h"))
-    world_from_cam = np.asarray(required(entry, "transform_matrix", source=source), dtype=np.float64)
-    if world_from_cam.shape not in ((3, 4), (4, 4)):
-        raise InputError(source, expected="a 4 x 4 transform_matrix", received=f"shape {world_from_cam.shape}")
-    if "from_na" not in content:
-        world_from_cam = world_from_cam @ _OPENCV_FROM_OPENGL
-    if "intrinsic_matrix" in values:
-        K = np.asarray(values["intrinsic_matrix"], dtype=np.float64)[:3, :3]
-    else:
-        angle = values.get("camera_angle_x")
-        fx = values.get("fl_x") or (None if angle is None else 0.5 * width / math.tan(0.5 * angle))
-        if fx is None:
-            raise InputError(source, expected="intrinsic_matrix, fl_x or camera_angle_x", received="none of them")
-        K = np.diag([fx, values.get("fl_y", fx), 1.0])
-        K[:2, 2] = values.get("cx", width / 2), values.get("cy", height / 2)
-    coefficients = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    return (
-        pinhole(name, K, *inverted(world_from_cam), (width, height)),
-        Distortion.from_opencv(coefficients, subject=source),
-    )
+def _size(path: Path, values: Mapping[str, Any]) -> tuple[Any, Any]:
+    return (values["w"], values["h"]) if "w" in values and "h" in values else image_size(path)
 
 
-def _keep(cameras: dict[str, Camera], name: str, camera: Camera, path: Path) -> None:
-    known = cameras.setdefault(name, camera)
-    same = np.allclose(known.cam_from_world, camera.cam_from_world, atol=1e-6) and np.allclose(known.K, camera.K)
-    if not same:
-        raise InputError(
-            f"file {path}: camera {name}",
-            expected="the pose and intrinsics it has in the other frames",
-            received="others",
-            remedy="a capture's cameras stand still: give moving cameras names of their own",
-        )
+def _listed_parts(root: Path, path: Path, content: Mapping[str, Any]) -> dict[str, str] | None:
+    """Which part nerfstudio's `train_filenames`, `val_filenames`, `test_filenames` put images in; None without them."""
+    lists = {part: content.get(f"{part}_filenames") for part in (*_HELD_OUT, _TRAIN)}
+    if all(names is None for names in lists.values()):
+        return None
+    parts = {}
+    for part, names in lists.items():
+        subject = f"file {path}: {part}_filenames"
+        for name in as_list(names or [], subject=subject):
+            image = find_image(root, path.parent, as_text(name, subject=subject), subject=subject)
+            parts[str(image)] = _TRAIN if part == _TRAIN else _TEST
+    return parts
+
+
+def _scale_note(path: Path, content: Mapping[str, Any]) -> list[Problem]:
+    scale = content.get("applied_scale")
+    if scale is None or as_number(scale, subject=f"file {path}: applied_scale") == 1:
+        return []
+    return [Problem(f"{path}: applied_scale {scale:g}, by which somebody multiplied the world: left aside")]
+
+
+def _dynamic_masks(root: Path, images: Sequence[NamedImage]) -> list[Problem]:
+    """Instant-NGP's `dynamic_mask_IMAGE.png` mark what a training skips: people, where the scene is meant."""
+    first = {image.path.parent: image.path for image in images}
+    found = [path.with_name(f"dynamic_mask_{path.stem}.png") for path in first.values()]
+    folders = [str(root / path.parent) for path in found if os.path.isfile(root / path)]
+    return [Problem(f"{', '.join(folders[:5])}: dynamic_mask_*.png: left aside")] if folders else []
 
 
 def _has_alpha(images: Mapping[str, FileSeries]) -> bool:
-    import PIL.Image
+    """What the first image that can be read says of all."""
+    for series in images.values():
+        try:
+            return image_mode(series.required(int(series.numbers[0]))) in ("RGBA", "LA", "PA")
+        except InputError:  # find_problems tells of it
+            continue
+    return False
 
-    series = next(iter(images.values()), None)
-    path = None if series is None else series.path(int(series.numbers[0]))
-    if path is None or not path.is_file():
-        return False
-    with PIL.Image.open(path) as image:
-        return image.mode in ("RGBA", "LA", "PA")
 
-
-def _splits(cameras: Mapping[str, Camera], tested: Mapping[bool, set[tuple[str, int]]]) -> Splits | None:
-    """What only the test files name is held out; without any training file there is nothing to hold out from."""
-    if not tested[False]:
+def _splits(cameras: Mapping[str, Camera], parts: Mapping[str, set[tuple[str, int]]]) -> Splits | None:
+    """What test and val alone name is held out; without any training image there is nothing to hold out from."""
+    if not parts[_TRAIN]:
         return None
-    train_cameras, test_cameras = ({name for name, _ in tested[test]} for test in (False, True))
-    train_frames, test_frames = ({frame for _, frame in tested[test]} for test in (False, True))
+    train_cameras, test_cameras = ({name for name, _ in parts[part]} for part in (_TRAIN, _TEST))
+    train_frames, test_frames = ({frame for _, frame in parts[part]} for part in (_TRAIN, _TEST))
     return Splits(
         tuple(name for name in cameras if name in train_cameras),
         tuple(name for name in cameras if name in test_cameras - train_cameras),

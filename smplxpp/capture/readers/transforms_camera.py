@@ -1,0 +1,142 @@
+"""A camera from a frame of transforms.json, in the words of Instant-NGP, nerfstudio, Blender's NeRF and NeuS2.
+
+Instant-NGP: `src/nerf_loader.cu` (`read_lens`, `read_focal_length`); nerfstudio: `nerfstudio_dataparser.py`,
+`cameras/cameras.py` (`CAMERA_MODEL_TO_TYPE`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.capture.distortion import FISHEYE, OPENCV, Distortion
+from smplxpp.capture.readers.common import inverted, pinhole, required
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_number, as_numbers, as_text
+
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# What Instant-NGP takes for other projections where it is there.
+_PROJECTIONS = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
+_REMEDY = "render or undistort the images to pinholes, or to OpenCV's fisheye, and say their intrinsics"
+# Camera axes of OpenGL (y up, z backwards) in OpenCV's.
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def frame_camera(
+    content: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[Any, Any], *, name: str, source: str
+) -> tuple[Camera, Distortion | None]:
+    """A frame's camera and its lens; what the frame says goes before what the file says.
+
+    Args:
+        content: the file's object.
+        frame: one of its `frames`.
+        size: width and height of the image, unchecked.
+        name: of the camera. source: what messages call the frame.
+
+    Raises:
+        InputError: a projection that is no lens of ours, a camera that moves while it exposes, missing or broken
+            numbers.
+    """
+    width, height = (as_integer(side, subject=f"{source}: image size", least=1, most=1 << 16) for side in size)
+    K = _intrinsics(content, frame, (width, height), source)
+    camera = pinhole(name, K, *inverted(_pose(content, frame, source)), (width, height))
+    return camera, _lens({**content, **frame}, source)
+
+
+def _pose(content: Mapping[str, Any], frame: Mapping[str, Any], source: str) -> Float64[np.ndarray, "N 4"]:
+    """Camera to world with OpenCV's camera axes; `from_na` says that the file has them already (NeuS2)."""
+    key = "transform_matrix_start" if "transform_matrix_start" in frame else "transform_matrix"
+    matrix = as_numbers(required(frame, key, source=source), (None, 4), subject=f"{source}: {key}")
+    end = as_numbers(frame.get("transform_matrix_end", matrix), (None, 4), subject=f"{source}: transform_matrix_end")
+    if matrix.shape != end.shape or not np.allclose(matrix, end, atol=1e-9):
+        raise InputError(
+            source,
+            expected="a camera that stands still while it exposes",
+            received="transform_matrix_start and transform_matrix_end that differ (rolling shutter)",
+            remedy="undo the rolling shutter, or name one transform_matrix",
+        )
+    if matrix.shape[0] not in (3, 4):
+        raise InputError(f"{source}: {key}", expected="shape (4, 4) or (3, 4)", received=f"{matrix.shape}")
+    return matrix if "from_na" in content else matrix @ _OPENCV_FROM_OPENGL
+
+
+def _intrinsics(
+    content: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[int, int], source: str
+) -> Float64[np.ndarray, "3 3"]:
+    values = {**content, **frame}
+    if "intrinsic_matrix" in values:
+        matrix = as_numbers(values["intrinsic_matrix"], (None, None), subject=f"{source}: intrinsic_matrix")
+        if min(matrix.shape) < 3:
+            raise InputError(f"{source}: intrinsic_matrix", expected="3 rows and columns", received=f"{matrix.shape}")
+        return matrix[:3, :3]
+    found = _focal_lengths(frame, size, source) or _focal_lengths(content, size, source)
+    if found is None:
+        raise InputError(
+            source,
+            expected="intrinsic_matrix, fl_x, x_fov or camera_angle_x (or these of y)",
+            received="none of them",
+        )
+    K = np.diag([*found, 1.0])
+    for row, key in enumerate(("cx", "cy")):
+        K[row, 2] = as_number(values.get(key, size[row] / 2), subject=f"{source}: {key}")
+    return K
+
+
+def _focal_lengths(values: Mapping[str, Any], size: tuple[int, int], source: str) -> tuple[float, float] | None:
+    """Of both axes; one alone counts for both."""
+    x, y = (_focal_length(values, axis, side, source) for axis, side in zip("xy", size, strict=True))
+    first = x or y
+    return None if first is None else (first, y or first)
+
+
+def _focal_length(values: Mapping[str, Any], axis: str, side: int, source: str) -> float | None:
+    """Instant-NGP's order; its `x_fov` is in degrees and `camera_angle_x` in radians."""
+    for key, half_circle in ((f"{axis}_fov", 180.0), (f"fl_{axis}", None), (f"camera_angle_{axis}", math.pi)):
+        if key in values:
+            number = as_number(values[key], subject=f"{source}: {key}", least=1e-6, most=half_circle or 1e9)
+            return number if half_circle is None else 0.5 * side / math.tan(0.5 * math.pi * number / half_circle)
+    return None
+
+
+def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
+    other = [key for key in _PROJECTIONS if key in values and values[key] is not False and values[key] is not None]
+    if other:
+        raise InputError(f"{source}: lens", expected="a pinhole or a fisheye", received=other[0], remedy=_REMEDY)
+    name = as_text(values.get("camera_model") or "", subject=f"{source}: camera_model").upper()
+    known = _PINHOLES + _FISHEYES
+    fisheye = name in _FISHEYES or bool(values.get("is_fisheye"))
+    if (name and name not in known) or (fisheye and name in _PINHOLES[:2]):
+        received = f"{name} with is_fisheye" if name in known else name[:80]
+        expected = f"one of {', '.join(known)}"
+        raise InputError(f"{source}: camera_model", expected=expected, received=received, remedy=_REMEDY)
+    k, p = _coefficients(values, source)
+    if (p if fisheye else k[3:]).any():
+        raise InputError(
+            f"{source}: lens",
+            expected="k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2",
+            received="p1 and p2 of a fisheye" if fisheye else "k4, k5 or k6, which tools use for different things",
+            remedy=_REMEDY,
+        )
+    if fisheye:
+        return Distortion.from_opencv(k[:4], subject=source, model=FISHEYE)
+    return Distortion.from_opencv([*k[:2], *p, k[2]], subject=source, model=OPENCV)
+
+
+def _coefficients(
+    values: Mapping[str, Any], source: str
+) -> tuple[Float64[np.ndarray, " 6"], Float64[np.ndarray, " 2"]]:
+    """k1..k6 and p1, p2; nerfstudio's `distortion_params` (k1, k2, k3, k4, p1, p2) goes before single ones."""
+    if "distortion_params" in values:
+        listed = as_numbers(values["distortion_params"], (6,), subject=f"{source}: distortion_params")
+        return np.append(listed[:4], [0.0, 0.0]), listed[4:]
+
+    def numbers(keys: tuple[str, ...]) -> Float64[np.ndarray, " N"]:
+        return np.array([as_number(values.get(key, 0.0), subject=f"{source}: {key}") for key in keys])
+
+    return numbers(("k1", "k2", "k3", "k4", "k5", "k6")), numbers(("p1", "p2"))
