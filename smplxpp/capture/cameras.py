@@ -80,6 +80,7 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
     lenses: list[tuple[Camera, Distortion | None]] = []
     try:
         rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+        names = [row[_CSV_FIELDS[0]] or "" for row in rows]
         numbers = [{key: float(row[key]) for key in _CSV_FIELDS[1:]} for row in rows]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise InputError(
@@ -87,8 +88,8 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
             expected=f"ActorsHQ columns {', '.join(_CSV_FIELDS)}",
             received=f"{type(error).__name__}: {error}"[:200],
         ) from None
-    for row, value in zip(rows, numbers, strict=True):
-        source = f"camera file {path}: camera {row['name']}"
+    for name, value in zip(names, numbers, strict=True):
+        source = f"camera file {path}: camera {name}"
         as_numbers(list(value.values()), subject=source)
         width, height = (as_integer(value[key], subject=f"{source}: {key}") for key in ("w", "h"))
         world_from_cam = np.eye(4)
@@ -96,5 +97,5 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
         world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]
         K = np.diag([value["fx"] * width, value["fy"] * height, 1.0])
         K[:2, 2] = value["px"] * width, value["py"] * height
-        lenses.append((pinhole(row["name"] or "", K, *inverted(world_from_cam), (width, height)), None))
+        lenses.append((pinhole(name, K, *inverted(world_from_cam), (width, height)), None))
     return lenses

@@ -157,3 +157,11 @@ def _blocks(data: bytes) -> list[bytes]:
         else:
             out.append(line)
     return out
+
+
+def test_a_calibration_table_without_names_is_refused(tmp_path):
+    root = write_actorshq(make_scene(), tmp_path / "set")
+    table = root / "4x" / "calibration.csv"
+    table.write_text(table.read_text().replace("name,", "nome,"))
+    with pytest.raises(InputError, match=r"calibration\.csv: expected ActorsHQ columns name, .*'name'"):
+        open_capture(root)
