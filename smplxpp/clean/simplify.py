@@ -10,12 +10,16 @@ import numpy as np
 from jaxtyping import Int64
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.topology import edge_groups, manifold_corners
+from smplxpp.core.topology import component_labels, edge_groups, manifold_corners
 from smplxpp.core.validation import require_at_least
 
 # Collapses per pass: 3 keeps the quadric order well; higher is no faster at these sizes and breaks manifoldness.
 _AGGRESSIVENESS = 3
 _MAX_ROUNDS = 5
+# Edges below this share of the mean edge join vertices that went to one place (0.09 mm on a garment of 20,000 faces).
+_SAME_PLACE = 1e-2
+# A source of more than this many times the budget may be simplified half-way first.
+_FINE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +46,10 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
 
     Border vertices stay, so a mesh whose border alone needs more faces ends above the budget. Where the collapses make
     a non-manifold edge or a face opposed to the nearest source face, the source's faces are restored and locked, and
-    the rest is simplified again. A mesh within its budget returns as it is.
+    the rest is simplified again; where those of a fine source would take half of the budget, it is simplified half-way
+    first (to the geometric mean of its faces and the budget). Vertices that an edge joins and that went to the same
+    place become one: on a surface much finer than its features the best place of many is the same corner. A mesh within
+    its budget returns as it is.
 
     Args:
         mesh: manifold, possibly open (`sanitize`, `manifold_corners`).
@@ -75,12 +82,30 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
             ring = touched[mesh.faces].any(axis=1)
             touched[mesh.faces[ring]] = True
         if (locked | ring).sum() > face_budget // 2:
+            if mesh.face_count > _FINE * face_budget:
+                return _in_two_steps(mesh, face_budget)
             break
         locked |= ring
     faces, source_of_cut = manifold_corners(result.faces)
     result = TriangleMesh(result.vertices[source_of_cut], faces)
     source = _nearest_source(mesh, result, new_from_old, source_of_cut)
     return Simplified(result, new_from_old, source, int(locked.sum()), int(flipped.sum()))
+
+
+def _in_two_steps(mesh: TriangleMesh, face_budget: int) -> Simplified:
+    """The simplification of the mesh simplified half-way, mapped to the mesh's own vertices."""
+    fine = simplify(mesh, round((mesh.face_count * face_budget) ** 0.5))
+    if fine.mesh.face_count >= mesh.face_count:  # its borders alone need more
+        return fine
+    coarse = simplify(fine.mesh, face_budget)
+    new_from_old = np.where(fine.new_from_old >= 0, coarse.new_from_old[fine.new_from_old], -1)
+    return Simplified(
+        coarse.mesh,
+        new_from_old,
+        fine.source_vertex[coarse.source_vertex],
+        coarse.restored_faces,
+        coarse.flipped_faces,
+    )
 
 
 def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple[TriangleMesh, np.ndarray]:
@@ -97,6 +122,7 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
         return_collapses=True,
     )
     _, _, small_from_free = fast_simplification.replay_simplification(free.vertices.copy(), faces, collapses)
+    points, small_faces, small_from_free = _joined(points, small_faces, small_from_free)
     new_from_old = np.full(mesh.vertex_count, -1, dtype=np.int64)
     new_from_old[used] = small_from_free
     if not locked.any():
@@ -112,6 +138,32 @@ def _opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.n
     _, nearest, _ = tree.squared_distance(source.vertices, source.faces, result.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", result.face_normals, source.face_normals[nearest])
     return (cosine < 0) | (result.face_areas <= 0)
+
+
+def _joined(
+    points: np.ndarray, faces: np.ndarray, point_of_free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The collapsed mesh with vertices made one that an edge without length joins: points, faces, the map to them.
+
+    The vertex of lowest index stays. Faces that lose an edge go, and so do both of two faces that come to lie on each
+    other: a flap without a volume.
+    """
+    edges = TriangleMesh(points, faces).edges
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    short = edges[length < _SAME_PLACE * length.mean()]
+    if not len(short):
+        return points, faces, point_of_free
+    group = component_labels(short, len(points))
+    first = np.unique(group, return_index=True)[1][np.unique(group, return_inverse=True)[1]]
+    faces = first[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, same, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    faces = faces[count[same.ravel()] == 1]
+    kept = np.unique(faces)
+    place = np.full(len(points), -1, dtype=np.int64)
+    place[kept] = np.arange(len(kept))
+    to = np.where(point_of_free >= 0, place[first[point_of_free]], -1)
+    return points[kept], place[faces], to
 
 
 def _non_manifold(faces: np.ndarray) -> np.ndarray:

@@ -41,6 +41,30 @@ def test_simplify_keeps_borders_and_traces_every_vertex():
     np.testing.assert_allclose(*lengths, rtol=1e-12)
 
 
+def finer(mesh: TriangleMesh) -> TriangleMesh:
+    """Every face in four, in its own plane."""
+    fine = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).subdivide()
+    return TriangleMesh(fine.vertices, fine.faces)
+
+
+def test_a_scan_much_finer_than_its_features_keeps_edges_with_a_length():
+    # Sixteen flat faces in the place of each: the best place of many vertices is the same old corner, and edges of
+    # 1e-16 m between them grew by a factor of millions when they were posed.
+    rough = tube()
+    rough = rough.with_vertices(rough.vertices + np.random.default_rng(0).normal(0, 7e-4, rough.vertices.shape))
+    fine = finer(finer(rough))
+    result = simplify(fine, 5000)
+    mesh = result.mesh
+    length = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1), axis=2)
+    assert length.min() > 1e-3 * length.mean() and mesh.face_areas.min() > 0
+    assert 4000 < mesh.face_count <= 5000
+    assert igl.is_edge_manifold(mesh.faces) and result.flipped_faces == 0
+    np.testing.assert_array_equal(result.new_from_old[result.source_vertex], np.arange(mesh.vertex_count))
+    tree = igl.AABB()
+    tree.init(mesh.vertices, mesh.faces)
+    assert np.sqrt(tree.squared_distance(mesh.vertices, mesh.faces, fine.vertices)[0]).max() < 3e-3
+
+
 def test_simplify_commutes_with_rigid_motion_and_units_within_the_error():
     sleeve = tube()
     for scale in (1.0, 100.0):
