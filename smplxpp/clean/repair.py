@@ -17,6 +17,15 @@ from smplxpp.core.topology import component_labels, half_edges, manifold_corners
 
 # A face is without area below this fraction of the squared bounding-box diagonal (2 um x 2 um on an adult).
 _ZERO_AREA = 1e-12
+# A vertex farther from the middle than this many times the median distance belongs to nothing (a person: 300 m).
+_STRAY = 1e3
+# Of more strays than these, and than this share of the vertices, nobody can tell which are the mesh.
+_FEW_STRAYS = 3
+_MOST_STRAYS = 0.01
+# Squares of larger coordinates are infinite.
+_LARGEST = 1e100
+# Near pairs a vertex: more is no surface but a heap, whose pairs would fill the memory.
+_CROWD = 100
 # An open sheet is turned over only when it is clearly inside out: flux below this fraction of area x radius.
 _INSIDE_OUT = 0.05
 
@@ -27,6 +36,7 @@ class CleanReport:
 
     Attributes:
         nonfinite_vertices: vertices with NaN or infinity, dropped with their faces.
+        stray_vertices: vertices immensely far from all others, dropped with their faces.
         welded_vertices: vertices merged into another one.
         zero_area_faces, duplicate_faces: faces dropped.
         flipped_faces: faces turned over for consistent, outward winding.
@@ -35,6 +45,7 @@ class CleanReport:
     """
 
     nonfinite_vertices: int = 0
+    stray_vertices: int = 0
     welded_vertices: int = 0
     zero_area_faces: int = 0
     duplicate_faces: int = 0
@@ -73,7 +84,8 @@ def sanitize(
 ) -> Sanitized:
     """Repair raw arrays: NaN, duplicates, faces without area, winding, non-manifold places.
 
-    In this order: vertices that are not finite go with their faces; vertices closer than `weld_tolerance` merge into
+    In this order: vertices that are not finite go with their faces, as do those more than 1000 times farther from the
+    middle than the median vertex, if they are few; vertices closer than `weld_tolerance` merge into
     the one of lowest index (the default is 1e-6 of the bounding box's diagonal); faces without area and repeated faces
     go; winding is made consistent in each component, and outward; the surface is cut at edges with more than two faces
     and at vertices where fans meet; unreferenced vertices go. Sanitising the result again changes nothing but the same
@@ -83,7 +95,7 @@ def sanitize(
         vertices: (N, 3). faces: (M, 3) integers.
 
     Raises:
-        InputError: wrong shapes, indices out of range, or nothing left.
+        InputError: wrong shapes, indices out of range, nothing left, or vertices in heaps that are no surface.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -91,7 +103,8 @@ def sanitize(
     finite = np.isfinite(vertices).all(axis=1)
     # The checks of shapes and indices are the mesh's own.
     faces = TriangleMesh(np.where(finite[:, None], vertices, 0.0), faces).faces
-    kept = np.flatnonzero(finite[faces].all(axis=1))
+    near = finite & ~_strays(vertices, np.unique(faces[finite[faces].all(axis=1)]))
+    kept = np.flatnonzero(near[faces].all(axis=1))
     faces = faces[kept]
     referenced = np.unique(faces)
     if not len(referenced):
@@ -123,22 +136,65 @@ def sanitize(
     used = len(np.unique(source_vertex))
     report = CleanReport(
         nonfinite_vertices=int((~finite).sum()),
+        stray_vertices=int((finite & ~near).sum()),
         welded_vertices=merged,
         zero_area_faces=int((~solid).sum()),
         duplicate_faces=duplicates,
         flipped_faces=int(flipped.sum()),
         split_vertices=len(source_vertex) - used,
-        unreferenced_vertices=int(finite.sum()) - merged - used,
+        unreferenced_vertices=int(near.sum()) - merged - used,
     )
     if not report.is_clean:
         warnings.warn(f"mesh repaired: {report}", GeometryWarning, stacklevel=2)
     return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report)
 
 
+def _strays(vertices: np.ndarray, referenced: np.ndarray) -> np.ndarray:
+    """(N,) those of the referenced vertices that lie immensely far from where most lie.
+
+    Raises:
+        InputError: so many that they may be the mesh, or numbers that are no places.
+    """
+    stray = np.zeros(len(vertices), dtype=bool)
+    if not len(referenced):
+        return stray
+    # Halves, so that differences of the largest numbers stay finite.
+    half = 0.5 * vertices[referenced]
+    distance = np.abs(half - np.median(half, axis=0)).max(axis=1)
+    usual = float(np.median(distance))
+    if usual > _LARGEST:
+        raise InputError("mesh vertices", expected="coordinates of a surface", received=f"most beyond {_LARGEST:g}")
+    far = distance > _STRAY * usual
+    if usual == 0 or not far.any():  # what lies in heaps is told when it is welded
+        return stray
+    if far.sum() > max(_FEW_STRAYS, _MOST_STRAYS * len(referenced)):
+        raise InputError(
+            "mesh vertices",
+            expected="a surface",
+            received=f"{int(far.sum())} of {len(referenced)} vertices more than {_STRAY:g} times farther from the "
+            "middle than most",
+            remedy="remove what lies far from the person",
+        )
+    stray[referenced[far]] = True
+    return stray
+
+
 def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.ndarray:
-    """(N,) for every vertex the one of lowest index that it merges into (chains of near vertices merge whole)."""
+    """(N,) for every vertex the one of lowest index that it merges into (chains of near vertices merge whole).
+
+    Raises:
+        InputError: vertices in heaps.
+    """
     target = np.arange(len(vertices))
-    pairs = cKDTree(vertices[referenced]).query_pairs(tolerance, output_type="ndarray")
+    tree = cKDTree(vertices[referenced])
+    if tree.count_neighbors(tree, tolerance) > 2 * _CROWD * len(referenced):
+        raise InputError(
+            "mesh vertices",
+            expected="a surface",
+            received=f"vertices in heaps, each with more than {_CROWD} others in the same place",
+            remedy="check for vertices without a position, and for stray geometry far from the rest",
+        )
+    pairs = tree.query_pairs(tolerance, output_type="ndarray")
     if len(pairs):
         group = component_labels(pairs, len(referenced))
         _, first = np.unique(group, return_index=True)

@@ -68,6 +68,46 @@ def test_every_repair_is_counted_and_mapped():
     assert len(result.source_face) == result.mesh.face_count
 
 
+@pytest.mark.parametrize("place", [1e30, 1e9, -1e150, 1e308, np.inf])
+def test_a_vertex_far_from_everything_goes_and_is_said(place: float):
+    ball = sphere()
+    vertices = ball.vertices.copy()
+    vertices[100] = [place, 0, 0]
+    with pytest.warns(GeometryWarning, match="nonfinite" if np.isinf(place) else "1 stray vertices"):
+        result = sanitize(vertices, ball.faces)
+    around = (ball.faces == 100).any(axis=1).sum()
+    assert result.mesh.face_count == ball.face_count - around
+    np.testing.assert_array_equal(np.delete(np.arange(len(vertices)), 100), result.source_vertex)
+    assert result.report.unreferenced_vertices == 0
+
+
+def test_a_stray_face_goes_and_a_vertex_within_a_hall_stays():
+    ball = sphere()
+    vertices = np.concatenate([ball.vertices, 1e12 + np.eye(3)])
+    count = ball.vertex_count
+    faces = np.concatenate([ball.faces, [[count, count + 1, count + 2]]])
+    result = quiet_sanitize(vertices, faces)
+    assert result.report.stray_vertices == 3 and result.mesh.face_count == ball.face_count
+    vertices = ball.vertices.copy()
+    vertices[100] *= 100.0
+    assert sanitize(vertices, ball.faces).report.is_clean
+
+
+def test_many_strays_heaps_and_immense_coordinates_are_refused_before_work():
+    ball = sphere()
+    vertices = ball.vertices.copy()
+    vertices[:40] = 1e30
+    with pytest.raises(InputError, match="40 of 642 vertices"):
+        sanitize(vertices, ball.faces)
+    with pytest.raises(InputError, match="most beyond"):
+        sanitize(1e200 * ball.vertices, ball.faces)
+    # Ten thousand vertices in one place are fifty million pairs.
+    heap = np.concatenate([ball.vertices, np.zeros((10_000, 3))])
+    faces = np.concatenate([ball.faces, ball.vertex_count + np.arange(9999).reshape(-1, 3)])
+    with pytest.raises(InputError, match="heaps"):
+        sanitize(heap, faces)
+
+
 def test_inward_ball_and_open_bowl_turn_outward():
     ball = sphere()
     result = quiet_sanitize(ball.vertices, ball.faces[:, ::-1])
