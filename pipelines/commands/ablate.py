@@ -78,8 +78,10 @@ class Ablate:
         from avatar.training.engine.device import choose_device
         from pipelines.ablation.ablate import AblationRun, ablate
         from pipelines.ablation.rows import ablation_rows
+        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.scene import TrainInputs
 
+        keep_out_of_capture(self.run_folder, self.capture, subject="--run")
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:
                 raise InputError(f"option {name}", expected="a number above 0", received=f"{value:g}")

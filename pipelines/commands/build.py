@@ -21,7 +21,7 @@ from pipelines.runs.layout import (
     REGISTER_STAGE,
     TRAIN_STAGES,
 )
-from pipelines.runs.places import same_place
+from pipelines.runs.places import keep_out_of_capture, same_place
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
@@ -100,6 +100,7 @@ class Build:
         from pipelines.report.sections.build import write_build_report
         from pipelines.stages.build import build
 
+        keep_out_of_capture(self.out, self.capture)
         config, inputs = self.config(), self.inputs()
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
         count = sum(name in inputs.stages for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])

@@ -53,9 +53,12 @@ class CaptureCheckCommand:
         from pipelines.captures.check.report import check_as_dict
         from pipelines.captures.check.terminal import print_check
         from pipelines.commands.progress import counted_progress
+        from pipelines.runs.places import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
 
+        if self.out is not None:
+            keep_out_of_capture(self.out, self.capture)
         body = load_body(self.body)
         capture = open_capture(
             self.capture,

@@ -75,11 +75,13 @@ class FitReference:
         from avatar.training.refinement.config import RefineConfig
         from pipelines.report.sections.build import rewrite_report
         from pipelines.runs.layout import BIND_STAGE, REPORT_FILE
+        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.bind import BindStage
         from pipelines.stages.models import Trainer, TrainOptions
         from pipelines.stages.refine import refine, wants_refinement
         from pipelines.stages.scene import TrainInputs, open_frame
 
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         require_positive("option max-minutes", self.max_minutes, finite=False)
         config = self.config()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)

@@ -70,8 +70,10 @@ class Register:
         from pipelines.commands.progress import shared_progress
         from pipelines.runs.layout import REGISTER_STAGE
         from pipelines.runs.lock import own_run_folder
+        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.register_capture import register_capture
 
+        keep_out_of_capture(self.out, self.capture)
         require_at_least("option seed", self.seed, 0)
         require_at_least("option frame", self.frame, 0)
         inputs = self.inputs()

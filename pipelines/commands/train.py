@@ -112,11 +112,13 @@ class Train:
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
         from avatar.training.refinement.config import RefineConfig
+        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.models import TrainOptions
         from pipelines.stages.refine import wants_refinement
         from pipelines.stages.scene import TrainInputs, open_scene
         from pipelines.stages.train import train, with_batch
 
+        keep_out_of_capture(self.run_folder, self.capture, subject="--run")
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         if not self.max_minutes > 0:
             raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")

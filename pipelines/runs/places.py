@@ -1,9 +1,18 @@
-"""Whether two names are of one file, links or not: captures may link to files that lie elsewhere."""
+"""Whether two names are of one file, links or not, and that a run keeps out of its capture.
+
+Captures may link to files that lie elsewhere.
+"""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+from pipelines.runs.layout import ABLATION, ALL_STAGES
+from smplxpp.core.errors import InputError
+
+RUNS_OF_A_CAPTURE = "runs"
+"""The one folder of a capture in which runs may lie: no reader looks for anything there."""
 
 
 def same_place(one: Path, other: Path) -> bool:
@@ -19,3 +28,37 @@ def lies_in(path: Path, folder: Path) -> bool:
 def absolute(path: Path) -> Path:
     """The absolute path without `..`; links stay as they are."""
     return Path(os.path.abspath(path))
+
+
+def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--out") -> None:
+    """Refuse a folder to write into that would mix what is written with the files of a capture.
+
+    Refused are the capture's own folder, every folder in it but those in its folder `runs`, and a folder of which the
+    capture is a stage, or lies in one.
+
+    Args:
+        out: folder that is going to be written, which need not exist.
+        capture: folder that is read; None: there is none.
+        subject: the option that names `out`.
+
+    Raises:
+        InputError: it is refused.
+    """
+    if capture is None:
+        return
+    for folder, root in ((absolute(out), absolute(capture)), (out.resolve(), capture.resolve())):
+        if folder.is_relative_to(root):
+            inside = folder.relative_to(root).parts
+            mixed = len(inside) < 2 or inside[0] != RUNS_OF_A_CAPTURE
+            received = "the capture's own folder" if not inside else f"{out}, a folder in it"
+        else:
+            stage = root.relative_to(folder).parts[0] if root.is_relative_to(folder) else ""
+            mixed = stage in (*ALL_STAGES, ABLATION)
+            received = f"{out}, in which the capture takes the place of {stage}"
+        if mixed:
+            raise InputError(
+                subject,
+                expected=f"a folder apart from the capture {capture}",
+                received=received,
+                remedy=f"choose another, as {capture / RUNS_OF_A_CAPTURE / 'NAME'} or runs/{root.name}",
+            )
