@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipelines.runs.checks import Check
+from smplxpp.clean import ROUGH
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,22 @@ class Gate:
         return Check(name, value, self.unit, self.warn, self.fail, self.higher_is_better, explanation)
 
 
+ROUGHNESS = Gate("edges", ROUGH, 1.0, higher_is_better=False)
+"""How far a scan's vertices stand off their neighbours: beyond the first bound it is smoothed."""
+UNCOVERED = Gate("", 0.08, 0.2, higher_is_better=False)
+"""Share of the body that a scan neither shows nor covers: up to 0.015 in whole scans, 0.09 without a head, from 0.28 on
+with 40 % of the faces gone."""
+REGION_UNCOVERED = Gate("", 0.2, 0.6, higher_is_better=False)
+"""The same of head, torso, an arm or a leg: up to 0.02 in whole scans, 0.97 of a lost head."""
+ENDS_UNCOVERED = Gate("", 0.5, 0.9, higher_is_better=False)
+"""The same of a hand or a foot, whose soles no scanner sees and whose fingers stick together: up to 0.17 in whole
+scans, 0.8 of a lost hand."""
+UNEXPLAINED = Gate("", 0.03, 0.12, higher_is_better=False)
+"""Share of a scan that its template does not explain: up to 0.006, 0.06 to 0.19 where a label is missing."""
+SKIN_PATCH = Gate("cm2", 100.0, 1000.0, higher_is_better=False)
+"""Area that is labelled skin and stands off the body: up to 20, 435 to 2158 where a label is missing."""
+MIRRORED = Gate("x", 1.3, 2.0, higher_is_better=False)
+"""Distance of a scan to its fit over that of the scan's mirror image: up to 1.02, mirrored 2.8 to 27."""
 SILHOUETTE = Gate("IoU", 0.95, 0.8)
 """The skinned template on the masks."""
 PSNR: Mapping[str, Gate] = {"novel_view": Gate("dB", 18.0, 16.0), "novel_pose": Gate("dB", 17.0, 15.0)}

@@ -8,13 +8,16 @@ import numpy as np
 
 from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.gates import ROUGHNESS
 from pipelines.runs.layout import REGISTERED_PARAMS
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from pipelines.stages.scan_files import read_scan
 from smplxpp.body import load_body, load_params
+from smplxpp.clean import smooth_if_rough
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
+from smplxpp.metrics.distance import MM
 
 GREY = 180
 
@@ -23,12 +26,13 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
     scan = read_scan(build.inputs.scan, units=build.config.units, up=build.config.up)
     raw, clean = scan.raw, scan.clean
+    smoothed = smooth_if_rough(clean.mesh)
     colors = np.full((len(raw.vertices), 3), GREY, np.uint8) if raw.vertex_colors is None else raw.vertex_colors
     save_arrays(
         folder / "scan.npz",
         {
             "scan": {
-                "vertices": clean.mesh.vertices,
+                "vertices": smoothed.mesh.vertices,
                 "faces": clean.mesh.faces,
                 "colors": colors[clean.source_vertex],
                 "source_vertex": clean.source_vertex,
@@ -38,7 +42,11 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     )
     _params_of_frame(build).save(folder / "params.npz")
     numbers = {"vertices": clean.mesh.vertex_count, "faces": clean.mesh.face_count, "repairs": str(clean.report)}
-    return StageOutput(numbers=numbers)
+    numbers |= {"smoothing_steps": smoothed.steps, "smoothing_moved_mm": smoothed.moved * MM}
+    explanation = "how far vertices stand off their neighbours, as a share of the median edge"
+    if smoothed.steps:
+        explanation += f"; smoothed: vertices moved by {smoothed.moved * MM:.1f} mm, what follows is of that surface"
+    return StageOutput([ROUGHNESS.check("roughness of the scan", smoothed.roughness, explanation=explanation)], numbers)
 
 
 def _params_of_frame(build: BuildContext) -> BodyParams:

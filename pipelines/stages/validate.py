@@ -13,6 +13,7 @@ from pipelines.runs.checks import Check
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
+from pipelines.stages.completeness import completeness_checks
 from pipelines.stages.motion import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.clean import loop_lengths
@@ -23,6 +24,7 @@ from smplxpp.core.spread import spread
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import (
     CompareConfig,
+    DirectedDistances,
     directed_distances,
     mesh_quality,
     point_to_surface,
@@ -43,7 +45,9 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     face_labels = load_scan_labels(build.run)
     reference = load_params_of_run(build.run)
     posed = template.mesh.with_vertices(template.pose(reference)[0])
-    checks, numbers = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)
+    checks, numbers, back = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)
+    whole, numbers["completeness"] = completeness_checks(template, reference, scan, face_labels, back)
+    checks += whole
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     flips = _flips(template, posed, build.run)
@@ -75,7 +79,7 @@ def _against_scan(
     scan: TriangleMesh,
     face_labels: np.ndarray,
     config: BuildConfig,
-) -> tuple[list[Check], dict]:
+) -> tuple[list[Check], dict, DirectedDistances]:
     measured = partial(
         directed_distances, samples=config.samples, seed=config.seed, config=CompareConfig(visible_only=True)
     )
@@ -106,7 +110,7 @@ def _against_scan(
         checks.append(
             Check("scan's skin to the template: mean", fit, "mm", 5.0, 15.0, explanation="how well the body was fitted")
         )
-    return checks, {"template_vs_scan": result.as_dict()}
+    return checks, {"template_vs_scan": result.as_dict()}, back
 
 
 def _flips(template: Template, posed: TriangleMesh, run: Path) -> int:

@@ -4,17 +4,20 @@ from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
 from smplxpp.clean.simplify import Simplified, simplify
+from smplxpp.clean.smooth import ROUGH, Smoothed, roughness, smooth_if_rough
 from smplxpp.clean.units import METRES_PER_UNIT, check_human_scale, convert_points
 from smplxpp.clean.webs import WebConfig, cut_webs, find_webs
 
 __all__ = [
     "METRES_PER_UNIT",
+    "ROUGH",
     "CleanReport",
     "CleanedPart",
     "PartReport",
     "PartsConfig",
     "Sanitized",
     "Simplified",
+    "Smoothed",
     "WebConfig",
     "check_human_scale",
     "clean_parts",
@@ -24,6 +27,8 @@ __all__ = [
     "fill_pinholes",
     "find_webs",
     "loop_lengths",
+    "roughness",
     "sanitize",
     "simplify",
+    "smooth_if_rough",
 ]

@@ -1,5 +1,6 @@
 """Every stage measured: distances between surfaces, mesh quality, weights, stretch, penetration. No torch."""
 
+from smplxpp.metrics.completeness import Patch, Uncovered, body_regions, far_patches, uncovered_body
 from smplxpp.metrics.conventions import Convention, presets
 from smplxpp.metrics.distance import (
     CompareConfig,
@@ -12,6 +13,7 @@ from smplxpp.metrics.distance import (
     summarize,
 )
 from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
+from smplxpp.metrics.mirror import mirror_ratio
 from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
 from smplxpp.metrics.quality import MeshQuality, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
@@ -26,18 +28,23 @@ __all__ = [
     "DirectionStats",
     "MeshComparison",
     "MeshQuality",
+    "Patch",
     "PenetrationReport",
     "PoseError",
     "StretchReport",
     "SurfaceSamples",
+    "Uncovered",
     "VariationStats",
     "WeightReport",
+    "body_regions",
     "compare",
     "directed_distances",
     "edge_stretch",
+    "far_patches",
     "flipped_faces",
     "mean_pose_error",
     "mesh_quality",
+    "mirror_ratio",
     "penetration",
     "point_to_surface",
     "pose_error",
@@ -48,5 +55,6 @@ __all__ = [
     "stretch_report",
     "summarize",
     "total_variation",
+    "uncovered_body",
     "weight_report",
 ]

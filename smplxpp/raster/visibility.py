@@ -19,7 +19,8 @@ def view_directions(count: int) -> Float64[np.ndarray, "count 3"]:
     return np.stack([r * np.cos(angle), z, r * np.sin(angle)], axis=1)
 
 
-def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
+def outside_views(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> list[Camera]:
+    """Parallel square views of a whole mesh from directions spread over the sphere."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     radius = 0.5 * float(np.linalg.norm(high - low)) * 1.01
     return [
@@ -31,7 +32,7 @@ def _cameras(mesh: TriangleMesh, views: int, resolution: int) -> list[Camera]:
 def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> Bool[np.ndarray, " M"]:
     """The faces that own a pixel in some of `views` orthographic views from outside."""
     seen = np.zeros(mesh.face_count, dtype=bool)
-    for camera in _cameras(mesh, views, resolution):
+    for camera in outside_views(mesh, views=views, resolution=resolution):
         ids = rasterize_mesh(mesh, camera).face_id
         seen[ids[ids >= 0]] = True
     return seen
@@ -43,7 +44,7 @@ def outer_visible_points(
     """The points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
-    for camera in _cameras(mesh, views, resolution):
+    for camera in outside_views(mesh, views=views, resolution=resolution):
         depth = rasterize_mesh(mesh, camera).depth
         todo = np.flatnonzero(~seen)
         x, y, z = camera.screen_from_world(points[todo]).T[:3]

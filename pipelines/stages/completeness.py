@@ -1,0 +1,115 @@
+"""Whether scan, body and labels are of one whole person: what is missing, what has no label, what is mirrored."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipelines.runs.checks import Check
+from pipelines.runs.gates import ENDS_UNCOVERED, MIRRORED, REGION_UNCOVERED, SKIN_PATCH, UNCOVERED, UNEXPLAINED
+from smplxpp.core.labels import BACKGROUND, SKIN
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.metrics import DirectedDistances, mirror_ratio, point_to_surface
+from smplxpp.metrics.completeness import ENDS, TRUNK_AND_LIMBS, body_regions, far_patches, uncovered_body
+from smplxpp.metrics.distance import MM
+from smplxpp.template.template import Template
+
+EXPLAINED = 15e-3
+"""Metres from the template within which it explains the scan."""
+OFF_BODY = 20e-3
+"""Metres off the body from which skin looks like cloth."""
+_LOOKS_DOWN = -0.5
+_MIRROR_POINTS = 5_000
+_LEAST_SKIN = 0.02
+
+
+def completeness_checks(
+    template: Template,
+    params: BodyParams,
+    scan: TriangleMesh,
+    face_labels: np.ndarray,
+    scan_to_template: DirectedDistances,
+) -> tuple[list[Check], dict[str, Any]]:
+    """The checks of both sides, and their numbers.
+
+    Args:
+        params: of the scan's pose. face_labels: (M,) of the scan.
+        scan_to_template: from the scan's visible points.
+    """
+    figure = template.posed_body(params).frame(0)
+    body = template.body.mesh(figure.vertices)
+    names = np.array(body_regions(template.body.joint_names))
+    region = names[template.body.weights.argmax(axis=1)]
+    bare = np.isin(face_labels, (SKIN.id, BACKGROUND))
+    checks, numbers = _body_side(body, region, scan)
+    unexplained = (scan_to_template.distance > EXPLAINED) & (scan_to_template.samples.normals[:, 1] > _LOOKS_DOWN)
+    share = float(unexplained.mean())
+    checks.append(
+        UNEXPLAINED.check(
+            "share of the scan that the template does not explain",
+            share,
+            explanation=f"visible, not looking down, more than {EXPLAINED * MM:.0f} mm from it; high: a garment "
+            "without its label, a thing beside the person, a wrong fit",
+        )
+    )
+    patches = far_patches(scan, bare, body, far=OFF_BODY)
+    where = ""
+    if patches:
+        face = point_to_surface(np.array([patches[0].center]), body)[2]
+        where = f"at the {region[body.faces[face[0], 0]]}; "
+    largest = patches[0].area * 1e4 if patches else 0.0
+    checks.append(
+        SKIN_PATCH.check(
+            "largest patch labelled skin that stands off the body",
+            largest,
+            explanation=f"{where}by more than {OFF_BODY * MM:.0f} mm; large: it looks like cloth or hair without its "
+            "label, or the fit is off there",
+        )
+    )
+    joints = dict(zip(template.body.joint_names, figure.joints, strict=True))
+    ratio = _mirror_ratio(body, joints["left_hip"], joints["right_hip"], scan, bare)
+    checks.append(
+        MIRRORED.check(
+            "distance of the scan to the fit over that of its mirror image",
+            ratio,
+            explanation="above 1 the mirror image fits better: scan or parameters have left and right exchanged; a "
+            "symmetric pose gives 1 and tells nothing",
+        )
+    )
+    return checks, {**numbers, "scan_unexplained": share, "skin_patches_cm2": [p.area * 1e4 for p in patches[:5]]}
+
+
+def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tuple[list[Check], dict[str, Any]]:
+    uncovered = uncovered_body(body, scan)
+    of_face = region[body.faces[:, 0]]
+    shares = {name: uncovered.mean(of_face == name) for name in (*TRUNK_AND_LIMBS, *ENDS)}
+    checks = [
+        UNCOVERED.check(
+            "share of the body that the scan neither shows nor covers",
+            uncovered.mean(),
+            explanation="of what is seen of the naked body; high: a part of the scan is missing, or it has holes",
+        )
+    ]
+    for title, gate, among in (
+        ("head, torso, arms and legs", REGION_UNCOVERED, TRUNK_AND_LIMBS),
+        ("hands and feet", ENDS_UNCOVERED, ENDS),
+    ):
+        order = sorted(among, key=lambda name: -shares[name])
+        lost = [f"{name} {100 * shares[name]:.0f} %" for name in order if shares[name] > gate.warn] or [
+            f"{order[0]} {100 * shares[order[0]]:.0f} %"
+        ]
+        checks.append(gate.check(f"the same, worst of {title}", shares[order[0]], explanation=", ".join(lost)))
+    return checks, {"body_uncovered": {"all": uncovered.mean(), **shares}}
+
+
+def _mirror_ratio(
+    body: TriangleMesh, left_hip: np.ndarray, right_hip: np.ndarray, scan: TriangleMesh, bare: np.ndarray
+) -> float:
+    """`mirror_ratio` of the scan's skin, of all of it where little skin shows."""
+    chosen = bare if bare.mean() > _LEAST_SKIN else np.ones_like(bare)
+    used = np.unique(scan.faces[chosen])
+    used = used[np.sort(np.random.default_rng(0).permutation(len(used))[:_MIRROR_POINTS])]
+    center, across = 0.5 * (left_hip + right_hip), left_hip - right_hip
+    return mirror_ratio(scan.vertices[used], body, center=center, across=across)

@@ -1,0 +1,51 @@
+"""Whether a scan is the mirror image of the person that the body was fitted to."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.core.mesh import TriangleMesh
+
+_STEPS = 15
+# Farther points are capped: a coat's hem must not outvote the hands.
+_CAP = 0.03
+
+
+def mirror_ratio(
+    points: Float64[np.ndarray, "P 3"],
+    body: TriangleMesh,
+    *,
+    center: Float64[np.ndarray, " 3"],
+    across: Float64[np.ndarray, " 3"],
+) -> float:
+    """The distance of points to a body over that of their mirror image, each moved rigidly to where it fits best.
+
+    Above 1 the mirror image fits better. A person whose pose and shape are symmetric gives 1: no geometry can tell
+    her from her image.
+
+    Args:
+        points: of the scan, skin at best. body: in the scan's pose.
+        center, across: a point of the plane to mirror at, and its normal: the body's middle, from hip to hip.
+    """
+    normal = across / np.linalg.norm(across)
+    image = points - 2.0 * np.outer((points - center) @ normal, normal)
+    tree = igl.AABB()
+    tree.init(body.vertices, body.faces)
+    one, other = (_aligned_distance(each, body, tree) for each in (points, image))
+    return one / max(other, 1e-9)
+
+
+def _aligned_distance(points: np.ndarray, body: TriangleMesh, tree: igl.AABB) -> float:
+    """Mean capped distance after rigid steps towards the closest points (Besl and McKay 1992)."""
+    for _ in range(_STEPS):
+        squared, _, closest = tree.squared_distance(body.vertices, body.faces, points)
+        distance = np.sqrt(squared)
+        used = distance <= max(_CAP, 2.0 * float(np.median(distance)))
+        here, there = points[used].mean(axis=0), closest[used].mean(axis=0)
+        left, _, right = np.linalg.svd((points[used] - here).T @ (closest[used] - there))
+        turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        points = (points - here) @ (left @ turn @ right) + there
+    squared, _, _ = tree.squared_distance(body.vertices, body.faces, np.ascontiguousarray(points))
+    return float(np.minimum(np.sqrt(squared), _CAP).mean())
