@@ -237,6 +237,15 @@ PARTS = (
         build_lines,
     ),
     Part(
+        "nasty_scans",
+        "Builds of scans that are not what they should be",
+        "Variants of the fixture's scan, with exact parameters and the true labels but where the name says otherwise; "
+        "what a build warns of and fails, and what it costs. `nothing` is right for whole scans and for holes that "
+        "scanners leave; it is wrong for shoes that are labelled skin, and for a mirrored scan in a symmetric pose it "
+        "says that geometry cannot tell. Bounds of the checks were chosen on these scans and on whole ones of three "
+        "persons.",
+    ),
+    Part(
         "driving",
         "Driven garments, two captures with known weights",
         "Distance in mm of each driven part from the same part driven by its authored weights; `exact` and `noisy` "
