@@ -268,7 +268,7 @@ def test_a_broken_scan_is_repaired_and_said_so(small):
         (lambda s: {"vertices": s.vertices * np.nan}, "finite"),
         (lambda s: {"faces": s.faces[:0]}, "not the point cloud"),
         (lambda s: {"faces": s.faces + 1}, "1-based"),
-        (lambda s: {"labels": s.labels[:-3]}, "belong to this scan"),
+        (lambda s: {"labels": s.labels[:-3]}, "one a vertex"),
         (lambda s: {"labels": s.labels + 40}, "label set"),
         (lambda s: {"labels": np.ones_like(s.labels)}, "at least one of hair"),
         (lambda s: {"labels": s.labels + 0.5}, "integers"),
