@@ -79,7 +79,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
         _weights_section(run, records["40_transfer"], cameras, by_stage["40_transfer"]),
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
-        _fidelity_section(run, template, posed, scan, colors, cameras, by_stage["65_validate"]),
+        _fidelity_section(records["65_validate"], template, posed, scan, colors, cameras, by_stage["65_validate"]),
         _poses_section(run, template, reference, inputs),
         *(() if poses is None else (refine_section(poses),)),
         *(() if fit is None else (fit_section(fit),)),
@@ -264,7 +264,7 @@ def _template_section(template: Template, checks: tuple[CheckRow, ...]) -> Secti
 
 
 def _fidelity_section(
-    run: Path,
+    record: StageRecord,
     template: Template,
     posed: TriangleMesh,
     scan: TriangleMesh,
@@ -273,7 +273,7 @@ def _fidelity_section(
     checks: tuple[CheckRow, ...],
 ) -> Section:
     distance = point_to_surface(posed.vertices, scan)[0] * MM
-    errors = load_arrays(run / "65_validate" / "errors.npz")
+    errors = load_arrays(record.folder / "errors.npz")
     histograms = []
     for label in LABELS:
         values = errors["template_to_scan"]["distance_mm"][errors["template_to_scan"]["label"] == label.id]
@@ -282,6 +282,9 @@ def _fidelity_section(
             histograms.append(Histogram(f"{label.name}: template to scan", values, gates=gates))
     back = errors["scan_to_template"]
     histograms.append(Histogram("scan to template, all labels", back["distance_mm"]))
+    # Runs from before the check have none.
+    uncovered = record.manifest["numbers"].get("completeness", {}).get("body_uncovered", {})
+    rows = tuple((name, 100.0 * share) for name, share in uncovered.items())
     front = cameras[0]
     heat = [
         render_heat(posed, camera, distance, limits=(0.0, ERROR_LIMIT_MM), unit="mm", bar=camera is cameras[-1])
@@ -304,6 +307,7 @@ def _fidelity_section(
                 Picture("template", encode_jpeg(render_shaded(posed, front, vertex_colors=template.vertex_colors))),
             ),
         ),
+        tables=(Table(("body", "neither shown nor covered, %"), rows, "uncovered"),) if rows else (),
         histograms=tuple(histograms),
         checks=checks,
     )
