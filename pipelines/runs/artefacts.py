@@ -42,7 +42,7 @@ def load_stacked_params(path: Path) -> tuple[tuple[int, ...], BodyParams]:
     arrays = safe_npz(path)
     good = np.isfinite(arrays["global_orient"]).all(axis=1)
     kept = {name: array[good] if name in ARRAY_NAMES else array for name, array in arrays.items()}
-    if len(np.atleast_1d(arrays.get("v_shape", 0))) == len(good):
+    if "v_shape" in arrays and len(np.atleast_1d(arrays["v_shape"])) == len(good):
         kept["v_shape"] = arrays["v_shape"][good]
     return tuple(np.flatnonzero(good).tolist()), BodyParams.from_mapping(kept, source=f"file {path}")
 
