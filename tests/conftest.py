@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from tests import shape_contracts
@@ -16,6 +17,12 @@ shape_contracts.install()  # before anything of the packages is imported
 from tests import remembered  # noqa: E402 - its imports are of the packages
 
 remembered.install()
+
+# A busy machine is no reason to fail.
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any machine")
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"

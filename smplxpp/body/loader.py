@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,7 @@ def load_body(
         InputError: a missing key, a wrong shape, weights that do not sum to 1, more directions asked than there are.
     """
     if path is None:
-        with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as embedded:
-            return load_body(embedded, num_betas=num_betas, num_expressions=num_expressions)
+        return _open_body(num_betas, num_expressions)
     path = Path(path)
     raw = _read(path)
     missing = [key for key in _REQUIRED if key not in raw]
@@ -70,6 +70,13 @@ def load_body(
             remedy="give a model file of SMPL-X, SMPL-H or SMPL, not a file of parameters",
         )
     return _Builder(path, raw).build(num_betas, num_expressions)
+
+
+@lru_cache(maxsize=4)
+def _open_body(num_betas: int | None, num_expressions: int | None) -> BodyModel:
+    """The embedded body; its arrays are read-only, so that whoever asks again may have the same."""
+    with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as embedded:
+        return load_body(embedded, num_betas=num_betas, num_expressions=num_expressions)
 
 
 def _read(path: Path) -> dict[str, Any]:

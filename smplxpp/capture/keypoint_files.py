@@ -24,7 +24,7 @@ from smplxpp.capture.keypoint_people import (
     openpose_people,
 )
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.json_file import as_numbers, read_json
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.safe_pickle import safe_npz
 from smplxpp.core.validation import require_choice
@@ -32,6 +32,7 @@ from smplxpp.core.validation import require_choice
 KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")
 _SUFFIXES = (".npz", ".json")
+_MOST_FRAMES = 1 << 53
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ def _ours(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
         raise InputError(
             f"file {path}: keypoints", expected=f"shape (frames, {len(names)}, 3)", received=f"shape {values.shape}"
         )
-    frames = np.ravel(arrays.get("frames", np.arange(len(values)))).astype(np.int64)
+    frames = _frame_numbers(arrays, len(values), path)
     try:
         return Keypoints2D(names, frames, values[..., :2], values[..., 2])
     except InputError as error:
@@ -260,10 +261,20 @@ def _mediapipe_arrays(
         )
     count = counts.pop()
     normalised = bool(arrays["normalized"]) if "normalized" in arrays else None
-    for row, number in enumerate(np.ravel(arrays.get("frames", np.arange(count))).tolist()):
+    for row, number in enumerate(_frame_numbers(arrays, count, path).tolist()):
         own = {name: values[row] for name, values in have.items()}
         person = mediapipe_person(own, size=options.size, normalised=normalised, source=f"file {path}")
-        yield int(number), [person]
+        yield number, [person]
+
+
+def _frame_numbers(arrays: Mapping[str, Any], count: int, path: Path) -> np.ndarray:
+    """The numbers of the frames in an npz file, 0, 1, ... where it has none."""
+    if "frames" not in arrays:
+        return np.arange(count)
+    numbers = as_numbers(np.ravel(arrays["frames"]), (count,), subject=f"file {path}: frames")
+    if numbers.size and not (np.abs(numbers).max() < _MOST_FRAMES and np.array_equal(numbers, np.rint(numbers))):
+        raise InputError(f"file {path}: frames", expected="whole numbers", received=f"{numbers[:5].tolist()}, ...")
+    return numbers.astype(np.int64)
 
 
 def _last_number(path: Path) -> int:

@@ -73,11 +73,13 @@ def open_capture(
         raise InputError("capture", expected="an existing folder", received=str(path))
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
-    reader = READERS[format or detect_format(root)]
     options = ReaderOptions(
         params=None if params is None else Path(params), protocol=protocol, body=body, person=person
     )
-    recording = reader.read(root, options)
+    try:
+        recording = READERS[format or detect_format(root)].read(root, options)
+    except OSError as error:  # folders that may not be listed, names that are too long for a file
+        raise InputError(f"capture {root}", expected="files that can be listed", received=str(error)[:300]) from None
     if recording.protocol != protocol:
         raise InputError(
             f"protocol {protocol} of capture {root.name}",

@@ -17,6 +17,7 @@ from smplxpp.core.paths import regular_file
 
 # Keypoints of a long film in one file have some hundred megabytes; nothing that we read nests deeper than ten levels.
 _MOST_BYTES, _MOST_LEVELS = 1 << 30, 64
+_MOST_DIGITS = 19  # with its sign
 # Escapes that can stand for no character of a file's name: NUL, and halves of a surrogate pair.
 _DOUBTFUL_ESCAPE = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])")
 
@@ -46,16 +47,16 @@ def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
     """The value of a JSON text.
 
     Raises:
-        InputError: broken JSON, more than 64 levels, integers of thousands of digits, or texts with a NUL or half a
+        InputError: broken JSON, more than 64 levels, integers of more than 18 digits, or texts with a NUL or half a
             character in them, which no file can be called by.
     """
     try:
-        value = json.loads(data)
+        value = json.loads(data, parse_int=_integer)
     except RecursionError:
         raise InputError(
             subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy
         ) from None
-    except ValueError as error:  # broken JSON, broken UTF-8, and integers beyond Python's limit of digits
+    except ValueError as error:  # broken JSON, broken UTF-8, and long integers
         raise InputError(subject, expected="JSON", received=str(error)[:200], remedy=remedy) from None
     if _levels(value) > _MOST_LEVELS:
         raise InputError(subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy)
@@ -149,6 +150,13 @@ def _of_type(value: Any, kind: type, expected: str, subject: str) -> Any:
     if not isinstance(value, kind):
         raise InputError(subject, expected=expected, received=shown(value))
     return value
+
+
+def _integer(digits: str) -> int:
+    """An integer of 64 bits: arrays of longer ones would hold objects, and nothing that we read has any."""
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
 
 
 def _levels(value: Any) -> int:

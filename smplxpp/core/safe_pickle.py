@@ -39,7 +39,7 @@ _BROKEN = (
     RecursionError,
     AssertionError,
 )
-_MOST_BYTES = 1 << 32
+_MOST_BYTES, _PIECE = 1 << 32, 1 << 20
 # Elements of a sparse matrix that is made dense: a regressor of joints has half a million.
 _MOST_DENSE = 100_000_000
 
@@ -130,9 +130,12 @@ def _dense_sparse(value: InertObject, subject: str) -> np.ndarray:
 
 def _load(stream: BinaryIO, subject: str) -> Any:
     # Whole: the machine must not ask a stream for the lengths that a file claims.
-    data = stream.read(_MOST_BYTES + 1)
-    if len(data) > _MOST_BYTES:
-        raise InputError(subject, expected=f"a pickle of at most {_MOST_BYTES} bytes", received="more")
+    pieces: list[bytes] = []
+    while piece := stream.read(_PIECE):
+        pieces.append(piece)
+        if len(pieces) * _PIECE > _MOST_BYTES:
+            raise InputError(subject, expected=f"a pickle of at most {_MOST_BYTES} bytes", received="more")
+    data = b"".join(pieces)
     try:
         return PickleMachine(data).load()
     except RefusedName as error:

@@ -38,6 +38,7 @@ _ORDER = (
     *("left_hand_components", "right_hand_components", "left_hand_mean", "right_hand_mean"),
     *("body_labels", "body_label_names", "body_index", "scan_index", "expression_names", "metadata"),
 )
+_LARGEST_INDEX = 2**31 - 1
 _WEIGHTS = "weights_"
 _BASES = ("shapedirs", "exprdirs", "posedirs")
 
@@ -120,17 +121,24 @@ def weights_from_arrays(arrays: Mapping[str, np.ndarray]) -> SkinWeights:
 
     Raises:
         KeyError: one that is missing.
+        ValueError: indices beyond 32 bits.
     """
     return SkinWeights(
-        joint_indices=arrays[f"{_WEIGHTS}joint_indices"],
+        joint_indices=_int32(arrays[f"{_WEIGHTS}joint_indices"]),
         joint_weights=arrays[f"{_WEIGHTS}joint_weights"],
         joint_count=int(arrays[f"{_WEIGHTS}joint_count"]),
         matched=arrays[f"{_WEIGHTS}matched"],
         distance=arrays[f"{_WEIGHTS}distance"],
         angle=arrays[f"{_WEIGHTS}angle"],
-        component=arrays[f"{_WEIGHTS}component"],
+        component=_int32(arrays[f"{_WEIGHTS}component"]),
         policies=_texts(arrays[f"{_WEIGHTS}policies"]),
     )
+
+
+def _int32(values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind not in "iu" or (values.size and np.abs(values.astype(np.float64)).max() > _LARGEST_INDEX):
+        raise ValueError(f"indices of type {values.dtype}")
+    return values.astype(np.int32, copy=False)
 
 
 def in_file_order(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

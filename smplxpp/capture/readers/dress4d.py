@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.meshes import MeshFiles
 from smplxpp.capture.params import ParamFiles
@@ -15,6 +13,7 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_numbers
 from smplxpp.core.safe_pickle import safe_load
 
 NAME = "4ddress"
@@ -70,7 +69,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 def _camera(name: str, entry: Mapping, path: Path, images: Mapping[str, FileSeries]) -> Camera:
     source = f"file {path}: camera {name}"
     K = required(entry, "intrinsics", source=source)
-    extrinsics = np.asarray(required(entry, "extrinsics", source=source), dtype=np.float64)
+    extrinsics = as_numbers(required(entry, "extrinsics", source=source), subject=f"{source}: extrinsics")
     if extrinsics.shape not in ((3, 4), (4, 4)):
         raise InputError(source, expected="extrinsics of shape (3, 4)", received=f"shape {extrinsics.shape}")
     return pinhole(name, K, extrinsics[:3, :3], extrinsics[:3, 3], size_of_first_image(name, images))

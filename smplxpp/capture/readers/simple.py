@@ -70,7 +70,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     description = read_description(root)
     try:
         return _described(root, lenses, description, options)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

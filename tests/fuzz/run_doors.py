@@ -1,0 +1,135 @@
+"""The doors of a run: templates, body models, networks, Gaussians, and what stages say of themselves."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from avatar.evaluation.report import EvalReport, ModelFigures
+from avatar.export.splats import read_splat_ply, write_splat_ply
+from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.rig.rig import Rig
+from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.metrics_log import read_metrics
+from pipelines.commands.inspect import summarise_run
+from pipelines.runs.arrays import load_arrays, save_arrays
+from pipelines.runs.checks import Check
+from pipelines.runs.layout import BUILD_STAGES
+from pipelines.runs.stage import StageOutput, run_stage
+from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
+from pipelines.stages.register_config import RegisterInputs, load_register, save_register
+from smplxpp.body import load_body
+from smplxpp.template import Template
+from tests.avatar_export.test_splats import random_splats
+from tests.dolls.dancing import gaussians, template
+from tests.fuzz.examine import Door
+from tests.models.test_model_file import make
+from tests.pipelines.test_evaluation_gates import surfaces, view
+from tests.runs.stages import stage_of
+
+_VERTICES, _JOINTS = 60, 24
+
+
+def _write_body(path: Path) -> None:
+    """A body in SMPL's layout with few vertices."""
+    rng = np.random.default_rng(0)
+    weights, regressor = rng.random((_VERTICES, _JOINTS)), rng.random((_JOINTS, _VERTICES))
+    parents = np.maximum(np.arange(_JOINTS) - 1, 0)
+    parents[0] = 2**32 - 1
+    np.savez(
+        path,
+        v_template=rng.random((_VERTICES, 3)),
+        f=rng.integers(0, _VERTICES, (100, 3)),
+        shapedirs=rng.random((_VERTICES, 3, 10)) * 0.01,
+        posedirs=rng.random((_VERTICES, 3, 9 * (_JOINTS - 1))) * 0.01,
+        weights=weights / weights.sum(axis=1, keepdims=True),
+        J_regressor=regressor / regressor.sum(axis=1, keepdims=True),
+        kintree_table=np.stack([parents, np.arange(_JOINTS)]),
+    )
+
+
+def _report() -> EvalReport:
+    models = {"student": ModelFigures({"novel_view": {"Cam0_0": view(25.0)}}, surfaces(2.0))}
+    return EvalReport("doll", None, models, skinning_alone=surfaces(1.0))
+
+
+@cache
+def _rig() -> Rig:
+    return Rig(template())
+
+
+def _checkpoint(path: Path) -> None:
+    tensors = {name: value.detach() for name, value in make("student", _rig()).state_dict().items()}
+    save_checkpoint(path, Checkpoint(7, 1.5, "key", tensors))
+
+
+def _write_run(run: Path) -> None:
+    def work(folder: Path) -> StageOutput:
+        (folder / "data.bin").write_bytes(bytes(100))
+        return StageOutput(checks=[Check("mean error", 0.5, "mm", 1, 2)])
+
+    for name in BUILD_STAGES[:3]:
+        run_stage(run, stage_of(name), work)
+    (run / "metrics.json").write_text(json.dumps({"schema": 1, "subject": "Dancer", "checks": []}))
+    inputs = BuildInputs(scan=run / "scan.ply", params=run / "params.npz", subject="Dancer")
+    save_build(run, inputs, BuildConfig())
+    save_register(run, RegisterInputs(capture=run))
+
+
+def _open_run(run: Path) -> None:
+    summarise_run(run)
+    load_build(run)
+    load_register(run)
+
+
+def _model_door(kind: str, *, compact: bool = False) -> Door:
+    return Door(
+        f"model {kind}{' compact' if compact else ''}",
+        lambda folder: save_avatar(folder / "m.safetensors", make(kind, _rig()), compact=compact),
+        lambda folder: load_avatar(folder / "m.safetensors", _rig()),
+    )
+
+
+def run_doors() -> list[Door]:
+    """Doors that `avatar` and `pipelines` have."""
+    lines = [{"iteration": k, "loss": 1.0 / (k + 1), "psnr": 20.0 + k} for k in range(6)]
+    groups = {"scan": {"vertices": np.zeros((3, 3)), "faces": np.array([[0, 1, 2]])}, "hair": {"label": np.arange(3)}}
+    return [
+        Door("body npz", lambda folder: _write_body(folder / "b.npz"), lambda folder: load_body(folder / "b.npz")),
+        Door("template", lambda folder: template().save(folder / "t.npz"), lambda f: Template.load(f / "t.npz")),
+        *(_model_door(kind) for kind in ("teacher", "tracked", "student", "shapes")),
+        _model_door("shapes", compact=True),
+        Door(
+            "gaussians",
+            lambda folder: save_bound(gaussians(60), folder / "g.safetensors"),
+            lambda folder: load_bound(folder / "g.safetensors", faces=template().faces),
+        ),
+        Door(
+            "checkpoint",
+            lambda folder: _checkpoint(folder / "c.safetensors"),
+            lambda folder: load_checkpoint(folder / "c.safetensors", key="key"),
+            refuses=False,
+        ),
+        Door(
+            "metrics log",
+            lambda folder: (folder / "m.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n"),
+            lambda folder: read_metrics(folder / "m.jsonl"),
+            refuses=False,
+        ),
+        Door(
+            "evaluation",
+            lambda folder: _report().save(folder / "m.json"),
+            lambda folder: EvalReport.load(folder / "m.json"),
+        ),
+        Door("stage arrays", lambda f: save_arrays(f / "a.npz", groups), lambda f: load_arrays(f / "a.npz")),
+        Door("run", _write_run, _open_run, ("**/*.json",), refuses=False),
+        Door(
+            "splats",
+            lambda folder: write_splat_ply(folder / "s.ply", random_splats()),
+            lambda folder: read_splat_ply(folder / "s.ply"),
+        ),
+    ]
