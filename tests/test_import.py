@@ -245,6 +245,35 @@ def test_files_are_opened_by_their_doors():
     assert {call: files - DOORS[call] for call, files in found.items() if files - DOORS[call]} == {}
 
 
+# What reads a file whole or opens it -> where it may stand: files of others go through `smplxpp.core.paths`, which
+# refuses pipes and devices and bounds the size.
+READS: dict[str, set[str]] = {
+    "read_bytes": {"smplxpp/core/paths.py", "pipelines/stages/build_config.py"},
+    "read_text": {  # the system's, and our own sources
+        *("smplxpp/native/__init__.py", "avatar/render/list_limit.py"),
+        *("pipelines/report/builder.py", "pipelines/runs/code.py"),
+    },
+    "open": {
+        *("smplxpp/core/array_file.py", "smplxpp/core/safe_pickle.py", "smplxpp/core/image_file.py"),
+        *("smplxpp/capture/readers/colmap_model.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/digests.py"),
+        *("smplxpp/capture/writers/arrays.py", "smplxpp/core/params.py", "avatar/export/splats.py"),  # written
+        *("avatar/training/engine/metrics_log.py", "pipelines/runs/lock.py", "pipelines/commands/terminal.py"),
+    },
+}
+
+
+def test_files_are_read_where_pipes_and_sizes_are_looked_at():
+    found: dict[str, set[str]] = {name: set() for name in READS}
+    for package in PACKAGES:
+        for path in sources(package):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call):
+                    name = ast.unparse(node.func).split(".")[-1]
+                    if name in READS and (isinstance(node.func, ast.Attribute) or name == "open"):
+                        found[name].add(path.relative_to(ROOT).as_posix())
+    assert {name: files - READS[name] for name, files in found.items() if files - READS[name]} == {}
+
+
 def test_plain_pickle_is_never_loaded():
     unpickles = {"pickle.load", "pickle.loads", "pickle.Unpickler"}
     for package in PACKAGES:

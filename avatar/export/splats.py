@@ -17,6 +17,7 @@ from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import C0, rotate_sh
 from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
+from smplxpp.core.paths import read_bytes
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _DC = tuple(f"f_dc_{k}" for k in range(3))
@@ -145,9 +146,7 @@ def read_splat_ply(path: str | Path) -> Splats:
     """
     path = Path(path)
     subject = f"splats {path}"
-    if not path.is_file():
-        raise InputError(subject, expected="an existing file", received="none")
-    data = path.read_bytes()
+    data = read_bytes(path, subject="splats")
     layout = read_ply_layout(data, subject)
     names = layout.dtype.names or ()
     rest = [name for name in names if name.startswith("f_rest_")]

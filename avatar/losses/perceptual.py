@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.paths import regular_file
 from smplxpp.core.validation import require_choice
 
 log = logging.getLogger(__name__)
@@ -184,6 +185,7 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
                 "stlpips-pytorch", command="pip install --no-deps stlpips-pytorch", purpose="ST-LPIPS"
             )
         weights = Path(found.submodule_search_locations[0]) / WEIGHT_FILE
+    weights = regular_file(weights)
     try:
         stored = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:

@@ -27,6 +27,7 @@ from smplxpp.core.json_file import as_object, read_json
 from smplxpp.core.json_values import jsonable
 from smplxpp.core.mesh_io import write_ply
 from smplxpp.core.params import BodyParams
+from smplxpp.core.paths import read_bytes
 from smplxpp.core.validation import require_between, require_choice, require_positive
 
 Progress = Callable[[int, int], None]
@@ -244,11 +245,11 @@ def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
     """Write true surfaces, and the scans that a template is built from."""
     meshes = capture.recording.meshes
     if isinstance(meshes, PosedTopology):
-        atomic_write_bytes(out / "geometry" / "topology.npz", meshes.topology.read_bytes())
+        atomic_write_bytes(out / "geometry" / "topology.npz", read_bytes(meshes.topology))
         for frame in frames:
             path = meshes.files.path(frame)
             if path is not None:
-                atomic_write_bytes(out / "geometry" / f"frame_{frame:06d}.npz", path.read_bytes())
+                atomic_write_bytes(out / "geometry" / f"frame_{frame:06d}.npz", read_bytes(path))
     elif meshes is not None:
         for frame in frames:
             mesh = meshes.read(frame)
@@ -258,4 +259,4 @@ def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
     if capture.format == "simple":
         for frame in frames:
             for path in sorted((capture.root / "scans").glob(f"scan_{frame:06d}*")):
-                atomic_write_bytes(out / "scans" / path.name, path.read_bytes())
+                atomic_write_bytes(out / "scans" / path.name, read_bytes(path))

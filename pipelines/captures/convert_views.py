@@ -14,6 +14,7 @@ from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_
 from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
 from smplxpp.core.image_file import image_mode
+from smplxpp.core.paths import read_bytes
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 
@@ -55,7 +56,7 @@ class ViewWriter:
             for kind, (path, source) in targets.items():
                 value = read[kind](camera, frame)  # decoded in any case: a damaged file is not passed on
                 if source is not None:
-                    contents[path] = _bytes_of(source)
+                    contents[path] = read_bytes(source)
                     copied += 1
                 else:
                     assert value is not None  # only files that are there have a target
@@ -108,18 +109,6 @@ class ViewWriter:
     def _normals(self, camera: str, frame: int) -> UInt16[np.ndarray, "H W 3"] | None:
         normals = self.capture.normals(camera, frame)
         return None if normals is None else normal_codes(normals)
-
-
-def _bytes_of(source: Path) -> bytes:
-    """Read a file of the capture; what the system refuses spoils its view alone.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    try:
-        return source.read_bytes()
-    except OSError as error:
-        raise InputError(f"file {source}", expected="a file that can be read", received=str(error.strerror)) from None
 
 
 def _is_plain_mask(path: Path | None) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,11 @@ from pathlib import Path
 from smplxpp.core.errors import InputError
 
 LOCK_NAME = ".lock"
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file; a pipe that nobody reads is an error, not something to wait for."""
+    return os.open(path, flags | os.O_NONBLOCK, 0o666)
 
 
 @contextmanager
@@ -27,7 +33,7 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
-        lock = open(run / LOCK_NAME, "w")
+        lock = open(run / LOCK_NAME, "w", opener=_at_once)
     except OSError as error:
         raise InputError(
             f"run folder {run}",

@@ -110,7 +110,7 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
 
     content = {"inputs": plain(asdict(inputs)), "config": asdict(config)}
     text, path = json.dumps(content, indent=1) + "\n", run / BUILD_FILE
-    if not path.is_file() or path.read_text() != text:
+    if not path.is_file() or path.read_bytes() != text.encode():
         atomic_write_text(path, text)
 
 

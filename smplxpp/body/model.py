@@ -131,6 +131,8 @@ class BodyModel:
                 raise self._unfit(name, f"shape {shape}", f"shape {value.shape}")
         if len(self.joint_names) != J:
             raise self._unfit("joint_names", f"{J} names", f"{len(self.joint_names)}")
+        if not (J and self.parents[0] == -1 and all(0 <= p < j for j, p in enumerate(self.parents.tolist()) if j)):
+            raise self._unfit("parents", "one root first (-1), every parent before its children", "others")
         labels, names = self.part_labels, len(self.part_label_names)
         if labels.size and (labels.min() < 0 or labels.max() >= names):
             raise self._unfit("part_labels", f"indices in [0, {names})", "others")

@@ -14,7 +14,7 @@ from smplxpp.capture.readers.common import inverted, pinhole, required
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import as_integer, as_list, as_numbers, as_text, read_json
-from smplxpp.core.paths import regular_file
+from smplxpp.core.paths import read_text, regular_file
 from smplxpp.core.rotations import matrix_from_rotvec
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
@@ -79,7 +79,7 @@ def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
 def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
     lenses: list[tuple[Camera, Distortion | None]] = []
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+        rows = list(csv.DictReader(io.StringIO(read_text(path, subject="camera file"))))
         names = [row[_CSV_FIELDS[0]] or "" for row in rows]
         numbers = [{key: float(row[key]) for key in _CSV_FIELDS[1:]} for row in rows]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:

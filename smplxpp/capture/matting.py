@@ -13,9 +13,12 @@ from jaxtyping import UInt8
 from smplxpp.capture.capture import Capture
 from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.paths import regular_file
 
 # Side of the square that models of free input size are fed with.
 _DEFAULT_SIDE = 1024
+_LONGEST_SIDE = 8192
+_FLOATS: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 @dataclass(frozen=True)
@@ -49,9 +52,7 @@ class MattingModel:
             import onnxruntime
         except ImportError:
             raise MissingExtraError("onnxruntime", extra="matting", purpose="matting with an ONNX model") from None
-        path = Path(path)
-        if not path.is_file():
-            raise InputError("matting model", expected="an existing ONNX file", received=str(path))
+        path = regular_file(path, subject="matting model", remedy="name an existing ONNX file")
         self.config = config or MattingConfig()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.config.threads
@@ -59,17 +60,27 @@ class MattingModel:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
             raise InputError(f"matting model {path}", expected="an ONNX model", received=f"{error}") from None
-        entry = self._session.get_inputs()[0]
-        if len(self._session.get_inputs()) != 1 or len(entry.shape) != 4 or entry.shape[1] not in (3, "C", None):
+        self._subject = f"matting model {path}"
+        entries = self._session.get_inputs()
+        sizes = [self._size_of(entry) for entry in entries]
+        if len(sizes) != 1 or sizes[0] is None:
             raise InputError(
-                f"matting model {path}",
-                expected="one input of shape (1, 3, H, W)",
-                received=f"{[(i.name, i.shape) for i in self._session.get_inputs()]}",
+                self._subject,
+                expected=f"one input of floats of shape (1, 3, H, W), sides of at most {_LONGEST_SIDE}",
+                received=f"{[(one.name, one.type, one.shape) for one in entries]}"[:400],
             )
-        self._name = entry.name
-        self._dtype = np.float16 if "float16" in entry.type else np.float32
-        height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in entry.shape[2:])
-        self._size = (width, height)
+        self._name, self._dtype, self._size = entries[0].name, _FLOATS[entries[0].type], sizes[0]
+
+    @staticmethod
+    def _size_of(entry: Any) -> tuple[int, int] | None:
+        """Width and height that an input asks for; None where it is no image of floats. Sides that are no numbers are
+        free."""
+        if entry.type not in _FLOATS or len(entry.shape) != 4:
+            return None
+        batch, channels, *sides = entry.shape
+        height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in sides)
+        wanted = (not isinstance(batch, int) or batch == 1) and (not isinstance(channels, int) or channels == 3)
+        return (width, height) if wanted and min(height, width) > 0 and max(height, width) <= _LONGEST_SIDE else None
 
     def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
         """Return the opacity of the person in an sRGB image."""
@@ -80,18 +91,22 @@ class MattingModel:
         tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
             2, 0, 1
         )[None]
-        outputs = self._session.run(None, {self._name: tensor.astype(self._dtype)})
+        try:
+            outputs = self._session.run(None, {self._name: tensor.astype(self._dtype)})
+        except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for whatever a model cannot do
+            raise InputError(self._subject, expected="a model that runs", received=f"{error}"[:400]) from None
         matte = self._opacity(outputs)
         back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
         return np.clip(np.asarray(back) * 255.0 + 0.5, 0, 255).astype(np.uint8)
 
     def _opacity(self, outputs: list[Any]) -> np.ndarray:
-        mattes = [np.asarray(o, dtype=np.float32) for o in outputs if np.ndim(o) >= 2 and np.size(o) == self._pixels]
-        if not mattes:
+        arrays = [o for o in outputs if isinstance(o, np.ndarray) and o.dtype.kind in "fiub"]
+        mattes = [o.astype(np.float32) for o in arrays if o.ndim >= 2 and o.size == self._pixels]
+        if not mattes or not np.isfinite(mattes[0]).all():
             raise InputError(
-                "matting model",
-                expected=f"an output of {self._size[1]} x {self._size[0]} values",
-                received=f"shapes {[np.shape(o) for o in outputs]}",
+                self._subject,
+                expected=f"an output of {self._size[1]} x {self._size[0]} finite values",
+                received=f"NaN or infinity in {mattes[0].size}" if mattes else f"shapes {[o.shape for o in arrays]}",
             )
         matte = mattes[0].reshape(self._size[1], self._size[0])
         inside = matte.min() >= -1e-3 and matte.max() <= 1.0 + 1e-3

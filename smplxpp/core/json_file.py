@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.paths import read_bytes
 
 # Keypoints of a long film in one file have some hundred megabytes; nothing that we read nests deeper than ten levels.
 _MOST_BYTES, _MOST_LEVELS = 1 << 30, 64
@@ -28,18 +28,7 @@ def read_json(path: str | Path, *, subject: str = "file", remedy: str = "") -> A
     Raises:
         InputError: missing, no regular file, too large, or what `parse_json` refuses.
     """
-    path = regular_file(path, subject=subject, remedy=remedy)
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= _MOST_BYTES else b""
-    except OSError as error:
-        raise InputError(
-            f"{subject} {path}", expected="a readable file", received=error.strerror or str(error), remedy=remedy
-        ) from None
-    if size > _MOST_BYTES:
-        raise InputError(
-            f"{subject} {path}", expected=f"at most {_MOST_BYTES} bytes", received=f"{size}", remedy=remedy
-        )
+    data = read_bytes(path, subject=subject, most=_MOST_BYTES, remedy=remedy)
     return parse_json(data, subject=f"{subject} {path}", remedy=remedy)
 
 

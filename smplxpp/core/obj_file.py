@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.number_text import IS_SPACE, as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.obj_material import Material, read_materials
-from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices, warn
+from smplxpp.core.paths import read_bytes
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices, warn
 from smplxpp.core.texture import LOST, Pictures, sample_texture
 
 # Lines that are numbers are read together up to this many bytes, so that the work space stays small.

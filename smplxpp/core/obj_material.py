@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from smplxpp.core.raw_mesh import read_bytes, warn
+from smplxpp.core.paths import read_bytes
+from smplxpp.core.raw_mesh import warn
 from smplxpp.core.texture import beside
 
 # How many numbers follow an option of a picture's name.
@@ -44,7 +45,7 @@ def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
                 warn(f"mesh file {path}: colours of its materials are lost: {name[:200]!r} is not in its folder")
             elif found not in seen:
                 seen.add(found)
-                data = read_bytes(found, subject="material file", limit=_MOST_BYTES)
+                data = read_bytes(found, subject="material file", most=_MOST_BYTES)
                 out |= _parse(data.decode("utf-8", "replace"))
     return out
 

@@ -33,6 +33,37 @@ def regular_file(path: str | Path, *, subject: str = "file", remedy: str = "") -
     return path
 
 
+def read_bytes(path: str | Path, *, subject: str = "file", most: int = 1 << 33, remedy: str = "") -> bytes:
+    """The bytes of a regular file of at most `most` bytes.
+
+    Raises:
+        InputError: missing, no regular file, unreadable or larger.
+    """
+    path = regular_file(path, subject=subject, remedy=remedy)
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= most else b""
+    except OSError as error:
+        received = error.strerror or str(error)
+        raise InputError(f"{subject} {path}", expected="a readable file", received=received, remedy=remedy) from None
+    if size > most:
+        raise InputError(f"{subject} {path}", expected=f"at most {most} bytes", received=f"{size}", remedy=remedy)
+    return data
+
+
+def read_text(path: str | Path, *, subject: str = "file", most: int = 1 << 30, remedy: str = "") -> str:
+    """The text of a regular file of at most `most` bytes, UTF-8 with or without a byte order mark.
+
+    Raises:
+        InputError: what `read_bytes` refuses, and bytes that are no text.
+    """
+    data = read_bytes(path, subject=subject, most=most, remedy=remedy)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{subject} {path}", expected="text in UTF-8", received=str(error), remedy=remedy) from None
+
+
 def path_inside(root: str | Path, name: str, *, base: str | Path | None = None, subject: str = "file name") -> Path:
     """The file that a file of `root` names, relative to `base` (a folder of `root`; None: `root` itself).
 

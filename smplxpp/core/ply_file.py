@@ -10,8 +10,9 @@ from jaxtyping import Float64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.number_text import as_bytes, count_between, parse_numbers, word_starts
+from smplxpp.core.paths import read_bytes
 from smplxpp.core.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
-from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
 from smplxpp.core.texture import LOST, Pictures, sample_texture
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64, Integer, Num, UInt8
 
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.paths import regular_file
 
 # float64 still tells tenths of a millimetre at this distance, and no sum of squares overflows even in float32.
 LARGEST_COORDINATE = 1e12
@@ -131,25 +129,6 @@ def color_bytes(colors: Num[np.ndarray, "N C"], *, subject: str) -> UInt8[np.nda
     if rgb.dtype.kind == "f":
         rgb = rgb * (255.0 if rgb.size and rgb.max() <= 1.0 else 1.0) + 0.5
     return np.clip(rgb, 0, 255).astype(np.uint8)
-
-
-def read_bytes(path: str | Path, *, subject: str, limit: int = 1 << 33) -> bytes:
-    """The bytes of a regular file of at most `limit` bytes.
-
-    Raises:
-        InputError: missing, no regular file, unreadable or larger.
-    """
-    path = regular_file(path, subject=subject)
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= limit else b""
-    except OSError as error:
-        raise InputError(
-            f"{subject} {path}", expected="a readable file", received=error.strerror or str(error)
-        ) from None
-    if size > limit:
-        raise InputError(f"{subject} {path}", expected=f"at most {limit} bytes", received=f"{size}")
-    return data
 
 
 def warn(message: str) -> None:

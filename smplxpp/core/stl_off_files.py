@@ -13,7 +13,8 @@ from jaxtyping import Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.number_text import as_bytes, count_between, parse_numbers, word_starts
-from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, read_bytes, require_indices
+from smplxpp.core.paths import read_bytes
+from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84

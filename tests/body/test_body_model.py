@@ -192,3 +192,14 @@ def test_posed_open_body_is_the_capture_s_body(captures, open_body, capture, ste
                 truth = file["verts"][: body.vertex_count]
             posed = body.forward(params.frame(index)).frame(0).vertices
             assert 1e3 * np.abs(posed - truth).max() < millimetres
+
+
+@pytest.mark.parametrize("wrong", ["circle", "late", "two roots", "beyond", "none first"])
+def test_a_skeleton_that_is_no_tree_in_order_is_refused(open_body, wrong):
+    parents = open_body.parents.copy()
+    child = int(np.flatnonzero(parents == 3)[0])
+    changes = {"circle": (3, child), "late": (2, 5), "two roots": (4, -1), "beyond": (4, 1000), "none first": (0, 0)}
+    joint, parent = changes[wrong]
+    parents[joint] = parent
+    with pytest.raises(InputError, match="parents"):
+        replace(open_body, parents=parents)

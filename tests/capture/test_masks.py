@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -163,6 +164,70 @@ def test_what_is_no_matting_model_is_refused(tmp_path):
     (tmp_path / "broken.onnx").write_bytes(b"no")
     with pytest.raises(InputError, match=r"broken\.onnx"):
         MattingModel(tmp_path / "broken.onnx")
+    os.mkfifo(tmp_path / "pipe.onnx")
+    with pytest.raises(InputError, match="regular file"):
+        MattingModel(tmp_path / "pipe.onnx")
+
+
+def small_model(path, nodes, *, kind="FLOAT", shape=(1, 3, 8, 8), inputs=1):
+    """A model of ready nodes between `image` (or `image0`, `image1`) and `matte`."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper
+
+    names = [f"image{k}" for k in range(inputs)] if inputs != 1 else ["image"]
+    graph = helper.make_graph(
+        [helper.make_node(*node[:3], **node[3]) for node in nodes],
+        "foreign",
+        [helper.make_tensor_value_info(name, getattr(TensorProto, kind), shape) for name in names],
+        [helper.make_tensor_value_info("matte", getattr(TensorProto, kind), None)],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"kind": "DOUBLE"},
+        {"shape": (1, 3, 8)},
+        {"shape": (1, 4, 8, 8)},
+        {"shape": (4, 3, 8, 8)},
+        {"shape": (1, 3, 1 << 30, 1 << 30)},
+        {"shape": (1, 3, 0, 8)},
+    ],
+)
+def test_models_for_something_else_are_refused_when_they_are_opened(tmp_path, options):
+    pytest.importorskip("onnxruntime")
+    from smplxpp.capture.matting import MattingModel
+
+    small_model(tmp_path / "other.onnx", [("Identity", ["image"], ["matte"], {})], **options)
+    with pytest.raises(InputError, match=r"other\.onnx"):
+        MattingModel(tmp_path / "other.onnx")
+
+
+@pytest.mark.parametrize(
+    ("operation", "words"),
+    [("Identity", "64|8 x 8"), ("Log", "finite"), ("Reshape", "that runs")],
+)
+def test_models_that_give_no_matte_are_refused_when_they_run(tmp_path, operation, words):
+    pytest.importorskip("onnxruntime")
+    from smplxpp.capture.matting import MattingConfig, MattingModel
+
+    reduced = ("ReduceMean", ["image"], ["mean"], {"keepdims": 0})
+    nodes = {
+        "Identity": [("Identity", ["image"], ["matte"], {})],
+        "Log": [("Split", ["image"], ["r", "g", "b"], {"axis": 1, "num_outputs": 3}), ("Log", ["r"], ["matte"], {})],
+        "Reshape": [
+            reduced,
+            ("Cast", ["mean"], ["whole"], {"to": 7}),
+            ("Shape", ["image"], ["shape"], {}),
+            ("Add", ["shape", "whole"], ["wrong"], {}),
+            ("Reshape", ["image", "wrong"], ["matte"], {}),
+        ],
+    }[operation]
+    small_model(tmp_path / "foreign.onnx", nodes)
+    with pytest.raises(InputError, match=words) as error:
+        MattingModel(tmp_path / "foreign.onnx", MattingConfig(mean=(2.0, 2.0, 2.0)))(np.zeros((20, 10, 3), np.uint8))
+    assert "foreign.onnx" in str(error.value)
 
 
 def test_matting_without_onnxruntime_names_the_extra(tmp_path):

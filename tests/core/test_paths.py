@@ -3,7 +3,7 @@ import os
 import pytest
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import check_name, path_inside, regular_file
+from smplxpp.core.paths import check_name, path_inside, read_bytes, read_text, regular_file
 
 
 def test_a_pipe_a_device_and_a_folder_are_no_files(tmp_path):
@@ -47,3 +47,16 @@ def test_names_that_no_file_can_have_are_refused(name):
     with pytest.raises(InputError, match="name"):
         check_name(name, subject="camera")
     assert check_name("Cam 01-é", subject="camera") == "Cam 01-é"
+
+
+def test_what_is_read_whole_is_regular_and_bounded(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_bytes(b"\xef\xbb\xbfwords")
+    assert read_text(file) == "words" and read_bytes(file, most=8).endswith(b"words")
+    with pytest.raises(InputError, match="at most 7 bytes"):
+        read_bytes(file, subject="list", most=7)
+    file.write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_text(file)
+    with pytest.raises(InputError, match="regular file"):
+        read_text("/dev/zero")

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
 
 from pipelines.runs.checks import Check
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.lock import LOCK_NAME, own_run_folder
 from pipelines.runs.stage import StageOutput, decide, differences, read_manifest, require_stage, run_stage, standing
 from smplxpp.core.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.errors import InputError
@@ -195,3 +198,12 @@ def test_what_a_finished_training_is_replaced_for_is_told(tmp_path, caplog):
     assert "replaces" not in caplog.text
     Training(tmp_path, config={"lr": 0.2})()
     assert "replaces one made otherwise: config lr was 0.1, is 0.2" in caplog.text
+
+
+def test_pipes_are_neither_digested_nor_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="regular file"):
+        sha256_file(tmp_path / "pipe")
+    os.mkfifo(tmp_path / LOCK_NAME)
+    with pytest.raises(InputError, match="can be written"), own_run_folder(tmp_path, ()):
+        pass

@@ -12,8 +12,11 @@ from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.json_file import as_integer, as_object, as_text, parse_json
 from smplxpp.core.json_values import jsonable
+from smplxpp.core.paths import read_bytes
 
 log = logging.getLogger(__name__)
+# A million steps have some hundred megabytes.
+_MOST_BYTES = 1 << 30
 
 
 def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
@@ -25,11 +28,14 @@ def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
     """Return all entries: objects with a kind and an iteration. A last line that a kill cut short is left out.
 
-    Lines that are something else are left out too, with a warning in the log.
+    Lines that are something else are left out too, and a file that is no log, with a warning in the log.
     """
+    if not Path(path).exists():
+        return []
     try:
-        lines = Path(path).read_bytes().split(b"\n")
-    except OSError:
+        lines = read_bytes(path, subject="log", most=_MOST_BYTES).split(b"\n")
+    except InputError as error:
+        log.warning("%s", error)
         return []
     read = [_entry(line) for line in lines]
     foreign = [number for number, entry in enumerate(read[:-1], start=1) if entry is None and lines[number - 1].strip()]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.paths import read_text
 
 _KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
 
@@ -18,10 +19,7 @@ def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | s
     Raises:
         InputError: missing, not text, or a matrix whose numbers do not fit its size.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"file {path}", expected="a readable YAML file", received=str(error)) from None
+    lines = read_text(path).splitlines()
     blocks: dict[str, list[str]] = {}
     current: list[str] | None = None
     for line in lines:

@@ -6,6 +6,7 @@ import errno
 import itertools
 import json
 import math
+import os
 import sys
 from pathlib import Path
 
@@ -233,6 +234,13 @@ def test_lines_of_another_kind_are_left_out_and_told(tmp_path, caplog):
     assert f"{len(foreign)} lines" in caplog.text and "first is 2" in caplog.text
     truncate_metrics(path, 0)
     assert path.read_text().count("\n") == 1
+
+
+def test_a_log_that_is_no_file_is_told_and_empty(tmp_path, caplog):
+    os.mkfifo(tmp_path / "metrics.jsonl")
+    for path in (tmp_path / "metrics.jsonl", "/dev/zero", tmp_path):
+        caplog.clear()
+        assert read_metrics(path) == [] and "regular file" in caplog.text
 
 
 def test_a_training_that_stopped_before_its_first_step_logs_the_start_once(tmp_path):
