@@ -19,10 +19,11 @@ from pipelines.figures import encode_png
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.layout import ABLATION
 from pipelines.runs.lock import own_run_folder
-from pipelines.runs.stage import Stage, StageOutput, StageRecord, decide, run_stage
+from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.evaluate import surface_digest
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.json_file import as_integer, as_number
 
 ROWS_FOLDER = f"{ABLATION}/rows"
 PLAYER_FILE, REPORT_FILE, PICTURES = "player.safetensors", "report.json", "pictures"
@@ -132,13 +133,14 @@ def measure_row(
 
 
 def _result(trainer: Trainer, row: Row, model: ModelStage, record: StageRecord) -> RowResult:
-    numbers = []
+    seconds, iterations = 0.0, 0
     for stage in closure(model):
         found = trainer.found(stage)
         assert found is not None
-        numbers.append(found.manifest["numbers"])
-    seconds = sum(one.get(name, 0.0) for one in numbers for name in TIMED)
-    iterations = sum(one.get("iterations", 0) + one.get("iterations_before", 0) for one in numbers)
+        numbers, subject = found.manifest["numbers"], f"file {found.folder / MANIFEST}"
+        seconds += sum(as_number(numbers.get(name, 0.0), subject=f"{subject}: {name}") for name in TIMED)
+        counts = (numbers.get(name, 0) for name in ("iterations", "iterations_before"))
+        iterations += sum(as_integer(count, subject=f"{subject}: iterations") for count in counts)
     report = EvalReport.load(record.folder / REPORT_FILE)
     return RowResult(row, report, record.folder / PICTURES, seconds, iterations)
 

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress, training_progress
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
 
@@ -100,7 +102,8 @@ class FitReference:
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
         if not self.json:
-            _print(record, report, force=self.force)
+            with values_of(record):
+                _print(record, report, force=self.force)
         numbers = record.manifest["numbers"]
         return {**numbers, "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
@@ -140,7 +143,7 @@ def _print(record: StageRecord, report: Path, *, force: bool) -> None:
         table.add_row(name, *cells, style=style)
 
     for name, figures in numbers["held_out"].items():
-        add(name, figures)
+        add(escape(name), figures)
     for which, label in (("held_out", "mean, held out"), ("train", "mean, training")):
         if which in numbers["mean"]:
             add(label, numbers["mean"][which], style="bold" if which == "held_out" else "dim")

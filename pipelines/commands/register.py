@@ -13,8 +13,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.report.model import CheckRow
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.json_file import as_object, read_json
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class Register:
         from pipelines.runs.layout import REGISTER_STAGE
         from pipelines.runs.lock import own_run_folder
         from pipelines.runs.places import keep_out_of_capture
+        from pipelines.runs.reading import values_of
         from pipelines.stages.register_capture import register_capture
 
         keep_out_of_capture(self.out, self.capture)
@@ -80,17 +82,18 @@ class Register:
         with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
             record = register_capture(self.out, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
-        content = read_json(record.folder / "registration.json", subject="registration")
-        if not self.json:
-            _print(record, content, report)
-        numbers = record.manifest["numbers"]
+        path = record.folder / "registration.json"
+        content = as_object(read_json(path, subject="registration"), subject=f"registration {path}")
+        with values_of(path):
+            told = {name: content[name] for name in ("by_camera", "problems")}
+            if not self.json:
+                _print(record, content, report)
         return {
-            **numbers,
+            **record.manifest["numbers"],
             "run": str(self.out),
             "ran": record.ran,
             "params": str(record.folder / "params.npz"),
-            "by_camera": content["by_camera"],
-            "problems": content["problems"],
+            **told,
             "checks": record.manifest["checks"],
             "report": None if report is None else str(report),
         }
@@ -167,12 +170,11 @@ def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None)
         console.print(
             f"[dim]{escape(name)}[/]  {found['points']} keypoints, median {before}{after} px", highlight=False
         )
-    for check in record.manifest["checks"]:
-        if check["status"] != "pass":
-            style = "red" if check["status"] == "fail" else "yellow"
-            console.print(
-                f"[{style}]{check['status']}[/]  {check['name']}: {check['value']:.3g}, {check['explanation']}"
-            )
+    for check in map(CheckRow.of, record.manifest["checks"]):
+        if check.status != "pass":
+            style = "red" if check.status == "fail" else "yellow"
+            words = escape(f"{check.name}: {check.shown}, {check.explanation}")
+            console.print(f"[{style}]{check.status}[/]  {words}")
     problems = content["problems"]
     for words in problems[:_SHOWN]:
         console.print(f"[yellow]problem[/]  {escape(words)}", soft_wrap=True, highlight=False)

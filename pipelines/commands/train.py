@@ -18,6 +18,7 @@ from rich.table import Table
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
 from pipelines.runs.layout import BIND_STAGE
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.errors import InputError
 
@@ -214,7 +215,7 @@ class Train:
             for name, record in records.items()
         }
         last = self.stages()[-1]
-        finished = all(numbers["finished"] for numbers in stages.values()) and (last in stages or last == "refine")
+        finished = all(record.finished for record in records.values()) and (last in stages or last == "refine")
         return {"run": str(self.run_folder), "finished": finished, "stages": stages}
 
 
@@ -263,26 +264,32 @@ def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> Non
         table.add_column(name, justify="right")
     table.add_column("")
     for record in records.values():
-        numbers = record.manifest["numbers"]
-        stage = record.folder.name
-        views = (
-            numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
-            if stage == BIND_STAGE
-            else (numbers.get("novel_view", {}))
-        )
-        poses = numbers.get("novel_pose", {})
-        state = "" if numbers["finished"] else f"stopped: {goes_on(force=force)}"
-        table.add_row(
-            stage,
-            f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",
-            f"{numbers['seconds_of_steps']:.0f}",
-            *(
-                f"{values[key]:.{digits}f}" if key in values else "-"
-                for values, key, digits in ((views, "psnr", 2), (views, "ssim", 4), (poses, "psnr", 2))
-            ),
-            ", ".join(f"{size / 1e6:.1f}" for size in numbers.get("bytes", {}).values()) or "-",
-            state if record.ran or state else "stands",
-        )
+        with values_of(record):
+            table.add_row(*_row(record, force=force))
     console.print(table)
     if report.is_file():
         console.print(f"report  {report}", soft_wrap=True, highlight=False)
+
+
+def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:
+    """A stage's line of the table."""
+    numbers = record.manifest["numbers"]
+    stage = record.folder.name
+    views = (
+        numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
+        if stage == BIND_STAGE
+        else (numbers.get("novel_view", {}))
+    )
+    poses = numbers.get("novel_pose", {})
+    state = "" if numbers["finished"] else f"stopped: {goes_on(force=force)}"
+    return (
+        stage,
+        f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",
+        f"{numbers['seconds_of_steps']:.0f}",
+        *(
+            f"{values[key]:.{digits}f}" if key in values else "-"
+            for values, key, digits in ((views, "psnr", 2), (views, "ssim", 4), (poses, "psnr", 2))
+        ),
+        ", ".join(f"{size / 1e6:.1f}" for size in numbers.get("bytes", {}).values()) or "-",
+        state if record.ran or state else "stands",
+    )

@@ -17,10 +17,11 @@ SCHEMA = 2
 STATUSES = ("fail", "warn", "pass")  # worst first
 _OBJECTS = ("inputs", "config", "code", "versions", "numbers", "files")
 _DIGESTS = ("inputs", "files")
+_MOST_SECONDS = 1e12
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Read a stage's manifest or the record of its state.
+    """Read a stage's manifest or the record of its state; entries that are missing are empty.
 
     Raises:
         InputError: missing, damaged, of another version, or with entries of other kinds.
@@ -30,15 +31,15 @@ def read_record(path: Path) -> dict[str, Any]:
     if content.get("schema") != SCHEMA or isinstance(content["schema"], bool):
         raise InputError(subject, expected=f"version {SCHEMA}", received=f"version {shown(content.get('schema'))}")
     for name in _OBJECTS:
-        as_object(content.get(name, {}), subject=f"{subject}: {name}")
+        as_object(content.setdefault(name, {}), subject=f"{subject}: {name}")
     for name in _DIGESTS:
-        for file, digest in content.get(name, {}).items():
+        for file, digest in content[name].items():
             as_text(digest, subject=f"{subject}: {name}: {file}")
-    for file in content.get("files", {}):
+    for file in content["files"]:
         if PurePosixPath(file).is_absolute() or ".." in PurePosixPath(file).parts:
             raise InputError(f"{subject}: files", expected="names within the stage", received=repr(file[:80]))
-    as_number(content.get("seconds", 0.0), subject=f"{subject}: seconds", least=0.0)
-    for check in as_list(content.get("checks", []), subject=f"{subject}: checks"):
+    as_number(content.setdefault("seconds", 0.0), subject=f"{subject}: seconds", least=0.0, most=_MOST_SECONDS)
+    for check in as_list(content.setdefault("checks", []), subject=f"{subject}: checks"):
         require_check(check, subject=f"{subject}: check")
     return content
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import load_arrays
 from pipelines.runs.artefacts import (
+    load_canonical,
     load_params_of_run,
     load_parts,
     load_posed_body,
@@ -17,7 +17,8 @@ from pipelines.runs.artefacts import (
     load_weights,
 )
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import CANONICAL, SCAN
+from pipelines.runs.layout import PARTS_WITHOUT_WEBS
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template, body_colors_from_scan
@@ -31,15 +32,18 @@ from smplxpp.template.template import Template
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write body and parts as one `Template`, layers apart; npz, GLB and OBJ."""
     body = load_body(build.inputs.body)
-    canonical, weights, parts = load_arrays(build.run / CANONICAL), load_weights(build.run), {}
-    source_vertex = load_arrays(build.run / SCAN)["scan"]["source_vertex"]
-    for name, (mesh, arrays) in load_parts(build.run).items():
+    cleaned, parts = load_parts(build.run), {}
+    canonical, weights = load_canonical(build.run, cleaned), load_weights(build.run, cleaned)
+    _, _, source_vertex = load_scan(build.run)
+    for name, (_, arrays) in cleaned.items():
+        with values_of(build.run / PARTS_WITHOUT_WEBS):
+            scan_index = source_vertex[arrays["source_vertex"]]
         parts[name] = CanonicalPart(
-            mesh=mesh.with_vertices(canonical[name]["vertices"]),
+            mesh=canonical[name],
             weights=weights[name],
             label=int(arrays["label"]),
             vertex_colors=arrays["colors"],
-            scan_index=source_vertex[arrays["source_vertex"]],
+            scan_index=scan_index,
         )
     template, report = assemble_template(
         body, load_params_of_run(build.run), parts, config=AssemblyConfig(clearance=build.config.clearance_mm / MM)
@@ -83,7 +87,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
 def _colored_body(template: Template, run: Path, body: BodyModel) -> Template:
     """The template with the scan's colours on the skin that the scan shows."""
     scan, colors, source_vertex = load_scan(run)
-    skin = load_scan_labels(run) == SKIN.id
+    skin = load_scan_labels(run, scan.face_count) == SKIN.id
     posed, _ = load_posed_body(run, body)
     body_colors, body_index = body_colors_from_scan(posed, scan, colors, skin)
     count = body.vertex_count

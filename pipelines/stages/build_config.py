@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,14 @@ from typing import Any
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE_STAGES
 from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
+from pipelines.runs.reading import values_of
 from smplxpp.clean import WebConfig
 from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import read_json
 from smplxpp.core.labels import LABELS
+
+log = logging.getLogger(__name__)
 
 
 def _default_budgets() -> dict[str, int]:
@@ -115,21 +121,36 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
 
 
 def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
-    """What `save_build` wrote; None where there is none of this version. Optional inputs that are gone are left out."""
-    try:
-        content = read_json(run / BUILD_FILE)
-        choices = content["config"]
-        require_plain_fields(BuildConfig, choices, subject=BUILD_FILE)
-        require_plain_fields(WebConfig, choices.get("webs", {}), subject=BUILD_FILE)
-        config = BuildConfig(**{**choices, "webs": WebConfig(**choices.get("webs", {}))})
-        values = {"protocol": None, **content["inputs"]}  # builds from before there were protocols had none
-        require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
-        found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
-        found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
-        for name in ("labels", "cameras", "motion"):
-            if found[name] is not None and not found[name].exists():
-                found[name] = None
-        found["label_maps"] = {name: Path(path) for name, path in values["label_maps"].items()}
-        return BuildInputs(**found), config
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    """What `save_build` wrote; None where there is none, or none that this version can read, which is logged.
+
+    Optional inputs that are gone are left out.
+    """
+    path = run / BUILD_FILE
+    if not path.exists():
         return None
+    try:
+        content = read_json(path)
+        with values_of(path):
+            return _inputs(content["inputs"]), _config(content["config"])
+    except InputError as error:
+        log.warning("%s counts as a run that does not say what it was built from: %s", run, error)
+        return None
+
+
+def _config(values: Mapping[str, Any]) -> BuildConfig:
+    require_plain_fields(BuildConfig, values, subject=BUILD_FILE)
+    webs = values.get("webs", {})
+    require_plain_fields(WebConfig, webs, subject=BUILD_FILE)
+    return BuildConfig(**{**values, "webs": WebConfig(**webs)})
+
+
+def _inputs(written: Mapping[str, Any]) -> BuildInputs:
+    values = {"protocol": None, **written}  # builds from before there were protocols had none
+    require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
+    found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
+    found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
+    for name in ("labels", "cameras", "motion"):
+        if found[name] is not None and not found[name].exists():
+            found[name] = None
+    found["label_maps"] = {name: Path(path) for name, path in values["label_maps"].items()}
+    return BuildInputs(**found)

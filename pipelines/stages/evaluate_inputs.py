@@ -6,11 +6,12 @@ from pathlib import Path
 
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
 from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
 from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps, path_of_params
 from pipelines.stages.usable import normal_maps
 from smplxpp.capture import Capture
+from smplxpp.core.json_file import as_integer, as_text
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:
@@ -54,5 +55,11 @@ def _trained(run: Path) -> tuple[str | None, int | None, int | None]:
     for stage in reversed(TRAIN_STAGES):
         numbers = (read_manifest(run / stage) or {}).get("numbers", {})
         if "training_frames" in numbers and "training_cameras" in numbers:
-            return numbers.get("normals"), numbers["training_frames"], numbers["training_cameras"]
+            subject = f"file {run / stage / MANIFEST}"
+            frames, cameras = (
+                as_integer(numbers[name], subject=f"{subject}: {name}", least=0)
+                for name in ("training_frames", "training_cameras")
+            )
+            normals = numbers.get("normals")
+            return None if normals is None else as_text(normals, subject=f"{subject}: normals"), frames, cameras
     return None, None, None

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.stage import read_manifest
+from pipelines.runs.stage import MANIFEST, StageRecord, read_manifest
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_list, as_object, as_text
 
 log = logging.getLogger(__name__)
 NAMED = 8
@@ -26,13 +27,33 @@ class Seen:
     frames: frozenset[int]
 
 
+def seen_of(record: StageRecord) -> Seen | None:
+    """What the model of a stage has seen, by the stage's manifest; None where it does not say.
+
+    Raises:
+        InputError: a manifest that says it in other kinds of values.
+    """
+    subject = f"file {record.folder / MANIFEST}: seen"
+    value = record.manifest["numbers"].get("seen")
+    if value is None:
+        return None
+    found = as_object(value, subject=subject)
+    cameras = as_list(found.get("cameras", []), subject=f"{subject}: cameras")
+    frames = as_list(found.get("frames", []), subject=f"{subject}: frames")
+    return Seen(
+        frozenset(as_text(camera, subject=f"{subject}: camera") for camera in cameras),
+        frozenset(as_integer(frame, subject=f"{subject}: frame") for frame in frames),
+    )
+
+
 def _seen_by(run: Path, stage: str) -> Seen:
     """What the model of a stage has seen; a model without a record of it is logged."""
-    seen = (read_manifest(run / stage) or {}).get("numbers", {}).get("seen")
+    manifest = read_manifest(run / stage)
+    seen = None if manifest is None else seen_of(StageRecord(run / stage, manifest, ran=False))
     if seen is None:
         log.warning("%s: what its model has seen is not recorded; whether views are novel is not known", stage)
-        seen = {}
-    return Seen(frozenset(seen.get("cameras", ())), frozenset(seen.get("frames", ())))
+        return Seen(frozenset(), frozenset())
+    return seen
 
 
 def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, anew: str = TRAIN_ANEW) -> None:

@@ -23,6 +23,7 @@ from avatar.training.engine.session import Session
 from pipelines.figures.comparison import preview_writer
 from pipelines.runs.digests import TRAINING
 from pipelines.runs.lock import own_run_folder
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import (
     Stage,
     StageOutput,
@@ -33,6 +34,7 @@ from pipelines.runs.stage import (
     run_stage,
     standing,
 )
+from pipelines.stages.held_out import seen_of
 from pipelines.stages.scene import TrainScene
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
@@ -210,7 +212,7 @@ class Trainer:
         """What there is of a stage that is not finished, in words."""
         if found is not None:
             numbers = found.manifest["numbers"]
-            return f"{numbers['iterations_done']} of {numbers['iterations']} iterations of it"
+            return f"{numbers.get('iterations_done')} of {numbers.get('iterations')} iterations of it"
         manifest = read_manifest(self.run / stage.name)
         needs = (self.found(one) for one in stage.needs.values())
         if manifest is None or any(need is None or not need.finished for need in needs):
@@ -241,7 +243,8 @@ class Trainer:
         digests, sources = dict(stage.inputs(self)), {}
         for part, needed in stage.needs.items():
             path = self.path(needed)
-            digests[part] = self._finished[needed.name].manifest["files"][needed.file]
+            with values_of(self._finished[needed.name]):
+                digests[part] = self._finished[needed.name].manifest["files"][needed.file]
             sources[part] = path.relative_to(self.run).as_posix()
         ground = {} if stage.ground == CLOTHED else {"ground": stage.ground}
         return Stage(
@@ -330,9 +333,10 @@ class Trainer:
         frames = {scene.frame} if stage.alone else set(splits.train_frames)
         cameras = set(splits.train_cameras)
         for needed in stage.needs.values():
-            seen = self._finished[needed.name].manifest["numbers"].get("seen", {})
-            cameras |= set(seen.get("cameras", ()))
-            frames |= set(seen.get("frames", ()))
+            seen = seen_of(self._finished[needed.name])
+            if seen is not None:
+                cameras |= seen.cameras
+                frames |= seen.frames
         if scene.template_frame is not None:
             frames.add(scene.template_frame)
         return {"cameras": sorted(cameras), "frames": sorted(frames)}

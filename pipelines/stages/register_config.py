@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,13 @@ from typing import Any
 from pipelines.runs.layout import REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
+from pipelines.runs.reading import values_of
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.atomic import atomic_write_text
-from smplxpp.core.json_file import as_list, as_numbers, as_text, read_json
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, read_json
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -64,15 +69,24 @@ def save_register(run: Path, inputs: RegisterInputs) -> None:
 
 
 def load_register(run: Path) -> RegisterInputs | None:
-    """What `save_register` wrote; None where there is none of this version."""
-    try:
-        values: dict[str, Any] = dict(read_json(run / REGISTER_FILE))
-        require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
-        as_numbers(values["frames"] or [], (None,), subject="frames")
-        hold_out = [as_text(name, subject="hold_out") for name in as_list(values["hold_out"], subject="hold_out")]
-        values |= {key: Path(values[key]) for key in _PATHS if values[key] is not None}
-        frames = values["frames"]
-        values |= {"frames": None if frames is None else tuple(frames), "hold_out": tuple(hold_out)}
-        return RegisterInputs(**values)
-    except (OSError, ValueError, KeyError, TypeError):
+    """What `save_register` wrote; None where there is none, or none that this version can read, which is logged."""
+    path = run / REGISTER_FILE
+    if not path.exists():
         return None
+    try:
+        values = as_object(read_json(path), subject=f"file {path}")
+        with values_of(path):
+            return _inputs(values)
+    except InputError as error:
+        log.warning("%s counts as a run without a registration by `smplxpp register`: %s", run, error)
+        return None
+
+
+def _inputs(values: dict[str, Any]) -> RegisterInputs:
+    require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
+    frames, hold_out = values["frames"], as_list(values["hold_out"], subject="hold_out")
+    if frames is not None:
+        frames = tuple(as_integer(frame, subject="frames") for frame in as_list(frames, subject="frames"))
+    found = values | {key: Path(values[key]) for key in _PATHS if values[key] is not None}
+    found |= {"frames": frames, "hold_out": tuple(as_text(name, subject="hold_out") for name in hold_out)}
+    return RegisterInputs(**found)

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import load_arrays
 from pipelines.runs.artefacts import (
     load_scan,
+    load_source_faces,
 )
 from pipelines.runs.checks import Check
 from pipelines.runs.layout import SCAN
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.capture import read_cameras
@@ -51,10 +52,13 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             source_faces=raw.source_faces,
         )
         if len(labels) == len(raw.faces):
-            source_face = load_arrays(build.run / SCAN)["scan"]["source_face"]
-            result = segment_scan(scan, face_labels=labels[source_face])
+            with values_of(build.run / SCAN):
+                of_faces = labels[load_source_faces(build.run)]
+            result = segment_scan(scan, face_labels=of_faces)
         else:
-            result = segment_scan(scan, vertex_labels=labels[source_vertex])
+            with values_of(build.run / SCAN):
+                of_vertices = labels[source_vertex]
+            result = segment_scan(scan, vertex_labels=of_vertices)
     np.savez(folder / "labels.npz", face_labels=result.face_labels, confidence=result.confidence, seen=result.seen)
     write_ply(
         folder / "labels.ply",

@@ -182,7 +182,7 @@ def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord |
     if manifest is None or manifest["inputs"].get(TEMPLATE) != scene.digests[TEMPLATE]:
         return None
     numbers = manifest["numbers"]
-    if not (numbers["by_hand"] and is_finished(manifest)):
+    if not (numbers.get("by_hand") and is_finished(manifest)):
         return None
     anew = f"fit without them (smplxpp fit-reference), or delete {run / fit.name}"
     refuse_seen(run, (fit.name,), scene.capture.splits, anew=anew)
@@ -190,8 +190,8 @@ def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord |
     log.info(
         "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
         fit.name,
-        f"{numbers['gaussians']:,}",
-        f"{numbers['iterations']:,}",
+        numbers.get("gaussians"),
+        numbers.get("iterations"),
     )
     return record
 

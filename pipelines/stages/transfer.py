@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from pipelines.figures.colors import blend_joint_colors
-from pipelines.runs.arrays import read_named, save_arrays
+from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import (
     load_cleaned_parts,
     load_posed_body,
+    load_resting_body,
 )
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import POSED_BODY
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
 from smplxpp.body import BodyModel, load_body
@@ -90,7 +90,7 @@ def _without_webs(
     found anew once it is cut; what remains of a web shows then.
     """
     posed, posed_from_rest = load_posed_body(run, body)
-    at_rest = body.mesh(read_named(run / POSED_BODY, "rest_vertices")[0])
+    at_rest = load_resting_body(run, body)
     source = np.arange(part.vertex_count)
     weights = transfer_weights(posed, body.weights, part, config=settings)
     for _ in range(config.rounds):

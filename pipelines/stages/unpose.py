@@ -23,8 +23,9 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write the parts in the T-pose, by the inverse of the skinning that will drive them."""
     body = load_body(build.inputs.body)
     _, posed_from_rest = load_posed_body(build.run, body)
-    weights, groups, checks, numbers = load_weights(build.run), {}, [], {}
-    for name, (mesh, _) in load_parts(build.run).items():
+    parts, groups, checks, numbers = load_parts(build.run), {}, [], {}
+    weights = load_weights(build.run, parts)
+    for name, (mesh, _) in parts.items():
         result = unpose(mesh.vertices, weights[name], posed_from_rest)
         stretch = stretch_report(mesh, mesh.with_vertices(result.vertices))
         groups[name] = {"vertices": result.vertices, "determinant": result.determinant}

@@ -42,7 +42,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
     template = Template.load(build.run / TEMPLATE)
     scan, _, _ = load_scan(build.run)
-    face_labels = load_scan_labels(build.run)
+    face_labels = load_scan_labels(build.run, scan.face_count)
     reference = load_params_of_run(build.run)
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     checks, numbers, back = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)

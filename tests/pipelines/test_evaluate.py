@@ -25,7 +25,12 @@ from pipelines.cli import main
 from pipelines.commands import evaluate as command
 from pipelines.figures.evaluation import read_tiles, surface_picture, write_tiles
 from pipelines.report import Report, write_report
-from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.report.sections.evaluation import (
+    evaluation_figures,
+    evaluation_key_numbers,
+    evaluation_views,
+    standing_evaluation,
+)
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
@@ -36,6 +41,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
+from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 from tools.overview import held_out_view
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -134,9 +140,16 @@ def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path
     assert list(answer["models"]["student"]["views"]) == ["novel_pose"]
 
 
+def test_numbers_of_another_program_are_told_in_the_place_of_the_sections(evaluated):
+    record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
+    for make in (evaluation_figures, evaluation_views):
+        read, told = sections_of(with_foreign_numbers(record, 20), make, evaluation_key_numbers)
+        assert read and told
+
+
 def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
-    figures, pictures = evaluation_sections(record)
+    figures, pictures = evaluation_figures(record), evaluation_views(record)
     assert [table.caption for table in figures.tables][:2] == [
         "not known: evaluation on doll; parameters not known, labels not known, normals none, "
         "trained on a number of frames that is not known",

@@ -16,13 +16,14 @@ from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, err
 from pipelines.report import Curve, Report, write_report
 from pipelines.report.charts import curve_svg
 from pipelines.report.sections.build import rewrite_report
-from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.report.sections.fit import fit_key_numbers, fit_section, head_box, standing_fit
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.core.errors import InputError
 from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
+from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 
@@ -104,6 +105,18 @@ def test_strips_keep_every_pixel_and_errors_their_scale(tmp_path):
     assert enlarge(real, 3).shape == (36, 30, 3) and np.array_equal(enlarge(real, 3)[1::3, 1::3], real)
 
 
+def test_numbers_of_another_program_are_told_in_the_place_of_the_section(fitted):
+    read, told = sections_of(with_foreign_numbers(fitted, 25), fit_section, fit_key_numbers)
+    assert read and told
+
+
+@pytest.mark.parametrize("box", [[0, 0, 10, 1], [0, 0, 0, 5], [-1, 0, 5, 5], [0, 0, 5], "none", [0, 0, 50, 5]])
+def test_heads_outside_of_their_picture_are_refused(box):
+    with pytest.raises(InputError, match="head in a picture"):
+        head_box(box, np.zeros((20, 30, 3), np.uint8))
+    assert head_box([1, 2, 9, 12], np.zeros((20, 30, 3), np.uint8)) == (1, 2, 9, 12)
+
+
 def test_curves_are_drawn_from_finite_points():
     x = np.array([0.0, 10.0, 20.0, 30.0])
     svg = curve_svg(Curve("quality", {"a": (x, np.array([1.0, np.nan, 3.0, 4.0])), "b": (x, 2 * x)}, "seconds", "dB"))
@@ -114,7 +127,7 @@ def test_curves_are_drawn_from_finite_points():
         curve_svg(Curve("none", {"a": (x[:1], np.array([np.inf]))}, "seconds"))
 
 
-def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path):
+def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path, caplog):
     scan, motion = tmp_path / "scan.ply", tmp_path / "motion.npz"
     motion.write_bytes(b"")
     maps = {"Cam1": tmp_path / "label.png"}
@@ -122,7 +135,7 @@ def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path):
     config = BuildConfig(clearance_mm=2.0, budgets={"hair": 300})
     assert load_build(tmp_path) is None
     save_build(tmp_path, inputs, config)
-    assert load_build(tmp_path) == (inputs, config)
+    assert load_build(tmp_path) == (inputs, config) and not caplog.records
     motion.unlink()
     assert load_build(tmp_path) == (replace(inputs, motion=None), config)
     good = json.loads((tmp_path / "build.json").read_text())
@@ -132,20 +145,25 @@ def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path):
         wrong += [{**good, part: {**good[part], name: [[1]]}} for name in good[part]]
     for content in wrong:
         (tmp_path / "build.json").write_text(json.dumps(content))
-        assert load_build(tmp_path) is None, content
+        caplog.clear()
+        assert load_build(tmp_path) is None and "build.json" in caplog.text, content
     (tmp_path / "build.json").write_text("[" * 50_000)
     assert load_build(tmp_path) is None
+    (tmp_path / "build.json").write_bytes(b"\xff")
+    save_build(tmp_path, inputs, config)  # one that nobody can read is written anew
+    assert load_build(tmp_path) is not None
 
 
-def test_a_registration_is_remembered_and_other_records_are_none(tmp_path):
+def test_a_registration_is_remembered_and_other_records_are_none(tmp_path, caplog):
     inputs = RegisterInputs(capture=tmp_path, frames=(1, 2), hold_out=("A",))
     save_register(tmp_path, inputs)
-    assert load_register(tmp_path) == inputs
+    assert load_register(tmp_path) == inputs and not caplog.records
     good = json.loads((tmp_path / "register.json").read_text())
     wrong: list[object] = [{}, [], 3, "words", *({**good, name: {"a": [1]}} for name in good)]
     for content in wrong:
         (tmp_path / "register.json").write_text(json.dumps(content))
-        assert load_register(tmp_path) is None, content
+        caplog.clear()
+        assert load_register(tmp_path) is None and "register.json" in caplog.text, content
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import (
     CheckRow,
     Comparison,
+    Curve,
     Histogram,
     KeyNumber,
     Picture,
@@ -138,16 +139,32 @@ def test_the_page_holds_every_number_and_picture(page):
 
 
 def test_markup_in_names_stays_text(tmp_path):
-    evil = "<script>alert(1)</script>"
+    evil = "'\"><script>alert(1)</script>"
+    picture = Picture(evil, encode_png(np.zeros((4, 4, 3), np.uint8)), evil)
+    section = Section(
+        evil,
+        (evil,),
+        pictures=(picture,),
+        comparisons=(Comparison(evil, picture, picture),),
+        tables=(Table((evil, "b"), ((evil, {evil: [evil]}),), evil),),
+        histograms=(Histogram(evil, np.arange(9.0), evil, ((evil, 4.0),)),),
+        curves=(Curve(evil, {evil: (np.arange(3.0), np.arange(3.0))}, evil, evil),),
+        legend=((evil, (1, 2, 3)),),
+        checks=(CheckRow(evil, 1.0, evil, "warn", evil, evil, evil),),
+    )
     report = Report(
         subject=evil,
-        checks=(CheckRow(evil, 1.0, evil, "pass", evil),),
+        summary=evil,
+        hero=(picture,),
+        key_numbers=(KeyNumber(evil, evil, evil),),
+        checks=(CheckRow(evil, 1.0, evil, "pass", evil, evil, evil), *section.checks),
         seconds={evil: 1.0},
-        sections=(Section(evil, (evil,), histograms=(Histogram(evil, np.arange(9.0), evil, ((evil, 4.0),)),)),),
+        sections=(section,),
         provenance={evil: {evil: evil}},
+        kind=evil,
     )
     html = write_report(tmp_path / "r.html", report).read_text()
-    assert evil not in html and Page(html).tags.count("script") == 1
+    assert "<script>alert" not in html and Page(html).tags.count("script") == 1
 
 
 def test_an_almost_empty_report_is_a_page(tmp_path):

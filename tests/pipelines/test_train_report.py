@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from pipelines.report import Report, write_report
+from pipelines.report.sections.readable import readable
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.train_names import kind_name
+from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.spread import spread
 from tests.dolls.dancing import write_dance, write_dance_run
+from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 from tests.pipelines.training_runs import STAGES, train
 
 
@@ -74,13 +77,28 @@ def test_curves_follow_evaluations_and_steps(own):
     assert len(seconds) == len(values) == 300 and (np.diff(seconds) > 0).all() and (np.diff(values) < 0).all()
 
 
-def test_key_numbers_are_those_of_the_last_training(run):
+def test_numbers_of_another_program_are_told_in_the_place_of_the_section(run):
+    records = with_foreign_numbers(standing(run)["90_compensate"], 25)
+    read, told = sections_of(records, training_section, training_key_numbers)
+    assert read and told
+
+
+def test_a_log_with_foreign_figures_is_told(own):
+    (own / "85_bake" / "metrics.jsonl").write_text('{"kind": "step", "iteration": 1, "loss": "low"}\n' * 3)
+    record = standing(own)["85_bake"]
+    with pytest.warns(GeometryWarning, match="85_bake cannot be read"):
+        section = readable(record, "Bake", lambda: training_section(record))
+    assert section.title == "Bake" and section.checks
+    ours = StageRecord(record.folder, record.manifest, ran=True)
+    with pytest.raises(KeyError):  # what this call has written is a mistake of ours
+        readable(ours, "Bake", lambda: training_section(ours))
+
+
+def test_key_numbers_are_those_of_a_training(run):
     records = standing(run)
-    names = [number.label for number in training_key_numbers(records)]
+    names = [number.label for number in training_key_numbers(records["90_compensate"])]
     assert names == ["student, held-out views", "student, held-out poses"]
-    assert training_key_numbers({}) == ()
-    teacher = {"80_teacher": records["80_teacher"]}
-    assert training_key_numbers(teacher)[0].value == (
+    assert training_key_numbers(records["80_teacher"])[0].value == (
         f"{records['80_teacher'].manifest['numbers']['novel_view']['psnr']:.1f} dB"
     )
 
@@ -118,7 +136,7 @@ def test_the_page_is_written(run, tmp_path):
         subject="doll",
         summary="three trainings",
         hero=(),
-        key_numbers=training_key_numbers(standing(run)),
+        key_numbers=training_key_numbers(standing(run)["90_compensate"]),
         checks=(),
         seconds={},
         sections=sections,

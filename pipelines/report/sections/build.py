@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,14 @@ from pipelines.figures import (
     row,
 )
 from pipelines.report import CheckRow, Comparison, Histogram, KeyNumber, Picture, Report, Section, Table, write_report
-from pipelines.report.sections.evaluation import evaluation_key_numbers, evaluation_sections, standing_evaluation
+from pipelines.report.sections.evaluation import (
+    evaluation_figures,
+    evaluation_key_numbers,
+    evaluation_views,
+    standing_evaluation,
+)
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.report.sections.readable import readable, readable_numbers
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
@@ -27,14 +33,18 @@ from pipelines.runs.arrays import load_arrays, read_named
 from pipelines.runs.artefacts import load_cleaned_parts, load_params_of_run, load_parts, load_scan, load_weights
 from pipelines.runs.digests import versions
 from pipelines.runs.layout import (
+    ASSEMBLE_STAGE,
     BIND_STAGE,
     BUILD_STAGES,
     EVALUATE_STAGE,
     REFINE_STAGE,
     REGISTER_STAGE,
     SCAN_LABELS,
+    SEGMENT_STAGE,
     TEMPLATE_STAGES,
+    VALIDATE_STAGE,
 )
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from pipelines.stages.motion import motion_of_build
@@ -57,7 +67,8 @@ ERROR_LIMIT_MM = 6.0
 
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
     """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
-    template_digest = records["60_assemble"].manifest["files"]["smplxpp.npz"]
+    with values_of(records[ASSEMBLE_STAGE]):
+        template_digest = records[ASSEMBLE_STAGE].manifest["files"]["smplxpp.npz"]
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
     poses = standing_refinement(run, template_digest)
     records = {**records, **({} if poses is None else {REFINE_STAGE: poses})}
@@ -73,39 +84,38 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
     early = tuple(c for c in checks if c.stage in ("00_capture", "10_body", "20_segment"))
     registration = records.get(REGISTER_STAGE)
+    kept, moved, checked = (records[name] for name in ("30_clean", "40_transfer", VALIDATE_STAGE))
     sections = (
-        *(() if registration is None else (register_section(run, registration),)),
-        _scan_section(run, scan, colors, cameras, early),
-        _parts_section(run, records["30_clean"], cameras, by_stage["30_clean"]),
-        _weights_section(run, records["40_transfer"], cameras, by_stage["40_transfer"]),
+        *_optional(registration, "Registration", lambda record: register_section(run, record)),
+        readable(records[SEGMENT_STAGE], "Scan and labels", lambda: _scan_section(run, scan, colors, cameras, early)),
+        readable(kept, "Parts", lambda: _parts_section(run, kept, cameras, by_stage["30_clean"])),
+        readable(moved, "Skin weights", lambda: _weights_section(run, moved, cameras, by_stage["40_transfer"])),
         _template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
-        _fidelity_section(records["65_validate"], template, posed, scan, colors, cameras, by_stage["65_validate"]),
+        readable(
+            checked,
+            "Back in the reference pose",
+            lambda: _fidelity_section(checked, template, posed, scan, colors, cameras, by_stage[VALIDATE_STAGE]),
+        ),
         _poses_section(run, template, reference, inputs),
-        *(() if poses is None else (refine_section(poses),)),
-        *(() if fit is None else (fit_section(fit),)),
-        *(training_section(record) for record in trainings.values()),
-        *(() if evaluation is None else evaluation_sections(evaluation)),
+        *_optional(poses, "Poses", refine_section),
+        *_optional(fit, "Gaussians", fit_section),
+        *(section for record in trainings.values() for section in _optional(record, "Training", training_section)),
+        *_optional(evaluation, "Avatar: figures", evaluation_figures),
+        *_optional(evaluation, "Avatar: side by side", evaluation_views),
     )
-    clothes = records["65_validate"].manifest["numbers"]["template_vs_scan"]["labels"]
-    key_numbers = [
-        KeyNumber(
-            f"{label.name} to scan", f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm", "mean, visible surface"
-        )
-        for label in CLOTH_LABELS
-        if clothes.get(label.name, {}).get("pred_to_gt")
-    ]
     seconds = {name: r.manifest["seconds"] for name, r in records.items()}
-    key_numbers += [
+    key_numbers = [
+        *readable_numbers(checked, lambda: _distances(checked)),
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber(
             "scan to template",
             f"{sum(seconds[name] for name in TEMPLATE_STAGES):.1f} s",
             "all stages of the template, validation included",
         ),
-        *refinement_key_numbers(poses),
-        *(() if fit is None else fit_key_numbers(fit)),
-        *training_key_numbers(trainings),
-        *(() if evaluation is None else evaluation_key_numbers(evaluation)),
+        *_numbers(poses, refinement_key_numbers),
+        *_numbers(fit, fit_key_numbers),
+        *_numbers(next(reversed(trainings.values()), None), training_key_numbers),
+        *_numbers(evaluation, evaluation_key_numbers),
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
     front = body_cameras(posed, views=("front",), height=HEIGHT)[0]
@@ -130,6 +140,28 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         },
     )
     return write_report(run / "report.html", report)
+
+
+def _optional(record: StageRecord | None, title: str, make: Callable[[StageRecord], Section]) -> tuple[Section, ...]:
+    """The section of a stage, where there is one."""
+    return () if record is None else (readable(record, title, lambda: make(record)),)
+
+
+def _numbers(record: StageRecord | None, make: Callable[[StageRecord], tuple[KeyNumber, ...]]) -> tuple[KeyNumber, ...]:
+    """The numbers of a stage for the head of the report, where there is one."""
+    return () if record is None else readable_numbers(record, lambda: make(record))
+
+
+def _distances(record: StageRecord) -> tuple[KeyNumber, ...]:
+    """How far the clothes are from the scan."""
+    clothes = record.manifest["numbers"]["template_vs_scan"]["labels"]
+    return tuple(
+        KeyNumber(
+            f"{label.name} to scan", f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm", "mean, visible surface"
+        )
+        for label in CLOTH_LABELS
+        if clothes.get(label.name, {}).get("pred_to_gt")
+    )
 
 
 def rewrite_report(run: Path) -> Path | None:
@@ -213,7 +245,8 @@ def _parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks
 
 
 def _weights_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
-    parts, weights = load_parts(run), load_weights(run)
+    parts = load_parts(run)
+    weights = load_weights(run, parts)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
     matched = np.concatenate([weights[name].matched for name in parts])

@@ -14,11 +14,12 @@ from pipelines.figures import encode_jpeg, encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend
 from pipelines.figures.evaluation import SURFACE_LIMIT_MM, read_tiles
 from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
-from pipelines.report.sections.fit import HEAD_HEIGHT
+from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES
+from smplxpp.core.paths import path_inside, read_bytes
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:
@@ -56,12 +57,8 @@ def _counted(numbers: Mapping[str, Any], part: str) -> str:
     return f"{counted(counts['images'], 'image')} of {counted(counts['frames'], 'frame')}"
 
 
-def evaluation_sections(record: StageRecord) -> tuple[Section, Section]:
-    """Tables with what their figures mean and distances on the meshes; then pictures of the views."""
-    return _figures(record), _side_by_side(record)
-
-
-def _figures(record: StageRecord) -> Section:
+def evaluation_figures(record: StageRecord) -> Section:
+    """Tables with what their figures mean, and distances on the meshes."""
     numbers = record.manifest["numbers"]
     inputs = InputProtocol.from_dict(numbers["inputs"])
     distance = numbers["metric"] or "none was measured"
@@ -75,7 +72,7 @@ def _figures(record: StageRecord) -> Section:
             *(f"{name[0].upper()}{name[1:]}: {words}" for name, words in numbers["conventions"].items()),
         ),
         pictures=tuple(
-            Picture(f"{shown['title']}, 0 to {SURFACE_LIMIT_MM:g} mm", (record.folder / shown["file"]).read_bytes())
+            Picture(f"{shown['title']}, 0 to {SURFACE_LIMIT_MM:g} mm", read_bytes(_named(record, shown["file"])))
             for shown in numbers["surfaces"]
         ),
         # Cells are text: they keep the digits that make small differences visible.
@@ -87,7 +84,7 @@ def _figures(record: StageRecord) -> Section:
     )
 
 
-def _side_by_side(record: StageRecord) -> Section:
+def evaluation_views(record: StageRecord) -> Section:
     """Held-out views, and one view of every other set: the first held-out one of a set also with a slider."""
     numbers = record.manifest["numbers"]
     models = list(numbers["models"])
@@ -97,7 +94,7 @@ def _side_by_side(record: StageRecord) -> Section:
         seen.add(shown["set"])
         if not first and not held_out:
             continue
-        truth, rendered = read_tiles(record.folder / shown["file"], len(models))
+        truth, rendered = read_tiles(_named(record, shown["file"]), len(models))
         pictures += _view_pictures(shown, truth, rendered)
         if first and held_out:
             pair = Picture("photograph", encode_png(truth)), Picture(models[-1], encode_png(rendered[-1]))
@@ -114,13 +111,18 @@ def _side_by_side(record: StageRecord) -> Section:
     )
 
 
+def _named(record: StageRecord, name: str) -> Path:
+    """A picture of the evaluation by the name that its manifest has for it."""
+    return path_inside(record.folder, name, subject="picture of an evaluation")
+
+
 def _view_pictures(
     shown: Mapping[str, Any], truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
 ) -> list[Picture]:
     """The view whole, and its head enlarged."""
     out = [Picture(shown["title"], encode_png(_with_errors(truth, rendered)))]
     if shown["head"] is not None:
-        x0, y0, x1, y1 = shown["head"]
+        x0, y0, x1, y1 = head_box(shown["head"], truth)
         factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
         crops = [enlarge(image[y0:y1, x0:x1], factor) for image in (truth, *rendered)]
         picture = encode_jpeg(_with_errors(crops[0], crops[1:]), quality=92)

@@ -14,6 +14,9 @@ from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, rea
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import BIND_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
+from smplxpp.core.errors import InputError
+from smplxpp.core.json_file import as_numbers, shown
+from smplxpp.core.paths import path_inside
 
 HEAD_HEIGHT = 420
 """Pixels: crops of the head are enlarged by the whole number that brings them nearest to this."""
@@ -43,7 +46,7 @@ def fit_section(record: StageRecord) -> Section:
     which, names = _shown(numbers)
     pictures, comparisons = [], []
     for name in names:
-        strip = record.folder / "previews" / f"{name}.png"
+        strip = path_inside(record.folder, f"previews/{name}.png")
         if not strip.is_file():
             continue
         parts = read_strip(strip)
@@ -85,11 +88,24 @@ def _shown(numbers: dict[str, Any]) -> tuple[str, list[str]]:
     return which, list(numbers[which])
 
 
-def _head_picture(name: str, parts: tuple[UInt8[np.ndarray, "H W 3"], ...], box: list[int]) -> Picture:
-    x0, y0, x1, y1 = box
+def _head_picture(name: str, parts: tuple[UInt8[np.ndarray, "H W 3"], ...], box: Any) -> Picture:
+    x0, y0, x1, y1 = head_box(box, parts[0])
     factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
     crops = [enlarge(part[y0:y1, x0:x1], factor) for part in parts]
     return Picture(f"{name}, head, {factor} times enlarged: photograph, rendered, error", encode_png(row(crops)))
+
+
+def head_box(value: Any, image: UInt8[np.ndarray, "H W 3"]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of a head in a picture, as a manifest has it.
+
+    Raises:
+        InputError: no such numbers, outside of the picture, or so flat that enlarged it would be a wall.
+    """
+    x0, y0, x1, y1 = (int(number) for number in as_numbers(value, (4,), subject="head in a picture"))
+    height, width = image.shape[:2]
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height and x1 - x0 <= 8 * (y1 - y0)):
+        raise InputError("head in a picture", expected=f"a box within {width} x {height}", received=shown(value))
+    return x0, y0, x1, y1
 
 
 def _table(numbers: dict[str, Any]) -> Table:

@@ -12,6 +12,7 @@ from pipelines.figures.evaluation import read_tiles
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import REFINE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
+from smplxpp.core.paths import path_inside
 
 
 def standing_refinement(run: Path, template_digest: str) -> StageRecord | None:
@@ -22,10 +23,8 @@ def standing_refinement(run: Path, template_digest: str) -> StageRecord | None:
     return StageRecord(run / REFINE_STAGE, manifest, ran=False)
 
 
-def refinement_key_numbers(record: StageRecord | None) -> tuple[KeyNumber, ...]:
+def refinement_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
     """How far the refinement turned joints, for the head of the report."""
-    if record is None:
-        return ()
     found = record.manifest["numbers"]["training"]
     note = f"{np.mean(found['moved_mm']):.1f} mm of translation, {len(found['frames'])} frames"
     return (KeyNumber("poses refined by", f"{np.mean(found['turned_degrees']):.2f} degrees", note),)
@@ -49,7 +48,7 @@ def refine_section(record: StageRecord) -> Section:
     ]
     pictures, comparisons = [], []
     for shown in numbers["pictures"]:
-        photograph, (start, refined) = read_tiles(record.folder / shown["file"], 2)
+        photograph, (start, refined) = read_tiles(path_inside(record.folder, shown["file"]), 2)
         pictures.append(
             Picture(f"{shown['title']}: photograph, before, after", encode_png(row([photograph, start, refined])))
         )

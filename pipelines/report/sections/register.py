@@ -14,6 +14,7 @@ from pipelines.figures import body_cameras, caption, encode_jpeg, encode_png, re
 from pipelines.figures.heat_strip import heat_strip
 from pipelines.figures.skeleton import body_on_photograph, draw_bones
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
+from pipelines.report.sections.readable import readable, readable_numbers
 from pipelines.runs.arrays import read_named
 from pipelines.runs.artefacts import load_stacked_params
 from pipelines.runs.layout import REGISTER_STAGE
@@ -89,19 +90,13 @@ def register_section(run: Path, record: StageRecord) -> Section:
 
 def write_register_report(path: Path, run: Path, record: StageRecord) -> None:
     """Write a page on a registration alone."""
-    section = register_section(run, record)
-    after = record.manifest["numbers"]["residuals"]["after"]
-    key_numbers = [
-        KeyNumber(shown.words, f"{after[name]:.1f} {shown.unit}", "median over frames")
-        for name, shown in RESIDUALS.items()
-        if name in after
-    ]
+    section = readable(record, "Registration", lambda: register_section(run, record))
     inputs = load_register(run)
     source = None if inputs is None else inputs.capture or inputs.scan
     report = Report(
         subject=run.name if source is None else source.resolve().stem,
         summary="The body registered to what was seen of a person.",
-        key_numbers=tuple(key_numbers),
+        key_numbers=readable_numbers(record, lambda: _key_numbers(record)),
         checks=section.checks,
         seconds={REGISTER_STAGE: record.manifest["seconds"]},
         sections=(section,),
@@ -143,6 +138,15 @@ def _pictures(inputs: RegisterInputs, fits: _Fits, content: Mapping[str, Any]) -
     if reference in scans:
         pictures.append(_on_scan(scans[reference], inputs, reference, fits))
     return pictures
+
+
+def _key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
+    after = record.manifest["numbers"]["residuals"]["after"]
+    return tuple(
+        KeyNumber(residual.words, f"{after[name]:.1f} {residual.unit}", "median over frames")
+        for name, residual in RESIDUALS.items()
+        if name in after
+    )
 
 
 def _cameras_shown(capture: Capture, names: Sequence[str], frame: int, fits: _Fits) -> list[str]:

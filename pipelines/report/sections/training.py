@@ -58,13 +58,10 @@ def standing_trainings(run: Path, records: Iterable[StageRecord]) -> dict[str, S
     return found
 
 
-def training_key_numbers(records: Mapping[str, StageRecord]) -> tuple[KeyNumber, ...]:
-    """Return the numbers of the last training for the head of the report."""
-    if not records:
-        return ()
-    stage, record = list(records.items())[-1]
+def training_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
+    """The numbers of a training for the head of the report."""
     numbers = record.manifest["numbers"]
-    who = "teacher" if stage == TEACHER_STAGE else "student"
+    who = "teacher" if record.folder.name == TEACHER_STAGE else "student"
     return tuple(
         KeyNumber(
             f"{who}, {kind_name(kind, held_out=numbers['held_out_cameras'])}",

@@ -24,7 +24,12 @@ BODY, REGION, ENDS, SCAN, PATCH, MIRROR = range(6)
 def whole(person_run):
     """Template, parameters, scan and labels of a finished build."""
     scan, _, _ = load_scan(person_run)
-    return Template.load(person_run / TEMPLATE), load_params_of_run(person_run), scan, load_scan_labels(person_run)
+    return (
+        Template.load(person_run / TEMPLATE),
+        load_params_of_run(person_run),
+        scan,
+        load_scan_labels(person_run, scan.face_count),
+    )
 
 
 def checked(whole, *, labels: np.ndarray | None = None, kept: np.ndarray | None = None, without: str = "none"):
