@@ -5,8 +5,9 @@ of the face, roots of hands (the wrist is there already), inner and outer corner
 
 Sources: OpenPose, `src/openpose/pose/poseParameters.cpp` (POSE_BODY_25_BODY_PARTS, POSE_BODY_25B_BODY_PARTS,
 POSE_BODY_135_BODY_PARTS) and its `doc/02_output.md` (hands, face); COCO (Lin et al. 2014); COCO-WholeBody (Jin et al.
-2020) as in mmpose's `configs/_base_/datasets/coco_wholebody.py`; MediaPipe's lists of pose, hand and face landmarks;
-the vertices of its face mesh (Kartynnik et al. 2019) at dlib's points as in P. Yan's Mediapipe_2_Dlib_Landmarks.
+2020) and Halpe (AlphaPose, Fang et al. 2022) as in mmpose's `configs/_base_/datasets/coco_wholebody.py`, `halpe26.py`
+and `halpe.py`; MediaPipe's lists of pose, hand and face landmarks; the vertices of its face mesh (Kartynnik et al.
+2019) at dlib's points as in P. Yan's Mediapipe_2_Dlib_Landmarks.
 """
 
 from __future__ import annotations
@@ -55,6 +56,11 @@ FACE_70: Order = (*FACE_68, None, None)
 LEFT_HAND, RIGHT_HAND = _hand("left", root=True), _hand("right", root=True)
 BODY_135: Order = (*BODY_25B, *_hand("left", root=False), *_hand("right", root=False), *FACE_70)
 WHOLE_BODY_133: Order = (*COCO_17, *_FEET, *FACE_68, *LEFT_HAND, *RIGHT_HAND)
+HALPE_26: Order = (
+    *COCO_17,
+    *_named("- - - L_big_toe R_big_toe L_small_toe R_small_toe L_heel R_heel"),  # after head, neck and hip
+)
+HALPE_136: Order = (*HALPE_26, *FACE_68, *LEFT_HAND, *RIGHT_HAND)
 MEDIAPIPE_POSE = _named(
     "nose - L_eye - - R_eye - L_ear R_ear - - L_shoulder R_shoulder L_elbow R_elbow L_wrist R_wrist - - - - - - L_hip "
     "R_hip L_knee R_knee L_ankle R_ankle L_heel R_heel L_big_toe R_big_toe"
@@ -73,7 +79,14 @@ MEDIAPIPE_FACE: tuple[tuple[int, ...], ...] = (
 )
 
 # Body points by how many there are; OpenPose's BODY_25 and BODY_25B are as many, and told apart by the format's name.
-BY_COUNT: dict[int, Order] = {17: COCO_17, 25: BODY_25, 133: WHOLE_BODY_133, 135: BODY_135}
+BY_COUNT: dict[int, Order] = {
+    17: COCO_17,
+    25: BODY_25,
+    26: HALPE_26,
+    133: WHOLE_BODY_133,
+    135: BODY_135,
+    136: HALPE_136,
+}
 
 VOCABULARY: frozenset[str] = frozenset(SMPLX_JOINTS) | {
     name for order in (*BY_COUNT.values(), BODY_25B, MEDIAPIPE_POSE) for name in order if name is not None

@@ -14,6 +14,8 @@ from smplxpp.capture.keypoint_names import (
     BODY_25B,
     BODY_135,
     COCO_17,
+    HALPE_26,
+    HALPE_136,
     MEDIAPIPE_FACE,
     MEDIAPIPE_POSE,
     VOCABULARY,
@@ -143,7 +145,9 @@ def test_easymocap_annotations(tmp_path):
     check(read_keypoints(tmp_path, KeypointOptions(person=4)), BODY_25)
 
 
-@pytest.mark.parametrize("order", [COCO_17, WHOLE_BODY_133], ids=["coco 17", "whole body 133"])
+@pytest.mark.parametrize(
+    "order", [COCO_17, WHOLE_BODY_133, HALPE_26, HALPE_136], ids=["coco 17", "whole body 133", "halpe 26", "halpe 136"]
+)
 @pytest.mark.parametrize("layout", ["video", "images", "results"])
 def test_mmpose_and_coco(tmp_path, order, layout):
     def instance(frame: int) -> dict:
@@ -190,6 +194,37 @@ def test_whole_body_order_is_mmposes():
     assert WHOLE_BODY_133[23:40] == (None,) * 17 and WHOLE_BODY_133[40] == "face_17" and WHOLE_BODY_133[90] == "face_67"
     assert (WHOLE_BODY_133[91], WHOLE_BODY_133[92], WHOLE_BODY_133[111]) == (None, "left_thumb1", "left_pinky_tip")
     assert (WHOLE_BODY_133[116 + 1], WHOLE_BODY_133[132]) == ("right_index1", "right_pinky_tip")
+
+
+def test_halpe_orders_are_mmposes_and_alphaposes_list_is_read(tmp_path):
+    """Blocks of `configs/_base_/datasets/halpe26.py` and `halpe.py`; AlphaPose's names of images and its `idx`."""
+    assert HALPE_26[:17] == COCO_17 and HALPE_26[17:20] == (None, None, None)  # head, neck, hip
+    assert HALPE_26[20:] == (
+        "left_big_toe",
+        "right_big_toe",
+        "left_small_toe",
+        "right_small_toe",
+        "left_heel",
+        "right_heel",
+    )
+    assert (HALPE_136[26 + 17], HALPE_136[93], HALPE_136[95], HALPE_136[135]) == (
+        "face_17",
+        "face_67",
+        "left_thumb1",
+        "right_pinky_tip",
+    )
+    entries = [
+        {
+            "image_id": f"{frame}.jpg",
+            "category_id": 1,
+            "keypoints": rows(HALPE_26, frame).ravel().tolist(),
+            "score": 2.48,
+            "box": [0, 0, 9, 9],
+            "idx": 1,
+        }
+        for frame in range(2)
+    ]
+    check(read_keypoints(write(tmp_path / "alphapose-results.json", entries)), HALPE_26)
 
 
 def mediapipe_parts(frame: int, size: tuple[int, int] | None) -> dict[str, np.ndarray]:

@@ -121,6 +121,24 @@ def test_what_a_frame_says_goes_before_what_the_file_says(tmp_path):
     assert capture.recording.distortions["a"].radial[0] == 0.1
 
 
+@pytest.mark.parametrize("scale", [1 / 844.4, 1.00002, 30.0])
+def test_a_scaled_rotation_is_the_rotation(tmp_path, scale):
+    """Tools that scale a scene by its matrices scale the cameras' axes with it; a mirrored one is still refused."""
+    angle = np.deg2rad(30)
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    matrix[:3, 3] = 3.0, -2.0, 5.0
+    plain = only(open_capture(scene(tmp_path / "plain", SPACE, [frame(transform_matrix=matrix.tolist())])))
+    scaled = matrix.copy()
+    scaled[:3, :3] *= scale
+    found = only(open_capture(scene(tmp_path / "scaled", SPACE, [frame(transform_matrix=scaled.tolist())])))
+    np.testing.assert_allclose(found.cam_from_world, plain.cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(found.position, matrix[:3, 3], atol=1e-12)
+    scaled[:3, 0] *= -1
+    with pytest.raises(InputError, match="a rotation matrix"):
+        open_capture(scene(tmp_path / "mirrored", SPACE, [frame(transform_matrix=scaled.tolist())]))
+
+
 def test_a_size_that_is_not_said_is_the_images(tmp_path):
     scene(tmp_path, {"camera_angle_x": np.pi / 2}, ["a.png", "gone.png", "broken.png"])
     (tmp_path / "gone.png").unlink()

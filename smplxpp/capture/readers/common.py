@@ -74,11 +74,19 @@ def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSourc
 
 
 def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix."""
+    """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix.
+
+    Scaled axes, as tools write them that scale a scene by its matrices, are made units again: a pinhole's picture has
+    no depth, and no pixel moves.
+    """
     matrix = as_numbers(world_from_cam, subject="camera-to-world matrix")
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError("camera-to-world matrix", expected="shape (4, 4) or (3, 4)", received=f"{matrix.shape}")
     rotation = matrix[:3, :3].T
+    with np.errstate(over="ignore", invalid="ignore"):
+        volume = np.linalg.det(rotation)
+    if 0 < volume < np.inf:
+        rotation = rotation / np.cbrt(volume)
     return rotation, -rotation @ matrix[:3, 3]
 
 
