@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from functools import cache
+import warnings
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,18 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.metrics_log import read_metrics
 from pipelines.commands.inspect import summarise_run
+from pipelines.report import Report, write_report
+from pipelines.report.sections.fit import fit_section
+from pipelines.report.sections.readable import readable
+from pipelines.report.sections.refine import refine_section
 from pipelines.runs.arrays import load_arrays, save_arrays
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import BUILD_STAGES
-from pipelines.runs.stage import StageOutput, run_stage
+from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, REFINE_STAGE
+from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.body import load_body
+from smplxpp.core.errors import GeometryWarning
 from smplxpp.template import Template
 from tests.avatar_export.test_splats import random_splats
 from tests.dolls.dancing import gaussians, template
@@ -74,14 +80,42 @@ def _write_run(run: Path) -> None:
 
     for name in BUILD_STAGES[:3]:
         run_stage(run, stage_of(name), work)
+    for name, numbers in ((BIND_STAGE, _FIT), (REFINE_STAGE, _REFINED)):
+        run_stage(run, stage_of(name), lambda folder, numbers=numbers: StageOutput(numbers=numbers))
     (run / "metrics.json").write_text(json.dumps({"schema": 1, "subject": "Dancer", "checks": []}))
     inputs = BuildInputs(scan=run / "scan.ply", params=run / "params.npz", subject="Dancer")
     save_build(run, inputs, BuildConfig())
     save_register(run, RegisterInputs(capture=run))
 
 
+_FIT = {
+    "held_out": {"Cam1": {"psnr": 30.0, "psnr_image": 33.0, "ssim": 0.97, "psnr_head": 29.0}},
+    "train": {},
+    "mean": {"held_out": {"psnr": 30.0, "psnr_image": 33.0, "ssim": 0.97, "psnr_head": 29.0}},
+    "heads": {"Cam1": [1, 2, 3, 4]},
+    "convention": "words",
+    **{"gaussians": 800, "iterations": 4, "iterations_done": 4, "seconds_of_steps": 2.0, "iterations_per_second": 2.0},
+}
+_REFINED = {
+    "training": {
+        **{name: [0.1, 0.2] for name in ("loss_before", "loss_after", "turned_degrees", "moved_mm")},
+        **{"frames": [0, 3], "kept": [3], "joints": {"knee": 1.5}},
+    },
+    "pictures": [],
+}
+
+
 def _open_run(run: Path) -> None:
     summarise_run(run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # what cannot be read is said
+        sections = []
+        for name, make in ((BIND_STAGE, fit_section), (REFINE_STAGE, refine_section)):
+            manifest = read_manifest(run / name)
+            if manifest is not None:
+                record = StageRecord(run / name, manifest, ran=False)
+                sections.append(readable(record, name, partial(make, record)))
+    write_report(run / "report.html", Report("Dancer", sections=tuple(sections)))
     load_build(run)
     load_register(run)
 
