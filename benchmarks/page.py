@@ -246,6 +246,13 @@ PARTS = (
         "persons.",
     ),
     Part(
+        "damaged_files",
+        "Damaged files",
+        "Mutations of valid files (bytes, tokens, values, the file itself) through the doors that read them: each is "
+        "to be read, as what it then says, or refused with an error that says what is wrong. Checkpoints, logs and "
+        "records of stages are left aside where they are damaged, with a word in the log, and count as read.",
+    ),
+    Part(
         "driving",
         "Driven garments, two captures with known weights",
         "Distance in mm of each driven part from the same part driven by its authored weights; `exact` and `noisy` "

@@ -287,7 +287,7 @@ def _basic_doors() -> list[Door]:
 @cache
 def doors() -> dict[str, Door]:
     """Every door by name."""
-    every = [_capture_door(name) for name in WRITERS if name != "talkbody4d"] + _params_doors() + _keypoint_doors()
+    every = [_capture_door(name) for name in WRITERS] + _params_doors() + _keypoint_doors()
     every += _mesh_doors() + _label_doors() + _image_doors() + _basic_doors()
     every += run_doors()
     return {door.name: door for door in every}

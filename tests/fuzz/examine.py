@@ -88,8 +88,7 @@ def examine(
         path = files[int(rng.integers(len(files)))]
         _spoil(path, originals[path], rng)
         try:
-            with _limited(), warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with _limited():
                 door.open(root)
             findings.add(READ)
         except InputError:
@@ -131,7 +130,7 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def _limited() -> Iterator[None]:
-    """Bound the time and the memory of an input, and leave out what is said in the log."""
+    """Bound the time and the memory of an input; leave out what is said in warnings and in the log."""
 
     def stop(number: int, frame: object) -> None:
         raise TooLong
@@ -142,7 +141,9 @@ def _limited() -> Iterator[None]:
     signal.alarm(SECONDS)
     logging.disable()
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
     finally:
         signal.alarm(0)
         logging.disable(logging.NOTSET)

@@ -7,6 +7,7 @@ import json
 import pickle
 import re
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -58,14 +59,20 @@ _WORD = re.compile(rb"[A-Za-z_]{2,}")
 def mutated(name: str, data: bytes, rng: Rng) -> bytes:
     """The content of a file of this name with one to four faults."""
     suffix = name.rpartition(".")[2].lower()
-    for _ in range(int(rng.integers(1, 5))):
-        ways = _BY_SUFFIX.get(suffix, (_bytes,))
-        way = ways[int(rng.integers(len(ways)))] if rng.random() > 0.15 else _bytes
-        try:
-            data = way(data, rng)
-        except Exception:  # noqa: BLE001  earlier faults may have left nothing that the way can read
-            data = _bytes(data, rng)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for _ in range(int(rng.integers(1, 5))):
+            data = _once(suffix, data, rng)
     return data
+
+
+def _once(suffix: str, data: bytes, rng: Rng) -> bytes:
+    ways = _BY_SUFFIX.get(suffix, (_bytes,))
+    way = ways[int(rng.integers(len(ways)))] if rng.random() > 0.15 else _bytes
+    try:
+        return way(data, rng)
+    except Exception:  # noqa: BLE001  earlier faults may have left nothing that the way can read
+        return _bytes(data, rng)
 
 
 def _place(data: bytes, rng: Rng) -> int:
@@ -217,8 +224,7 @@ def _npz(data: bytes, rng: Rng) -> bytes:
         case 2:
             return _raw_npz(data, rng)
         case _:
-            with np.errstate(all="ignore"):
-                arrays[name] = _array(arrays[name], rng)
+            arrays[name] = _array(arrays[name], rng)
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
@@ -246,8 +252,7 @@ def _pkl(data: bytes, rng: Rng) -> bytes:
     if isinstance(value, dict) and rng.random() < 0.7:
         key = list(value)[int(rng.integers(len(value)))]
         if isinstance(value[key], np.ndarray):
-            with np.errstate(all="ignore"):
-                value[key] = _array(value[key], rng)
+            value[key] = _array(value[key], rng)
             return pickle.dumps(value, protocol=int(rng.integers(2, 6)))
     return pickle.dumps(changed(value, rng), protocol=int(rng.integers(0, 6)))
 
