@@ -71,7 +71,7 @@ def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> 
     path, options = Path(path), options or KeypointOptions()
     try:
         return _read(path, options)
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
