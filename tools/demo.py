@@ -52,7 +52,9 @@ class Demo:
         film = self.out / "motion.mp4"
         Animate(run_folder=self.out, params=self.out / REFINED_PARAMS, out=film, height=540).run()
         report = self.out / "report.html"
-        console.print(f"\nreport  {report.resolve()}\nfilm    {film.resolve()}", highlight=False, soft_wrap=True)
+        console.print(
+            f"\nreport  {report.resolve()}\nfilm    {film.resolve()}", highlight=False, soft_wrap=True, markup=False
+        )
         return report
 
 

@@ -181,4 +181,4 @@ def _print(outcome: AblationOutcome, goes_on: str) -> None:
         console.print(outcome.table.text(), soft_wrap=True, highlight=False)
     if outcome.waiting:
         console.print(f"still to do: {', '.join(outcome.waiting)}; {goes_on}", soft_wrap=True)
-    console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False)
+    console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False, markup=False)

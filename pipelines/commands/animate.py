@@ -78,7 +78,7 @@ class Animate:
             frames = self._frames(template, _chain(first, posed), cameras)
             write_film(self.out, frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         if not self.json:
-            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second")
+            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second", markup=False)
         return {"out": str(self.out), "frames": len(params), "fps": fps}
 
     def _check_options(self, suffix: str) -> None:

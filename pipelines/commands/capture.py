@@ -75,7 +75,7 @@ class CaptureCheckCommand:
             print_check(check, Console())
         report = None if self.out is None else write_check_report(check, self.out)
         if report is not None and not self.json:
-            Console().print(f"report  {report}", soft_wrap=True, highlight=False)
+            Console().print(f"report  {report}", soft_wrap=True, highlight=False, markup=False)
         paths = {"report": None if report is None else str(report)}
         return {**check_as_dict(check), **paths, "exit_status": int(check.failed)}
 
@@ -152,7 +152,7 @@ class CaptureConvertCommand:
             if len(done.left_out) > _SHOWN:
                 console.print(f"[dim]and {len(done.left_out) - _SHOWN} more (--json lists all)[/]")
             files = f"{done.copied} files copied, {done.encoded} written anew, {done.kept} there already"
-            console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False)
+            console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
 
     def _matte(self, model_file: Path) -> None:

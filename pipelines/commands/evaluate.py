@@ -130,7 +130,7 @@ class Evaluate:
                 highlight=False,
             )
             if page.is_file():
-                console.print(f"report  {page}", soft_wrap=True, highlight=False)
+                console.print(f"report  {page}", soft_wrap=True, highlight=False, markup=False)
         return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
 

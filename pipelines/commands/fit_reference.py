@@ -161,4 +161,4 @@ def _print(record: StageRecord, report: Path, *, force: bool) -> None:
         ("report", report),
     ):
         if path.exists():
-            console.print(f"{name}  {path}", soft_wrap=True, highlight=False)
+            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)

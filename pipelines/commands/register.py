@@ -185,4 +185,4 @@ def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None)
     console.print(f"{numbers['frames']} frames registered{absent}{how}", highlight=False)
     for name, path in (("params", record.folder / "params.npz"), ("report", report)):
         if path is not None:
-            console.print(f"{name}  {path}", soft_wrap=True, highlight=False)
+            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)

@@ -78,5 +78,10 @@ class Synth:
                 bars.update(tasks[what], completed=share)
 
             checks = make_capture(self.out, self.person / "geometry" / "topology.npz", config, progress=show)
-        console.print(f"{self.out}: {config.cameras} cameras, {config.frames} frames", highlight=False, soft_wrap=True)
+        console.print(
+            f"{self.out}: {config.cameras} cameras, {config.frames} frames",
+            highlight=False,
+            soft_wrap=True,
+            markup=False,
+        )
         return {"out": str(self.out), "cameras": config.cameras, "frames": config.frames, "checks": checks}

@@ -268,7 +268,7 @@ def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> Non
             table.add_row(*_row(record, force=force))
     console.print(table)
     if report.is_file():
-        console.print(f"report  {report}", soft_wrap=True, highlight=False)
+        console.print(f"report  {report}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:
