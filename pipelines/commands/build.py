@@ -23,13 +23,14 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.places import keep_out_of_capture, same_place
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.build_config import BuildConfig, BuildInputs
+from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
 from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
 from smplxpp.core.json_file import read_json
+from smplxpp.core.spread import spread
 
 log = logging.getLogger(__name__)
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
@@ -162,7 +163,8 @@ class Build:
                 params_row=found.params_frame,
                 labels=labels,
                 label_maps={} if labels else found.label_maps,
-                cameras=None if labels else found.cameras_file,
+                photographs=dict(spread(list(found.photographs.items()), MOST_PHOTOGRAPHS)),
+                cameras=found.cameras_file if found.photographs or not labels else None,
                 label_set="capture" if label_set == "auto" else label_set,
                 motion=None if registered else found.motion,
                 body=self.body,

@@ -45,6 +45,8 @@ SKIN_PATCH = Gate("cm2", 100.0, 1000.0, higher_is_better=False)
 """Area that is labelled skin and stands off the body: up to 20, 435 to 2158 where a label is missing."""
 MIRRORED = Gate("x", 1.3, 2.0, higher_is_better=False)
 """Distance of a scan to its fit over that of the scan's mirror image: up to 1.02, mirrored 2.8 to 27."""
+MIRRORED_VIEWS = Gate("", 0.65, 0.8, higher_is_better=False)
+"""Where photographs lie between a scan (0) and its mirror image (1): TODO."""
 SILHOUETTE = Gate("IoU", 0.95, 0.8)
 """The skinned template on the masks."""
 PSNR: Mapping[str, Gate] = {"novel_view": Gate("dB", 18.0, 16.0), "novel_pose": Gate("dB", 17.0, 15.0)}

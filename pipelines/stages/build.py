@@ -80,7 +80,7 @@ PARTS: dict[str, _Part] = {
         validate,
         (REGISTER_STAGE, CAPTURE_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, ASSEMBLE_STAGE),
         settings=("samples", "seed"),
-        files=("body", "motion"),
+        files=("body", "motion", "photographs", "cameras"),
     ),
 }
 

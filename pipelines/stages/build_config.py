@@ -20,6 +20,8 @@ from smplxpp.core.json_file import read_json
 from smplxpp.core.labels import LABELS
 
 log = logging.getLogger(__name__)
+MOST_PHOTOGRAPHS = 8
+"""Photographs of the reference frame that a build looks at: a few from all around tell left from right."""
 
 
 def _default_budgets() -> dict[str, int]:
@@ -39,6 +41,7 @@ class BuildInputs:
         labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them or
             views do.
         label_maps: label image by camera name, with `cameras` their camera file.
+        photographs: image of the frame by camera name, of the same cameras: what a mirrored scan is told by.
         label_set: name of the label set that labels and label maps use, or a JSON mapping file.
         motion: parameters of the capture's own frames, for validation and the report; may be None.
         body: SMPL-X-layout body file, None for the open body.
@@ -52,6 +55,7 @@ class BuildInputs:
     params_row: int = 0
     labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
+    photographs: dict[str, Path] = field(default_factory=dict)
     cameras: Path | None = None
     label_set: str = "4ddress"
     motion: Path | None = None
@@ -145,12 +149,14 @@ def _config(values: Mapping[str, Any]) -> BuildConfig:
 
 
 def _inputs(written: Mapping[str, Any]) -> BuildInputs:
-    values = {"protocol": None, **written}  # builds from before there were protocols had none
+    # Builds of earlier versions had no protocols and looked at no photographs.
+    values = {"protocol": None, "photographs": {}, **written}
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
     found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
     found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
     for name in ("labels", "cameras", "motion"):
         if found[name] is not None and not found[name].exists():
             found[name] = None
-    found["label_maps"] = {name: Path(path) for name, path in values["label_maps"].items()}
+    for kind in ("label_maps", "photographs"):
+        found[kind] = {name: Path(path) for name, path in values[kind].items()}
     return BuildInputs(**found)

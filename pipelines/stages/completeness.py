@@ -68,8 +68,7 @@ def completeness_checks(
             "label, or the fit is off there",
         )
     )
-    joints = dict(zip(template.body.joint_names, figure.joints, strict=True))
-    ratio = _mirror_ratio(body, joints["left_hip"], joints["right_hip"], scan, bare)
+    ratio = _mirror_ratio(body, sagittal_plane(template, figure.joints), scan, bare)
     checks.append(
         MIRRORED.check(
             "distance of the scan to the fit over that of its mirror image",
@@ -104,12 +103,18 @@ def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tu
     return checks, {"body_uncovered": {"all": uncovered.mean(), **shares}}
 
 
+def sagittal_plane(template: Template, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The point between the hips of posed joints (J, 3), and the direction from the right to the left one."""
+    named = dict(zip(template.body.joint_names, joints, strict=True))
+    left, right = named["left_hip"], named["right_hip"]
+    return 0.5 * (left + right), left - right
+
+
 def _mirror_ratio(
-    body: TriangleMesh, left_hip: np.ndarray, right_hip: np.ndarray, scan: TriangleMesh, bare: np.ndarray
+    body: TriangleMesh, plane: tuple[np.ndarray, np.ndarray], scan: TriangleMesh, bare: np.ndarray
 ) -> float:
     """`mirror_ratio` of the scan's skin, of all of it where little skin shows."""
     chosen = bare if bare.mean() > _LEAST_SKIN else np.ones_like(bare)
     used = np.unique(scan.faces[chosen])
     used = used[np.sort(np.random.default_rng(0).permutation(len(used))[:_MIRROR_POINTS])]
-    center, across = 0.5 * (left_hip + right_hip), left_hip - right_hip
-    return mirror_ratio(scan.vertices[used], body, center=center, across=across)
+    return mirror_ratio(scan.vertices[used], body, center=plane[0], across=plane[1])

@@ -15,6 +15,7 @@ from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
 from pipelines.stages.completeness import completeness_checks
 from pipelines.stages.motion import motion_of_build
+from pipelines.stages.photographs import photograph_checks
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.clean import loop_lengths
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
@@ -41,13 +42,15 @@ MOTION_FRAMES = 12
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
     template = Template.load(build.run / TEMPLATE)
-    scan, _, _ = load_scan(build.run)
+    scan, colors, _ = load_scan(build.run)
     face_labels = load_scan_labels(build.run, scan.face_count)
     reference = load_params_of_run(build.run)
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     checks, numbers, back = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)
     whole, numbers["completeness"] = completeness_checks(template, reference, scan, face_labels, back)
     checks += whole
+    seen, numbers["photographs"] = photograph_checks(template, reference, scan, colors, build.inputs)
+    checks += seen
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     flips = _flips(template, posed, build.run)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from smplxpp.capture.files import FileSeries
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries
 from smplxpp.capture.protocols import ProtocolFiles, choose_protocol, read_description
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
+
+_MAPS = (".png", ".npy")
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class ReferenceFrame:
         scan_labels: labels of the scan's vertices, or None.
         label_maps: label image of each camera by name, without those that the capture holds out; with `cameras_file`
             their cameras.
+        photographs: the same of the images.
     """
 
     subject: str
@@ -35,6 +38,7 @@ class ReferenceFrame:
     motion: Path | None = None
     scan_labels: Path | None = None
     label_maps: dict[str, Path] = field(default_factory=dict)
+    photographs: dict[str, Path] = field(default_factory=dict)
     cameras_file: Path | None = None
 
 
@@ -49,10 +53,10 @@ def find_reference(
     """Find frame `frame` in a capture folder of our simple layout.
 
     The layout: `scans/scan_FFFFFF.ply` (`.obj`), `scans/scan_FFFFFF_labels.npz`, `params/params.npz` (stacked) or
-    `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `cameras.json` or `calibration.csv`. `params` names another
-    stacked parameter file (for instance a tracker's), whose rows are the motion then; `protocol` names the protocol
-    whose parameters and labels are taken, the scan's own labels only if it allows them. Without `fitted` there need be
-    no parameters: a registration is to make them.
+    `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `rgbs/CAM/CAM_rgbFFFFFF.jpg`, `cameras.json` or
+    `calibration.csv`. `params` names another stacked parameter file (for instance a tracker's), whose rows are the
+    motion then; `protocol` names the protocol whose parameters and labels are taken, the scan's own labels only if it
+    allows them. Without `fitted` there need be no parameters: a registration is to make them.
 
     Raises:
         InputError: no such folder, no such protocol, or scan or parameters missing.
@@ -87,12 +91,7 @@ def find_reference(
             received="neither" if params is None else str(params_file),
             remedy="convert your fit with `smplxpp params convert`",
         )
-    pattern = re.compile(rf"^(?P<camera>.+)_label{number}\.(png|npy)$")
-    maps, held_out = {}, set(map(str, description.get("novel_views", ())))
-    folder = () if files.labels is None else (root / files.labels).glob(f"*/*_label{number}.*")
-    for path in sorted(folder):
-        if (match := pattern.match(path.name)) and match["camera"] not in held_out:
-            maps[match["camera"]] = path
+    held_out = set(map(str, description.get("novel_views", ())))
     return ReferenceFrame(
         subject=root.resolve().name,
         frame=frame,
@@ -101,7 +100,8 @@ def find_reference(
         params_frame=row,
         motion=motion,
         scan_labels=_first(root / "scans", [f"scan_{number}_labels.npz"]) if files.scan_labels else None,
-        label_maps=maps,
+        label_maps={} if files.labels is None else _by_camera(root / files.labels, f"label{number}", _MAPS, held_out),
+        photographs=_by_camera(root / "rgbs", f"rgb{number}", IMAGE_SUFFIXES, held_out),
         cameras_file=_first(root, ["cameras.json", "calibration.csv"]),
     )
 
@@ -119,6 +119,16 @@ def _parameters(
     stacked, single = stacked_params(root), root / "params" / f"{frame:06d}.npz"
     motion = stacked if stacked.is_file() else None
     return (single, 0, motion) if single.is_file() else (stacked, frame, motion)
+
+
+def _by_camera(folder: Path, tag: str, suffixes: Sequence[str], held_out: set[str]) -> dict[str, Path]:
+    """The file `CAM/CAM_TAG` of each camera that is not held out."""
+    found = {
+        path.stem.removesuffix(f"_{tag}"): path
+        for path in sorted(folder.glob(f"*/?*_{tag}.*"))
+        if path.suffix.lower() in suffixes
+    }
+    return {name: path for name, path in found.items() if name not in held_out}
 
 
 def _first(folder: Path, names: list[str]) -> Path | None:

@@ -14,6 +14,7 @@ from smplxpp.metrics.distance import (
 )
 from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
 from smplxpp.metrics.mirror import mirror_ratio
+from smplxpp.metrics.mirror_views import mirrored_by_views
 from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
 from smplxpp.metrics.quality import MeshQuality, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
@@ -45,6 +46,7 @@ __all__ = [
     "mean_pose_error",
     "mesh_quality",
     "mirror_ratio",
+    "mirrored_by_views",
     "penetration",
     "point_to_surface",
     "pose_error",

@@ -29,23 +29,47 @@ def mirror_ratio(
         points: of the scan, skin at best. body: in the scan's pose.
         center, across: a point of the plane to mirror at, and its normal: the body's middle, from hip to hip.
     """
-    normal = across / np.linalg.norm(across)
-    image = points - 2.0 * np.outer((points - center) @ normal, normal)
-    tree = igl.AABB()
-    tree.init(body.vertices, body.faces)
-    one, other = (_aligned_distance(each, body, tree) for each in (points, image))
+    tree = search_tree(body)
+    one, other = (_aligned_distance(each, body, tree) for each in (points, reflected(points, center, across)))
     return one / max(other, 1e-9)
 
 
+def reflected(
+    points: Float64[np.ndarray, "P 3"], center: Float64[np.ndarray, " 3"], across: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, "P 3"]:
+    """The mirror image of points at the plane through `center` with the normal `across`, of any length."""
+    normal = across / np.linalg.norm(across)
+    return points - 2.0 * np.outer((points - center) @ normal, normal)
+
+
+def search_tree(mesh: TriangleMesh) -> igl.AABB:
+    """The tree in which the closest points of a mesh are found."""
+    tree = igl.AABB()
+    tree.init(mesh.vertices, mesh.faces)
+    return tree
+
+
 def _aligned_distance(points: np.ndarray, body: TriangleMesh, tree: igl.AABB) -> float:
-    """Mean capped distance after rigid steps towards the closest points (Besl and McKay 1992)."""
+    """Mean capped distance of points that are moved rigidly to where they fit best."""
+    squared, _, _ = tree.squared_distance(body.vertices, body.faces, np.ascontiguousarray(aligned(points, body, tree)))
+    return float(np.minimum(np.sqrt(squared), _CAP).mean())
+
+
+def aligned(points: Float64[np.ndarray, "P 3"], body: TriangleMesh, tree: igl.AABB) -> Float64[np.ndarray, "P 3"]:
+    """Points after rigid steps towards the closest ones of a mesh (Besl and McKay 1992); `tree` is the mesh's."""
     for _ in range(_STEPS):
         squared, _, closest = tree.squared_distance(body.vertices, body.faces, points)
         distance = np.sqrt(squared)
         used = distance <= max(_CAP, 2.0 * float(np.median(distance)))
         here, there = points[used].mean(axis=0), closest[used].mean(axis=0)
-        left, _, right = np.linalg.svd((points[used] - here).T @ (closest[used] - there))
-        turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-        points = (points - here) @ (left @ turn @ right) + there
-    squared, _, _ = tree.squared_distance(body.vertices, body.faces, np.ascontiguousarray(points))
-    return float(np.minimum(np.sqrt(squared), _CAP).mean())
+        points = (points - here) @ rotation_between(points[used] - here, closest[used] - there) + there
+    return points
+
+
+def rotation_between(
+    source: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray, "P 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """The rotation R, applied as `source @ R`, that takes centred points closest to others (Kabsch 1976)."""
+    left, _, right = np.linalg.svd(source.T @ target)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return left @ turn @ right
