@@ -110,7 +110,7 @@ def test_label_maps_come_first_and_the_scans_own_labels_only_when_asked_for(root
 
     assert inputs().labels is None and inputs(protocol="exact").labels is None
     assert inputs(label_source="scan").labels.name == "scan_000000_labels.npz"
-    assert inputs(label_source="scan").label_maps == {} and inputs(label_source="scan").cameras is None
+    assert inputs(label_source="scan").label_maps == {}
     with pytest.raises(InputError, match=r"labels of the scan.*by protocol tracked"):
         inputs(label_source="scan", protocol="tracked")
     assert not caplog.records
