@@ -46,7 +46,7 @@ SKIN_PATCH = Gate("cm2", 100.0, 1000.0, higher_is_better=False)
 MIRRORED = Gate("x", 1.3, 2.0, higher_is_better=False)
 """Distance of a scan to its fit over that of the scan's mirror image: up to 1.02, mirrored 2.8 to 27."""
 MIRRORED_VIEWS = Gate("", 0.65, 0.8, higher_is_better=False)
-"""Where photographs lie between a scan (0) and its mirror image (1): -0.03 to 0.34 of right scans, 0.4 to 0.6 of
+"""Where photographs lie between a scan (0) and its mirror image (1): -0.03 to 0.34 of right scans, 0.38 to 0.56 of
 symmetric colours, 0.66 to 1.2 of mirrored ones."""
 SILHOUETTE = Gate("IoU", 0.95, 0.8)
 """The skinned template on the masks."""
