@@ -10,7 +10,7 @@ take 4 GiB of memory and a minute.
 from __future__ import annotations
 
 import sys
-import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import tyro
@@ -18,7 +18,7 @@ import tyro
 from benchmarks.machine import store_results
 from tests.fuzz.campaign import campaign
 from tests.fuzz.doors import doors
-from tests.fuzz.examine import CLEAN, OUTCOMES, READ
+from tests.fuzz.examine import CLEAN, OUTCOMES, READ, Findings
 
 
 @dataclass(frozen=True)
@@ -29,29 +29,32 @@ class DamagedFiles:
         inputs: how many a door.
         first: the first seed; the same seed is the same input.
         door: doors alone whose names contain this.
+        jobs: doors at once.
     """
 
     inputs: int = 1000
     first: int = 0
     door: str = ""
+    jobs: int = 2
 
     def run(self) -> bool:
         """Print a line a door, with the place of what is neither read nor refused; true where there is nothing so."""
-        table = {}
-        for name in doors():
-            if self.door not in name:
-                continue
-            begun = time.monotonic()
-            findings = campaign(name, self.inputs, first=self.first)
-            milliseconds = 1e3 * (time.monotonic() - begun) / self.inputs
-            table[name] = {"inputs": self.inputs, **{outcome: findings.counts[outcome] for outcome in OUTCOMES}}
-            print(f"{name:24} {milliseconds:6.1f} ms", dict(findings.counts), flush=True)
-            for what, text in findings.examples.items():
-                print(f"    {what}: {text.splitlines()[0]}")
+        names = [name for name in doors() if self.door in name]
+        table: dict[str, dict[str, int]] = {}
+        with ThreadPoolExecutor(self.jobs) as pool:
+            for name, findings in zip(names, pool.map(self._tried, names), strict=True):
+                table[name] = {"inputs": self.inputs, **{outcome: findings.counts[outcome] for outcome in OUTCOMES}}
+                print(f"{name:24}", dict(findings.counts), flush=True)
+                for what, text in findings.examples.items():
+                    print(f"    {what}: {text.splitlines()[0]}")
         total = {key: sum(row[key] for row in table.values()) for key in ("inputs", *OUTCOMES)}
         if not self.door:
-            store_results("damaged_files", "python -m benchmarks.damaged_files", {**table, "all": total})
+            command = f"python -m benchmarks.damaged_files --inputs {self.inputs} --first {self.first}"
+            store_results("damaged_files", command, {**table, "all": total})
         return total["inputs"] == total[READ] + total[CLEAN]
+
+    def _tried(self, name: str) -> Findings:
+        return campaign(name, self.inputs, first=self.first)
 
 
 if __name__ == "__main__":

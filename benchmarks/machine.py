@@ -9,8 +9,8 @@ import platform
 from pathlib import Path
 
 from pipelines.runs.digests import versions
-from smplxpp.core.atomic import atomic_write_text
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_values import jsonable
 
 RESULTS = Path(__file__).parent / "results"
 

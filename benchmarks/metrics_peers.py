@@ -62,7 +62,7 @@ def worker(name: str, folder: Path) -> None:
 def load_pair(capture: Path):
     """The capture's visible layers of its reference frame, and the scan of that frame."""
     from smplxpp.core.mesh import TriangleMesh
-    from smplxpp.core.mesh_io import read_mesh
+    from smplxpp.core.mesh_files.mesh_io import read_mesh
 
     with np.load(capture / "geometry" / "topology.npz") as topology:
         faces = topology["faces"][~topology["face_hidden"]]

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from benchmarks.machine import store_results
 from smplxpp.body import load_body, load_params
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 
 FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 SHOWN = 3

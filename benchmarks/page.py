@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.machine import RESULTS
 from benchmarks.page_tables import registration_lines, table, tables_of
 from smplxpp.capture.protocols import TRACKED
-from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.files.atomic import atomic_write_text
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 WOMAN = (

@@ -20,7 +20,7 @@ from benchmarks.machine import store_results
 from pipelines.synth.tracker import estimated_labels
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.core.labels import BACKGROUND, LABELS
-from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.segment import map_labels, read_label_map, read_labels, segment_scan, vote_on_faces
 
 

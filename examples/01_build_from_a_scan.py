@@ -7,7 +7,7 @@ from pathlib import Path
 import smplxpp
 from smplxpp.assemble import CanonicalPart, assemble_template
 from smplxpp.clean import PartsConfig, check_human_scale, clean_parts, sanitize
-from smplxpp.core.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.segment import read_labels, segment_scan
 from smplxpp.skinning import unpose
 

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.json_values import jsonable
 
 # command -> (module, dataclass, one line of help)
 COMMANDS: dict[str, tuple[str, str, str]] = {

@@ -16,7 +16,7 @@ from pipelines.synth.simulate import Take
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import rasterize_mesh

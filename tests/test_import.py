@@ -221,11 +221,11 @@ DOORS: dict[str, set[str]] = {
     "np.memmap": set(),
     "np.fromfile": set(),
     "json.load": set(),
-    "json.loads": {"smplxpp/core/json_file.py"},
+    "json.loads": {"smplxpp/core/files/json_file.py"},
     "pickle.load": set(),
     "pickle.loads": set(),
-    "Image.open": {"smplxpp/core/image_file.py", "smplxpp/capture/readers/neus2.py"},
-    "zipfile.ZipFile": {"smplxpp/core/array_file.py"},
+    "Image.open": {"smplxpp/core/files/image_file.py"},
+    "zipfile.ZipFile": {"smplxpp/core/files/array_file.py"},
     "safe_open": {"avatar/gaussians/tensor_file.py"},
     "load_file": set(),  # of safetensors
     "torch.load": {"avatar/losses/perceptual.py"},  # weights of a metric, tensors alone
@@ -245,16 +245,16 @@ def test_files_are_opened_by_their_doors():
     assert {call: files - DOORS[call] for call, files in found.items() if files - DOORS[call]} == {}
 
 
-# What reads a file whole or opens it -> where it may stand: files of others go through `smplxpp.core.paths`, which
-# refuses pipes and devices and bounds the size.
+# What reads a file whole or opens it -> where it may stand: files of others go through `smplxpp.core.files.paths`,
+# which refuses pipes and devices and bounds the size.
 READS: dict[str, set[str]] = {
-    "read_bytes": {"smplxpp/core/paths.py", "pipelines/stages/build_config.py"},
+    "read_bytes": {"smplxpp/core/files/paths.py", "pipelines/stages/build_config.py"},
     "read_text": {  # the system's, and our own sources
         *("smplxpp/native/__init__.py", "avatar/render/list_limit.py"),
         *("pipelines/report/builder.py", "pipelines/runs/code.py"),
     },
     "open": {
-        *("smplxpp/core/array_file.py", "smplxpp/core/safe_pickle.py", "smplxpp/core/image_file.py"),
+        *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
         *("smplxpp/capture/readers/colmap_model.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/digests.py"),
         *("smplxpp/capture/writers/arrays.py", "smplxpp/core/params.py", "avatar/export/splats.py"),  # written
         *("avatar/training/engine/metrics_log.py", "pipelines/runs/lock.py", "pipelines/commands/terminal.py"),

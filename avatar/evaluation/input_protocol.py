@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import shown
+from smplxpp.core.files.json_file import shown
 from smplxpp.core.validation import require_choice, require_known
 
 NOT_KNOWN, EXACT, TRACKED, MIXED = "not known", "exact", "tracked", "mixed"

@@ -15,9 +15,9 @@ from avatar.export.ply_header import PlyLayout, read_ply_layout
 from avatar.gaussians.binding import THICKNESS, BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import C0, rotate_sh
-from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import read_bytes
+from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.paths import read_bytes
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _DC = tuple(f"f_dc_{k}" for k in range(3))

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import open_tensor_file, require_finite
-from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_text, shown
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.json_file import as_integer, as_text, shown
 
 SCHEMA = 1
 _KIND = "bound_gaussians"

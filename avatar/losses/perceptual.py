@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.files.paths import regular_file
 from smplxpp.core.validation import require_choice
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from avatar.models.networks.limits import LARGEST_NUMBER
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import shown
+from smplxpp.core.files.json_file import shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -24,9 +24,9 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
-from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, shown
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.json_file import as_integer, shown
 
 SCHEMA = 1
 HEADER = "avatar"

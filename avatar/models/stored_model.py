@@ -13,7 +13,7 @@ from avatar.gaussians.tensor_file import require_like
 from avatar.models.config_dict import config_from_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_object
+from smplxpp.core.files.json_file import as_integer, as_list, as_object
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -29,9 +29,9 @@ from PIL import Image
 from benchmarks.on_gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.capture import open_capture
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.camera import Camera
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_values import jsonable
 from smplxpp.template.template import Template
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -28,9 +28,9 @@ from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
-from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.image_file import open_image
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.files.image_file import open_image
+from smplxpp.core.files.json_values import jsonable
 
 RESULTS_FILE = "results.json"
 

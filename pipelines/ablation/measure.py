@@ -22,8 +22,8 @@ from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.evaluate import surface_digest
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
-from smplxpp.core.atomic import atomic_write_bytes
-from smplxpp.core.json_file import as_integer, as_number
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.json_file import as_integer, as_number
 
 ROWS_FOLDER = f"{ABLATION}/rows"
 PLAYER_FILE, REPORT_FILE, PICTURES = "player.safetensors", "report.json", "pictures"

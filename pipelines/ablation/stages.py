@@ -23,7 +23,7 @@ from avatar.training.student.prune import coefficient_std, pruned_to
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_results import training_output
-from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_write_bytes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,13 +21,13 @@ from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv, write_plain_cameras_json
 from smplxpp.capture.writers.description import write_description
 from smplxpp.capture.writers.keypoints import write_keypoints
-from smplxpp.core.atomic import atomic_path, atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_object, read_json
-from smplxpp.core.json_values import jsonable
-from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes, atomic_write_text
+from smplxpp.core.files.json_file import as_object, read_json
+from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.params import BodyParams
-from smplxpp.core.paths import read_bytes
 from smplxpp.core.validation import require_between, require_choice, require_positive
 
 Progress = Callable[[int, int], None]

@@ -11,10 +11,10 @@ from jaxtyping import UInt8, UInt16
 from smplxpp.capture import Capture
 from smplxpp.capture.window import Window
 from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
-from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import image_mode
-from smplxpp.core.paths import read_bytes
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.image_file import image_mode
+from smplxpp.core.files.paths import read_bytes
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 

@@ -29,7 +29,7 @@ from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
 from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.spread import spread
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, REFINE
 from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST, is_finished
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_list, as_object, read_json
+from smplxpp.core.files.json_file import as_list, as_object, read_json
 
 _STYLES = {"pass": "green", "warn": "yellow", "fail": "red"}
 _STATES = {

@@ -17,14 +17,15 @@ import numpy as np
 import tyro
 from jaxtyping import Shaped
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
-from smplxpp.core.array_file import read_array, read_arrays
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh_io import MeshFile, read_mesh
+from smplxpp.core.files.array_file import read_array, read_arrays
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.mesh_files.mesh_io import MeshFile, read_mesh
 from smplxpp.core.validation import require_at_least
 from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
 
@@ -313,4 +314,4 @@ def _print(report: dict[str, Any], console: Console) -> None:
                     add(f"  {label}", {k.removeprefix(start): v for k, v in values.items() if k.startswith(start)})
     console.print(table)
     for entry in report["skipped"]:
-        console.print(f"[yellow]skipped[/] {entry['frame']}: {entry['reason']}", soft_wrap=True)
+        console.print(f"[yellow]skipped[/] {escape(str(entry['frame']))}: {escape(entry['reason'])}", soft_wrap=True)

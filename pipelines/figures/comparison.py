@@ -11,8 +11,8 @@ from jaxtyping import UInt8
 from avatar.data.views import read_view
 from pipelines.figures import colormap, encode_png, heat_colors
 from smplxpp.capture import Capture
-from smplxpp.core.atomic import atomic_write_bytes
-from smplxpp.core.image_file import open_image
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.image_file import open_image
 
 ERROR_LIMIT = 64
 """Difference of the worst channel, of 255, that the error's colours end at."""

@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 
 from pipelines.figures import body_cameras, caption, encode_png, render_heat, row
 from pipelines.figures.comparison import error_colors
-from smplxpp.core.atomic import atomic_write_bytes
-from smplxpp.core.image_file import open_image
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.image_file import open_image
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.metrics import point_to_surface
 

@@ -18,8 +18,8 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import encode_png
-from smplxpp.core.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)

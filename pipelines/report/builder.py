@@ -22,7 +22,7 @@ from pipelines.report.model import (
     format_value,
     worst_status,
 )
-from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.files.atomic import atomic_write_text
 
 _VERDICTS = {
     "pass": "Every check passes",

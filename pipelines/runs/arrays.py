@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.core.array_file import read_arrays
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays
 
 _REMEDY = "the stage's file is damaged: delete the stage's folder and give the command again"
 

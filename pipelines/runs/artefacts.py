@@ -23,10 +23,10 @@ from pipelines.runs.layout import (
 from pipelines.runs.reading import values_of
 from smplxpp.body import BodyModel, load_params
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_numbers
+from smplxpp.core.files.json_file import as_integer, as_numbers
+from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.core.safe_pickle import safe_npz
 from smplxpp.core.skin_weights import SkinWeights
 
 

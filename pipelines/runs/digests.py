@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.files.paths import regular_file
 
 GEOMETRY = ("numpy", "scipy", "libigl", "fast-simplification")
 TRAINING = (*GEOMETRY, "torch")

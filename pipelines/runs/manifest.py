@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_number, as_object, as_text, read_json, shown
+from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, read_json, shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -31,9 +31,9 @@ from pipelines.runs.checks import Check
 from pipelines.runs.code import code_of
 from pipelines.runs.digests import GEOMETRY, sha256_file, versions
 from pipelines.runs.manifest import SCHEMA, read_record
-from smplxpp.core.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
+from smplxpp.core.files.json_values import jsonable
 
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3

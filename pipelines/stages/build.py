@@ -32,9 +32,9 @@ from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs
 from pipelines.stages.register_capture import register_capture
 from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import load_body, load_params
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.validation import require_choice
 from smplxpp.segment import find_label_set
 

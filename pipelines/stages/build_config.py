@@ -14,9 +14,9 @@ from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from pipelines.runs.reading import values_of
 from smplxpp.clean import WebConfig
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.labels import LABELS
 
 log = logging.getLogger(__name__)

@@ -42,8 +42,8 @@ from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.scene_digests import params_digest
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
-from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.validation import require_known
 from smplxpp.metrics.distance import MM

@@ -11,7 +11,7 @@ from pipelines.stages.build_config import load_build
 from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps, path_of_params
 from pipelines.stages.usable import normal_maps
 from smplxpp.capture import Capture
-from smplxpp.core.json_file import as_integer, as_text
+from smplxpp.core.files.json_file import as_integer, as_text
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:

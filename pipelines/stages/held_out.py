@@ -11,7 +11,7 @@ from typing import Any
 from pipelines.runs.stage import MANIFEST, StageRecord, read_manifest
 from smplxpp.capture.splits import Splits
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_object, as_text
+from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text
 
 log = logging.getLogger(__name__)
 NAMED = 8

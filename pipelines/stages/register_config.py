@@ -13,9 +13,9 @@ from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from pipelines.runs.reading import values_of
 from smplxpp.capture.readers.simple import stacked_params
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, read_json
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
 
 log = logging.getLogger(__name__)
 

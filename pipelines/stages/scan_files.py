@@ -8,8 +8,8 @@ from pathlib import Path
 from smplxpp.clean import check_human_scale, convert_points, sanitize
 from smplxpp.clean.repair import Sanitized
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh_io import read_raw_mesh
-from smplxpp.core.raw_mesh import RawMesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.raw_mesh import RawMesh
 
 
 @dataclass(frozen=True, eq=False)

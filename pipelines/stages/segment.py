@@ -19,7 +19,7 @@ from smplxpp.capture import read_cameras
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, display_colors
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_raw_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.segment import read_label_map, read_labels, segment_scan, vote_on_faces
 
 

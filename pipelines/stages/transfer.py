@@ -22,7 +22,7 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import WebConfig, cut_webs, find_webs
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.metrics import weight_report
 from smplxpp.skinning import UnposeConfig, unpose

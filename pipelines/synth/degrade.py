@@ -28,9 +28,9 @@ from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.cameras import write_cameras_json
 from smplxpp.capture.writers.description import write_description
-from smplxpp.core.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least
 

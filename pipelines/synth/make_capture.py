@@ -28,11 +28,11 @@ from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
-from smplxpp.core.array_file import read_arrays
-from smplxpp.core.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
 Progress = Callable[[str, float], None]

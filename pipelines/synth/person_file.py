@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
 from smplxpp.body import load_body
-from smplxpp.core.array_file import read_arrays
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.mesh import TriangleMesh
 
 _NEEDED = ("v_tpose", "faces", "face_part", "vertex_part", "vertex_label", "weights", "betas", "part_names")

@@ -12,7 +12,7 @@ import numpy as np
 from smplxpp.body.layout import HAND_WIDTH, JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
-from smplxpp.core.safe_pickle import dense_array, safe_load, safe_npz
+from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 
 _REQUIRED = ("v_template", "f", "shapedirs", "weights", "J_regressor", "kintree_table")
 _OPTIONAL = (

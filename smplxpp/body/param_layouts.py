@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.json_file import as_numbers
+from smplxpp.core.files.json_file import as_numbers
 from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 
 _JOINTS = dict(POSE_BLOCKS)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_numbers
+from smplxpp.core.files.json_file import as_numbers
 from smplxpp.core.validation import require_choice
 from smplxpp.native import address, check_size, native_library
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smplxpp.core.array_file import read_array
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import open_image
+from smplxpp.core.files.array_file import read_array
+from smplxpp.core.files.image_file import open_image
 
 if TYPE_CHECKING:
     from PIL.Image import Image

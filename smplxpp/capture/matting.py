@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from smplxpp.capture.capture import Capture
-from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.paths import regular_file
 
 # Side of the square that models of free input size are fed with.
 _DEFAULT_SIDE = 1024

@@ -10,9 +10,9 @@ import numpy as np
 
 from smplxpp.capture.files import FileSeries
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh
-from smplxpp.core.safe_pickle import safe_npz
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from jaxtyping import Int64
 from smplxpp.body import BodyModel, LayoutName, UpAxis, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.core.safe_pickle import safe_npz
 
 # What has a row a frame, in the layouts that stack frames.
 _STACKED = (*ARRAY_NAMES, "poses", "trans")

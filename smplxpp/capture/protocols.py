@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.json_file import read_json
 
 DESCRIPTIONS = ("capture.json", "manifest.json")
 """Files that describe a capture of our layout: written by hand, or by the tool that made it. The first counts."""

@@ -3,7 +3,7 @@
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 

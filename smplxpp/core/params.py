@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_path
 
 # Pose blocks in SMPL-X joint order, with their number of joints.
 POSE_BLOCKS: tuple[tuple[str, int], ...] = (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pygltflib
 
-from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.params import BodyParams
 from smplxpp.export.gltf_animation import add_animation
 from smplxpp.export.gltf_buffers import BufferBuilder

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.template.template import Template
 
 

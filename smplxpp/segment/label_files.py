@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
-from smplxpp.core.array_file import array_names, read_array, read_arrays
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import open_image
-from smplxpp.core.json_file import as_numbers
+from smplxpp.core.files.array_file import array_names, read_array, read_arrays
+from smplxpp.core.files.image_file import open_image
+from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files.safe_pickle import safe_load
 from smplxpp.core.labels import BACKGROUND, LABELS
-from smplxpp.core.mesh_io import read_mesh
-from smplxpp.core.paths import regular_file
-from smplxpp.core.safe_pickle import safe_load
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.segment.labels import LabelSet, map_labels
 
 _KEYS = (

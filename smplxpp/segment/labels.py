@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Int64, Num
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
 
 _OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 
 from smplxpp.body.model import BodyModel, PosedBody
-from smplxpp.core.array_file import read_arrays, write_arrays
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, semantic_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams

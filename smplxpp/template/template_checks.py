@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_object, as_text, parse_json
+from smplxpp.core.files.json_file import as_object, as_text, parse_json
 
 # Kind of numbers ("f": any floats, "i": any integers, "b": bools, "U": texts) and number of axes, by name in the file.
 _KINDS = {

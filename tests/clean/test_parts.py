@@ -13,7 +13,7 @@ from smplxpp.clean import PartsConfig, clean_parts, drop_specks, fill_pinholes, 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.topology import border_loops, edge_groups, face_components
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -177,7 +177,7 @@ def test_bad_labels_are_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["woman_casual", "man_casual"])
 def test_parts_of_a_capture(captures, name: str):
-    from smplxpp.core.mesh_io import read_mesh
+    from smplxpp.core.mesh_files.mesh_io import read_mesh
     from smplxpp.segment import read_labels, segment_scan
 
     folder = captures / name / "scans"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.export import write_obj
 from tests.export.templates import random_template
 

@@ -291,7 +291,7 @@ def test_the_same_mesh_gives_the_same_bytes(ball, front):
 
 
 def test_a_capture_fills_its_picture(captures):
-    from smplxpp.core.mesh_io import read_mesh
+    from smplxpp.core.mesh_files.mesh_io import read_mesh
 
     scan = read_mesh(captures / "man_casual" / "scans" / "scan_000000.ply")
     camera = body_cameras(scan.mesh, views=("front",), height=200)[0]

@@ -16,12 +16,12 @@ from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.images import read_alpha, read_color, read_normals
 from smplxpp.capture.images import read_labels as read_label_image
 from smplxpp.capture.keypoint_files import read_keypoints
-from smplxpp.core.array_file import read_array, read_arrays, write_arrays
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
+from smplxpp.core.files.json_file import read_json
+from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import BodyParams
-from smplxpp.core.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set
 from tests.capture.scene import make_scene

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.core.pickle_machine import PickleMachine
+from smplxpp.core.files.pickle_machine import PickleMachine
 
 Rng = np.random.Generator
 

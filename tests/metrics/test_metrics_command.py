@@ -12,7 +12,7 @@ import tyro
 
 from pipelines.commands.metrics import Metrics, Preset, frame_number, pair_frames
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.metrics import presets
 
 

@@ -24,7 +24,7 @@ from smplxpp.body.stress_poses import stress_poses
 from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.template.template import Template
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

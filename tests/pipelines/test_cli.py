@@ -15,7 +15,7 @@ import pytest
 
 from pipelines.cli import COMMANDS, main
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import write_ply
+from smplxpp.core.mesh_files.mesh_io import write_ply
 from tests.runs.stages import add_stage
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -12,9 +12,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from avatar.gaussians.tensor_file import open_tensor_file
-from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_number, shown
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.json_file import as_integer, as_number, shown
 
 SCHEMA = 1
 log = logging.getLogger(__name__)

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.json_file import as_integer, as_object, as_text, parse_json
-from smplxpp.core.json_values import jsonable
-from smplxpp.core.paths import read_bytes
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_json
+from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.paths import read_bytes
 
 log = logging.getLogger(__name__)
 # A million steps have some hundred megabytes.

@@ -15,8 +15,8 @@ from pipelines.captures.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, 
 from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.runs.digests import versions
-from smplxpp.core.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.spread import spread
 
 SHOWN_MESSAGES, SHOWN_FRAMES = 12, 200

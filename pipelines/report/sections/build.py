@@ -50,7 +50,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from pipelines.stages.motion import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
-from smplxpp.core.json_values import jsonable
+from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams

@@ -19,7 +19,7 @@ from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES
-from smplxpp.core.paths import path_inside, read_bytes
+from smplxpp.core.files.paths import path_inside, read_bytes
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:

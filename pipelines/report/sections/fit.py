@@ -15,8 +15,8 @@ from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Se
 from pipelines.runs.layout import BIND_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_numbers, shown
-from smplxpp.core.paths import path_inside
+from smplxpp.core.files.json_file import as_numbers, shown
+from smplxpp.core.files.paths import path_inside
 
 HEAD_HEIGHT = 420
 """Pixels: crops of the head are enlarged by the whole number that brings them nearest to this."""

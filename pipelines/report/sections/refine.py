@@ -12,7 +12,7 @@ from pipelines.figures.evaluation import read_tiles
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import REFINE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
-from smplxpp.core.paths import path_inside
+from smplxpp.core.files.paths import path_inside
 
 
 def standing_refinement(run: Path, template_digest: str) -> StageRecord | None:

@@ -28,7 +28,7 @@ from smplxpp.body.model import PosedBody
 from smplxpp.capture import Capture, find_scans
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import read_json
+from smplxpp.core.files.json_file import read_json
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 

@@ -11,7 +11,7 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_numbers, read_json
+from smplxpp.core.files.json_file import as_numbers, read_json
 
 NAME = "avatarrex"
 LOOKS_FOR = "calibration_full.json"

@@ -14,7 +14,7 @@ from smplxpp.capture.readers.image_cameras import camera_names, number_at_end
 from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import path_inside
+from smplxpp.core.files.paths import path_inside
 
 NAME = "colmap"
 LOOKS_FOR = "cameras and images as .bin or .txt, in sparse/0, sparse or there"

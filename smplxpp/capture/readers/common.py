@@ -15,9 +15,9 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import ParamSource
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import image_size
-from smplxpp.core.json_file import as_integer, as_numbers
-from smplxpp.core.paths import check_name
+from smplxpp.core.files.image_file import image_size
+from smplxpp.core.files.json_file import as_integer, as_numbers
+from smplxpp.core.files.paths import check_name
 
 # Largest deviation of R R^T from the identity: calibrations are written with six digits and more.
 _ROTATION_TOLERANCE = 1e-3

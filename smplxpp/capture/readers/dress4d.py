@@ -13,8 +13,8 @@ from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_numbers
-from smplxpp.core.safe_pickle import safe_load
+from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.files.safe_pickle import safe_load
 
 NAME = "4ddress"
 LOOKS_FOR = "Capture/cameras.pkl beside Meshes_pkl/"

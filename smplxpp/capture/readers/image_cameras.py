@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 
 from smplxpp.capture.files import IMAGE_SUFFIXES
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import check_name
+from smplxpp.core.files.paths import check_name
 
 # Folders that say nothing of a camera, with nerfstudio's reductions (images_4).
 _IMAGE_FOLDER = re.compile(r"(?:images?|imgs?|rgbs?)(?:_\d+)?")

@@ -19,8 +19,8 @@ from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import image_mode, image_size
-from smplxpp.core.json_file import as_list, as_number, as_object, as_text, read_json
+from smplxpp.core.files.image_file import image_mode, image_size
+from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text, read_json
 
 NAME = "neus2"
 LOOKS_FOR = "transform*.json, there or in train/ and test/"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import read_text
+from smplxpp.core.files.paths import read_text
 
 _KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
 

@@ -17,7 +17,7 @@ from smplxpp.capture.distortion import FISHEYE, OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_number, as_numbers, as_text
+from smplxpp.core.files.json_file import as_integer, as_number, as_numbers, as_text
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")

@@ -14,7 +14,7 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES
 from smplxpp.capture.readers.image_cameras import camera_names, number_at_end, without_suffix
 from smplxpp.core.camera import Camera
-from smplxpp.core.paths import path_inside
+from smplxpp.core.files.paths import path_inside
 
 
 @dataclass(frozen=True, eq=False)

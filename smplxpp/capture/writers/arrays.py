@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.array_file import write_arrays
-from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import write_arrays
+from smplxpp.core.files.atomic import atomic_path
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 # Coordinates of truth meshes are rounded to this many metres (0.06 mm): they compress better.

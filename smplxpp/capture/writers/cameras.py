@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.atomic import atomic_write_text
 from smplxpp.core.camera import Camera
+from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.rotations import rotvec_from_matrix
 
 _CONVENTION = (

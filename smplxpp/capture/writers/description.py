@@ -10,7 +10,7 @@ import numpy as np
 
 from smplxpp.capture.recording import Recording
 from smplxpp.capture.splits import Splits
-from smplxpp.core.atomic import atomic_write_text
+from smplxpp.core.files.atomic import atomic_write_text
 
 
 def write_description(path: Path, recording: Recording, splits: Splits, frames: Sequence[int]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 
-from smplxpp.core.atomic import atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_write_bytes
 
 # kind of file -> folder, and what stands before the frame's number in a file's name.
 VIEW_FOLDERS = {

@@ -6,7 +6,7 @@ import trimesh
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh, read_raw_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """The one door for arrays: npy and npz files whose sizes and types are checked before anything is allocated.
 
 Files are written without the time they were written at: the same arrays give the same bytes. Arrays of objects are read
-by `smplxpp.core.safe_pickle` alone.
+by `smplxpp.core.files.safe_pickle` alone.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from smplxpp.core.atomic import atomic_path
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.paths import regular_file
 
 ObjectReader = Callable[[BinaryIO, str], Any]
 """Reads the pickle of an array of objects from a stream; the second argument names it in messages."""

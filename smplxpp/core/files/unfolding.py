@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.core.pickle_values import InertObject, Unbuilt, broken
+from smplxpp.core.files.pickle_values import InertObject, Unbuilt, broken
 
 _MOST_LEVELS = 200
 

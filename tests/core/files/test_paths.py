@@ -3,7 +3,7 @@ import os
 import pytest
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import check_name, path_inside, read_bytes, read_text, regular_file
+from smplxpp.core.files.paths import check_name, path_inside, read_bytes, read_text, regular_file
 
 
 def test_a_pipe_a_device_and_a_folder_are_no_files(tmp_path):

@@ -14,7 +14,7 @@ from PIL import Image
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_io import read_mesh, read_raw_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from tests.core.gltf_maker import make_glb, make_gltf
 from tests.core.mutations import mutations
 

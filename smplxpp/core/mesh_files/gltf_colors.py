@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float64, Num, UInt8
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.gltf_document import GltfDocument
-from smplxpp.core.image_file import decode_image
-from smplxpp.core.json_file import as_number, as_numbers, as_text
-from smplxpp.core.raw_mesh import warn
-from smplxpp.core.texture import sample_texture
+from smplxpp.core.files.image_file import decode_image
+from smplxpp.core.files.json_file import as_number, as_numbers, as_text
+from smplxpp.core.mesh_files.gltf_document import GltfDocument
+from smplxpp.core.mesh_files.raw_mesh import warn
+from smplxpp.core.mesh_files.texture import sample_texture
 
 if TYPE_CHECKING:
     from PIL.Image import Image

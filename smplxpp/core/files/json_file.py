@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import read_bytes
+from smplxpp.core.files.paths import read_bytes
 
 # Keypoints of a long film in one file have some hundred megabytes; nothing that we read nests deeper than ten levels.
 _MOST_BYTES, _MOST_LEVELS = 1 << 30, 64

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import open_image
-from smplxpp.core.paths import path_inside, regular_file
-from smplxpp.core.raw_mesh import warn
+from smplxpp.core.files.image_file import open_image
+from smplxpp.core.files.paths import path_inside, regular_file
+from smplxpp.core.mesh_files.raw_mesh import warn
 
 if TYPE_CHECKING:
     from PIL.Image import Image

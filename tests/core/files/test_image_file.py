@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.image_file import image_mode, image_size, open_image
+from smplxpp.core.files.image_file import image_mode, image_size, open_image
 
 
 def png_of_size(width: int, height: int) -> bytes:

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from smplxpp.core.array_file import array_names, read_array, read_arrays, write_arrays
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import array_names, read_array, read_arrays, write_arrays
 
 KINDS = ["<f4", ">f8", "<i2", ">u4", "|b1", "<U7", "|S3", "<c16", "<f2", "|i1"]
 

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from smplxpp.core.array_file import check_dtype, check_shape
+from smplxpp.core.files.array_file import check_dtype, check_shape
 
 # Integers hash to themselves up to here; beyond, a file could choose keys that all hash alike.
 _LARGEST_KEY = 1 << 60

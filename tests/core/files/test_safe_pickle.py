@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.safe_pickle import InertObject, dense_array, safe_load, safe_npz
+from smplxpp.core.files.safe_pickle import InertObject, dense_array, safe_load, safe_npz
 
 
 class Call:

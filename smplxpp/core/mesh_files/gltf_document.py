@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_object, as_text, parse_json
-from smplxpp.core.paths import read_bytes
-from smplxpp.core.texture import Pictures, beside
+from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, parse_json
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.mesh_files.texture import Pictures, beside
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -1,9 +1,8 @@
 """The one door for pickles: other people's files and object arrays, read without executing anything they contain.
 
-A pickle is a program: its opcodes name Python objects and call them. `smplxpp.core.pickle_machine` runs the opcodes and
-knows arrays and plain containers alone. Objects of chumpy and scipy.sparse, which old body model files hold, become
-inert records of their state; `dense_array` reads the numbers out of them. Any other name is refused before anything is
-called.
+A pickle is a program: its opcodes name Python objects and call them. `pickle_machine` runs the opcodes and knows arrays
+and plain containers alone. Objects of chumpy and scipy.sparse, which old body model files hold, become inert records of
+their state; `dense_array` reads the numbers out of them. Any other name is refused before anything is called.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from typing import Any, BinaryIO
 import numpy as np
 import scipy.sparse
 
-from smplxpp.core.array_file import read_arrays
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import regular_file
-from smplxpp.core.pickle_machine import PickleMachine
-from smplxpp.core.pickle_values import InertObject, RefusedName
+from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files.pickle_machine import PickleMachine
+from smplxpp.core.files.pickle_values import InertObject, RefusedName
 
 # Errors that a truncated or foreign file raises inside the machine.
 _BROKEN = (

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh_io import read_mesh, read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
 
 PLACES = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -165,7 +165,7 @@ def test_files_longer_than_a_block_keep_their_order(tmp_path: Path, monkeypatch:
     for k, (a, b, c) in enumerate(faces + 1):
         lines += [f"usemtl m{k % 3}", f"f {a} {b}//1 {c}/3"]
     path = _write(tmp_path, "\n".join(lines))
-    monkeypatch.setattr("smplxpp.core.obj_file._BLOCK", 100)
+    monkeypatch.setattr("smplxpp.core.mesh_files.obj_file._BLOCK", 100)
     raw = read_raw_mesh(path)
     np.testing.assert_array_equal(raw.vertices, vertices)
     np.testing.assert_array_equal(raw.faces, faces)

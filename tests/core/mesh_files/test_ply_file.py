@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh_io import read_mesh, read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 XYZ = "property float x\nproperty float y\nproperty float z\n"

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.number_text import as_bytes, count_between, parse_numbers, word_starts
-from smplxpp.core.paths import read_bytes
-from smplxpp.core.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.mesh_files.number_text import as_bytes, count_between, parse_numbers, word_starts
+from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84

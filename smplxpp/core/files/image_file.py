@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.paths import regular_file
+from smplxpp.core.files.paths import regular_file
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh_io import read_raw_mesh
-from smplxpp.core.raw_mesh import RawMesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.raw_mesh import RawMesh
 from tests.core.gltf_maker import make_document, make_glb, make_gltf, pack_glb
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])

@@ -4,7 +4,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.json_file import as_integer, as_list, as_number, as_numbers, as_object, as_text, parse_json, read_json
+from smplxpp.core.files.json_file import (
+    as_integer,
+    as_list,
+    as_number,
+    as_numbers,
+    as_object,
+    as_text,
+    parse_json,
+    read_json,
+)
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),

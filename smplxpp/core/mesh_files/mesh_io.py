@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from smplxpp.core.array_file import read_arrays
-from smplxpp.core.atomic import atomic_write_bytes
 from smplxpp.core.errors import InputError
-from smplxpp.core.gltf_file import read_gltf
-from smplxpp.core.json_file import as_numbers
+from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.files.paths import regular_file
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.obj_file import read_obj
-from smplxpp.core.paths import regular_file
-from smplxpp.core.ply_file import read_ply
-from smplxpp.core.raw_mesh import RawMesh, color_bytes, require_reach
-from smplxpp.core.stl_off_files import read_off, read_stl
+from smplxpp.core.mesh_files.gltf_file import read_gltf
+from smplxpp.core.mesh_files.obj_file import read_obj
+from smplxpp.core.mesh_files.ply_file import read_ply
+from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, require_reach
+from smplxpp.core.mesh_files.stl_off_files import read_off, read_stl
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def _read_npz(path: Path) -> RawMesh:
 
 
 def _read_pickle(path: Path) -> RawMesh:
-    from smplxpp.core.safe_pickle import safe_load
+    from smplxpp.core.files.safe_pickle import safe_load
 
     loaded = safe_load(path)
     return _from_arrays(path, loaded if isinstance(loaded, dict) else {})

@@ -1,7 +1,7 @@
 """Runs the opcodes of a pickle with a vocabulary of its own: arrays, plain containers, records.
 
 The names in a pickle never become Python objects. They become `Name`s, and what is called is looked up in the table of
-`smplxpp.core.pickle_values`. Containers are only changed by what can stand in a file's data.
+`smplxpp.core.files.pickle_values`. Containers are only changed by what can stand in a file's data.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from smplxpp.core.pickle_values import (
+from smplxpp.core.files.pickle_values import (
     BUILDERS,
     KNOWN_NAMES,
     Budget,
@@ -27,7 +27,7 @@ from smplxpp.core.pickle_values import (
     exactly,
     is_recorded,
 )
-from smplxpp.core.unfolding import check_unfolding
+from smplxpp.core.files.unfolding import check_unfolding
 
 # What a file may unfold to, all references followed, beyond so many times its size.
 _FREELY_UNFOLDED, _MOST_UNFOLDING = 1 << 26, 16

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 
 CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0.5]]])
 

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from smplxpp.core.atomic import atomic_folder, atomic_path, atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from tests.full_disk import file_size_limit
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from smplxpp.core.paths import read_bytes
-from smplxpp.core.raw_mesh import warn
-from smplxpp.core.texture import beside
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.mesh_files.raw_mesh import warn
+from smplxpp.core.mesh_files.texture import beside
 
 # How many numbers follow an option of a picture's name.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}

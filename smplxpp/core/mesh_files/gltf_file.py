@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.gltf_colors import primitive_colors
-from smplxpp.core.gltf_document import GltfDocument, compressed
-from smplxpp.core.json_file import as_integer, as_numbers, as_object
-from smplxpp.core.raw_mesh import RawMesh, require_indices, warn
-from smplxpp.core.texture import LOST
+from smplxpp.core.files.json_file import as_integer, as_numbers, as_object
+from smplxpp.core.mesh_files.gltf_colors import primitive_colors
+from smplxpp.core.mesh_files.gltf_document import GltfDocument, compressed
+from smplxpp.core.mesh_files.raw_mesh import RawMesh, require_indices, warn
+from smplxpp.core.mesh_files.texture import LOST
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MOVING = {"matrix", "translation", "rotation", "scale"}
