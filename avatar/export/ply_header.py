@@ -26,6 +26,7 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
+_MOST_DIGITS = 18
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20
 
@@ -68,7 +69,7 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
                 raise InputError(
                     subject, expected="a binary PLY", received="a text PLY", remedy="save it as binary little endian"
                 )
-            case ["element", name, digits] if digits.isdecimal():
+            case ["element", name, digits] if digits.isdecimal() and len(digits) <= _MOST_DIGITS:
                 elements.append((name, int(digits), []))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1][2].append((name, _TYPES[kind]))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, read_json, shown
+from smplxpp.core.files.paths import path_inside
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -36,8 +37,7 @@ def read_record(path: Path) -> dict[str, Any]:
         for file, digest in content[name].items():
             as_text(digest, subject=f"{subject}: {name}: {file}")
     for file in content["files"]:
-        if PurePosixPath(file).is_absolute() or ".." in PurePosixPath(file).parts:
-            raise InputError(f"{subject}: files", expected="names within the stage", received=repr(file[:80]))
+        path_inside("stage", file, subject=f"{subject}: files")
     as_number(content.setdefault("seconds", 0.0), subject=f"{subject}: seconds", least=0.0, most=_MOST_SECONDS)
     for check in as_list(content.setdefault("checks", []), subject=f"{subject}: checks"):
         require_check(check, subject=f"{subject}: check")

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import InputError
 from smplxpp.core.skin_weights import SkinWeights
 
 # Raised when a reader of the older layout would misread the file.
@@ -38,7 +39,6 @@ _ORDER = (
     *("left_hand_components", "right_hand_components", "left_hand_mean", "right_hand_mean"),
     *("body_labels", "body_label_names", "body_index", "scan_index", "expression_names", "metadata"),
 )
-_LARGEST_INDEX = 2**31 - 1
 _WEIGHTS = "weights_"
 _BASES = ("shapedirs", "exprdirs", "posedirs")
 
@@ -121,24 +121,26 @@ def weights_from_arrays(arrays: Mapping[str, np.ndarray]) -> SkinWeights:
 
     Raises:
         KeyError: one that is missing.
-        ValueError: indices beyond 32 bits.
+        InputError: indices beyond 32 bits.
     """
     return SkinWeights(
-        joint_indices=_int32(arrays[f"{_WEIGHTS}joint_indices"]),
+        joint_indices=_int32(arrays, f"{_WEIGHTS}joint_indices"),
         joint_weights=arrays[f"{_WEIGHTS}joint_weights"],
         joint_count=int(arrays[f"{_WEIGHTS}joint_count"]),
         matched=arrays[f"{_WEIGHTS}matched"],
         distance=arrays[f"{_WEIGHTS}distance"],
         angle=arrays[f"{_WEIGHTS}angle"],
-        component=_int32(arrays[f"{_WEIGHTS}component"]),
+        component=_int32(arrays, f"{_WEIGHTS}component"),
         policies=_texts(arrays[f"{_WEIGHTS}policies"]),
     )
 
 
-def _int32(values: np.ndarray) -> np.ndarray:
-    if values.dtype.kind not in "iu" or (values.size and np.abs(values.astype(np.float64)).max() > _LARGEST_INDEX):
-        raise ValueError(f"indices of type {values.dtype}")
-    return values.astype(np.int32, copy=False)
+def _int32(arrays: Mapping[str, np.ndarray], key: str) -> np.ndarray:
+    values = arrays[key]
+    out = values.astype(np.int32) if values.dtype.kind in "iu" else None
+    if out is None or (out != values).any():
+        raise InputError(f"template: {key}", expected="indices of 32 bits", received=f"others, of type {values.dtype}")
+    return out
 
 
 def in_file_order(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -115,8 +115,8 @@ def test_a_training_that_the_time_stopped_is_unfinished(run, capsys):
 WRONG = [
     ("numbers", [1], "numbers: expected an object"),
     ("files", {"data.bin": 3}, "files: data.bin: expected a text"),
-    ("files", {"../../data.bin": "0" * 64}, "names within the stage"),
-    ("files", {"/dev/zero": "0" * 64}, "names within the stage"),
+    ("files", {"../../data.bin": "0" * 64}, "inside of stage"),
+    ("files", {"/dev/zero": "0" * 64}, "inside of stage"),
     ("inputs", ["a"], "inputs: expected an object"),
     ("seconds", "long", "seconds: expected a finite number"),
     ("seconds", float("nan"), "seconds: expected a finite number"),

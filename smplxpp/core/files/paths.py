@@ -9,6 +9,8 @@ from pathlib import Path
 from smplxpp.core.errors import InputError
 
 _LONGEST_NAME = 200
+# Bytes of a file's or folder's name: what file systems take.
+_LONGEST_PART = 255
 
 
 def regular_file(path: str | Path, *, subject: str = "file", remedy: str = "") -> Path:
@@ -75,7 +77,8 @@ def path_inside(root: str | Path, name: str, *, base: str | Path | None = None, 
     text = name.replace("\\", "/")
     joined = Path(os.path.normpath(Path(root if base is None else base) / text))
     inside = joined.is_relative_to(os.path.normpath(root))
-    if not text or "\0" in text or text.startswith("/") or text[1:3] == ":/" or not inside:
+    too_long = any(len(part.encode(errors="replace")) > _LONGEST_PART for part in joined.parts)
+    if not text or "\0" in text or text.startswith("/") or text[1:3] == ":/" or not inside or too_long:
         raise InputError(
             subject,
             expected=f"a path inside of {root}",
