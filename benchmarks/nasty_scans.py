@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from scipy.spatial import cKDTree
 
-from benchmarks.machine import store_results
+from benchmarks.machine import RESULTS, store_results
 from smplxpp.body import load_body, load_params
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
@@ -139,7 +139,7 @@ class NastyScans:
     """Build variants of the fixture's scan and store what each build says."""
 
     names: tuple[str, ...] = ()
-    """Variants to build; by default all. Results are stored only then."""
+    """Variants to build; by default all. The others keep what is stored of them."""
 
     def run(self) -> None:
         """Build, print and store."""
@@ -148,8 +148,10 @@ class NastyScans:
         for name in self.names or made:
             figures[name] = _verdict(made[name]())
             print(name, figures[name], flush=True)
-        if not self.names:
-            store_results("nasty_scans", "python -m benchmarks.nasty_scans", figures)
+        stored = RESULTS / "nasty_scans.json"
+        if self.names and stored.is_file():
+            figures = json.loads(stored.read_text())["figures"] | figures
+        store_results("nasty_scans", "python -m benchmarks.nasty_scans", figures)
 
 
 def _fixture() -> tuple[Scan, dict[str, np.ndarray]]:
@@ -179,8 +181,10 @@ def _verdict(scan: Scan) -> dict[str, object]:
             _, status, usage = os.wait4(child, 0)
         cost = {"CPU seconds": usage.ru_utime + usage.ru_stime, "peak GiB": usage.ru_maxrss / 2**20}
         if status:
-            lines = (folder / "said").read_text().strip().splitlines()
-            return {"faces": len(scan.faces), "warn": None, "fail": None, "says": f"refused: {lines[-1]}", **cost}
+            said = (folder / "said").read_text()
+            error = json.loads(said[said.index("{") :])["error"]["message"]
+            error = error.replace(str(folder / "scan.npz"), "scan.npz")
+            return {"faces": len(scan.faces), "warn": None, "fail": None, "says": f"refused: {error}", **cost}
         checks = json.loads((folder / "run" / "metrics.json").read_text())["checks"]
         found = {kind: [c for c in checks if c["status"] == kind] for kind in ("fail", "warn")}
         words = [f"{c['name']} {c['value']:.3g}" for kind in ("fail", "warn") for c in found[kind]]
