@@ -13,10 +13,12 @@ import tyro
 
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
+from pipelines.runs.by_hand import take_file
 from pipelines.runs.layout import (
     BIND_STAGE,
     BUILD_STAGES,
     EVALUATE_STAGE,
+    LANDMARKS_FILE,
     REFINE_STAGE,
     REGISTER_STAGE,
     TRAIN_STAGES,
@@ -50,6 +52,9 @@ class Build:
     """Body parameters of that frame, any layout that `smplxpp params convert` reads."""
     labels: OptionalPath = None
     """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh."""
+    landmarks: OptionalPath = None
+    """Landmarks of the scan, a JSON object of points by name: with --scan they stand in for --params. Kept in the run
+    as landmarks.json, which is read whenever it lies there."""
     label_set: str = "auto"
     """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
     auto: `capture` with --capture, else 4ddress."""
@@ -100,9 +105,11 @@ class Build:
         from pipelines.commands.inspect import Inspect
         from pipelines.report.sections.build import write_build_report
         from pipelines.stages.build import build
+        from smplxpp.register.landmark_file import read_landmarks
 
         keep_out_of_capture(self.out, self.capture)
         config, inputs = self.config(), self.inputs()
+        take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
         count = sum(name in inputs.stages for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
@@ -172,8 +179,9 @@ class Build:
             )
         if self.protocol is not None:
             raise InputError("option protocol", expected="with --capture", received="with --scan")
-        if self.params is None or self.scan is None:
-            raise InputError("input", expected="--params with --scan", received="no --params")
+        placed = self.landmarks is not None or (self.out / LANDMARKS_FILE).exists()
+        if self.scan is None or (self.params is None and not placed):
+            raise InputError("input", expected="--params with --scan, or --landmarks", received="neither")
         return BuildInputs(
             subject=self.scan.stem,
             scan=self.scan,

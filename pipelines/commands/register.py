@@ -27,7 +27,7 @@ _SHOWN = 8
 
 @dataclass(frozen=True)
 class Register:
-    """Options of `smplxpp register`. Give --capture, or --scan with --params."""
+    """Options of `smplxpp register`. Give --capture, or --scan with --params or --landmarks."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; the registration goes into it as 05_register, and `smplxpp build` there takes it up."""
@@ -49,6 +49,9 @@ class Register:
     """Labels of the reference frame's scan; without them its label maps vote."""
     label_set: str = "capture"
     """Label set of --labels, or a JSON file that maps ids to names."""
+    landmarks: OptionalPath = None
+    """Landmarks of that scan, a JSON object of points by name; kept in the run as landmarks.json, which is read
+    whenever it lies there."""
     hold_out: tuple[str, ...] = ()
     """Cameras that are not looked at; by default those that the capture holds out."""
     body: OptionalPath = None
@@ -69,16 +72,19 @@ class Register:
     def run(self) -> dict:
         """Register, write the report, print residuals before and after."""
         from pipelines.commands.progress import shared_progress
-        from pipelines.runs.layout import REGISTER_STAGE
+        from pipelines.runs.by_hand import take_file
+        from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE
         from pipelines.runs.lock import own_run_folder
         from pipelines.runs.places import keep_out_of_capture
         from pipelines.runs.reading import values_of
         from pipelines.stages.register_capture import register_capture
+        from smplxpp.register.landmark_file import read_landmarks
 
         keep_out_of_capture(self.out, self.capture)
         require_at_least("option seed", self.seed, 0)
         require_at_least("option frame", self.frame, 0)
         inputs = self.inputs()
+        take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
             record = register_capture(self.out, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
@@ -110,7 +116,7 @@ class Register:
 
         if self.capture is None and self.scan is None:
             raise InputError("input", expected="--capture, or --scan with --params", received="neither")
-        for name in ("scan", "labels", "body"):
+        for name in ("scan", "labels", "landmarks", "body"):
             path = getattr(self, name)
             if path is not None and not path.exists():
                 raise InputError(f"option {name}", expected="an existing file", received=str(path))

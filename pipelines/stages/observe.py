@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from pipelines.runs.digests import sha256_file
 from pipelines.stages.observed_scans import observed_scans
@@ -19,6 +19,8 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.register.landmark_file import read_landmarks
+from smplxpp.register.landmarks import LandmarkModel
 from smplxpp.register.observations import Observations
 from smplxpp.segment import map_labels
 
@@ -78,15 +80,18 @@ class Observed:
         return (*self.problems, *(words for one in self.maps for words in one.problems.values()))
 
 
-def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
+def observe(inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None = None) -> Observed:
     """Collect what a registration of these inputs sees.
+
+    Args:
+        landmarks: file of those that were placed by hand on the reference frame's scan.
 
     Raises:
         InputError: neither cameras nor scans, keypoints without cameras, nothing to start from, parameters of another
             body, unknown cameras or frames.
     """
     if inputs.capture is None:
-        return _observe_scan(inputs, body)
+        return _observe_scan(inputs, body, landmarks)
     capture = open_inputs(inputs, body)
     cameras = _training_cameras(capture, inputs)
     files = find_scans(inputs.capture) if inputs.scan is None else {inputs.frame: inputs.scan}
@@ -101,7 +106,8 @@ def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
     scans, problems = observed_scans(files, inputs, capture, labels)
     problems = [*unread, *problems]
     initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
-    if initial is None and not keypoints:
+    placed = _placed(landmarks, inputs.frame, body) if landmarks is not None and inputs.frame in frames else {}
+    if initial is None and not keypoints and not placed:
         raise InputError(
             f"capture {capture.name}",
             expected="keypoints of its training cameras, or a fit to start from",
@@ -120,33 +126,58 @@ def observe(inputs: RegisterInputs, body: BodyModel) -> Observed:
         mask=masks,
         labels=labels,
         scans=scans,
+        landmarks=placed,
         initial=initial,
         fps=capture.fps,
         shape_frames=shape,
     )
     maps = tuple(one for one in (masks, labels) if one is not None)
-    digests = _digests(observations, capture, files, inputs)
+    digests = _digests(observations, capture, files, inputs, landmarks if placed else None)
     return Observed(capture, observations, digests, (*problems, *more), maps)
 
 
-def _observe_scan(inputs: RegisterInputs, body: BodyModel) -> Observed:
-    """One scan with a fit to start from."""
+def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | None) -> Observed:
+    """One scan with a fit, or landmarks, to start from."""
     if inputs.scan is None:
         raise InputError("input", expected="--capture, or --scan with --params", received="neither")
-    if inputs.params is None or not inputs.start:
+    given = inputs.params if inputs.start else None
+    if given is None and landmarks is None:
         raise InputError(
             f"scan {inputs.scan.name}",
-            expected="a fit to start from: a scan alone does not say where its limbs are",
-            received="none",
-            remedy="name one with --params",
+            expected="a fit, or landmarks, to start from: a scan alone does not say where its limbs are",
+            received="neither",
+            remedy="name a fit with --params, or landmarks with --landmarks",
         )
-    params = load_params(inputs.params, body=body)
-    initial = params.frame(inputs.frame if len(params) > 1 else 0)
-    _check_body(initial, body, str(inputs.params))
+    initial = None
+    if given is not None:
+        params = load_params(given, body=body)
+        initial = params.frame(inputs.frame if len(params) > 1 else 0)
+        _check_body(initial, body, str(given))
+    placed = {} if landmarks is None else _placed(landmarks, inputs.frame, body)
     files = {inputs.frame: inputs.scan}
     scans, _ = observed_scans(files, inputs, None, None)
-    observations = Observations((inputs.frame,), scans=scans, initial=initial, shape_frames=(inputs.frame,))
-    return Observed(None, observations, _digests(observations, None, files, inputs), ())
+    observations = Observations(
+        (inputs.frame,), scans=scans, landmarks=placed, initial=initial, shape_frames=(inputs.frame,)
+    )
+    return Observed(None, observations, _digests(observations, None, files, inputs, landmarks), ())
+
+
+def _placed(path: Path, frame: int, body: BodyModel) -> dict[int, dict[str, Float64[np.ndarray, " 3"]]]:
+    """The landmarks of a file, of its frame; nothing where the file has none.
+
+    Raises:
+        InputError: names that the body does not have.
+    """
+    points = read_landmarks(path)
+    unknown = LandmarkModel.of(body, tuple(points)).unknown
+    if unknown:
+        raise InputError(
+            f"landmarks {path}",
+            expected="joints of the body, nose, left_ear, left_heel, left_big_toe, face_30 and the like",
+            received=", ".join(unknown[:_NAMED]),
+            remedy="see docs/registration.md for the names",
+        )
+    return {frame: points} if points else {}
 
 
 def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
@@ -286,7 +317,11 @@ def _check_body(params: BodyParams, body: BodyModel, source: str) -> None:
 
 
 def _digests(
-    observations: Observations, capture: Capture | None, scans: dict[int, Path], inputs: RegisterInputs
+    observations: Observations,
+    capture: Capture | None,
+    scans: dict[int, Path],
+    inputs: RegisterInputs,
+    landmarks: Path | None,
 ) -> dict[str, str]:
     """SHA-256 of what is read; of masks and label maps names and sizes alone, a sequence has gigabytes of them."""
     cameras, points, start, files = (hashlib.sha256() for _ in range(4))
@@ -314,4 +349,6 @@ def _digests(
         "capture/names and sizes of masks and label maps": files.hexdigest(),
     }
     digests |= {f"scan of frame {frame}": sha256_file(path) for frame, path in scans.items()}
+    if landmarks is not None:
+        digests["landmarks"] = sha256_file(landmarks)
     return digests if inputs.labels is None else {**digests, "labels": sha256_file(inputs.labels)}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import REGISTER_STAGE
+from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.observe import Observed, observe
 from pipelines.stages.register_config import RegisterInputs, save_register
@@ -39,12 +39,15 @@ def register_capture(
 ) -> StageRecord:
     """Register the body, unless the stage stands, and keep the stage in a run that the caller owns.
 
+    Landmarks that lie in the run, placed by hand on the reference frame's scan, are observations too.
+
     Raises:
         InputError: inputs that nothing can be registered to, or not a single frame that was.
     """
     config = RegisterConfig(seed=inputs.seed)
     body = load_body(inputs.body)
-    observed = observe(inputs, body)
+    placed = run / LANDMARKS_FILE
+    observed = observe(inputs, body, landmarks=placed if placed.exists() else None)
     digests = dict(observed.digests)
     if inputs.body is not None:
         digests["body"] = sha256_file(inputs.body)

@@ -38,6 +38,7 @@ class Residual:
 
 RESIDUALS: dict[str, Residual] = {
     "keypoints_px": Residual("keypoints to the body", "px", (0.01, 0.03)),
+    "landmarks_mm": Residual("landmarks to the body", "mm", (20.0, 50.0)),
     "silhouette_px": Residual("silhouette to the mask", "px"),
     "skin_mm": Residual("bare skin to the scan", "mm", (8.0, 20.0)),
     "inside_mm": Residual("cloth of the scan inside the body", "mm", (5.0, 15.0)),
@@ -170,6 +171,7 @@ def summary(body: BodyModel, observed: Observations, fit: BodyFit, problems: Seq
             "keypoints": sorted(observed.keypoints),
             "masks": observed.mask is not None,
             "label_maps": observed.labels is not None,
+            "landmarks": sum(len(points) for points in observed.landmarks.values()),
             "scans": {frame: scan.labels is not None for frame, scan in observed.scans.items()},
             "start": observed.initial is not None,
         },

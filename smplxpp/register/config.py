@@ -13,6 +13,7 @@ class RegisterConfig:
 
     Attributes:
         keypoint_px: least error of a keypoint that is assumed, for an image 640 pixels high; else it is measured.
+        landmark_m: error of a landmark in space on the skin; of one within a limb it is three times as much.
         silhouette_px: error of a mask's contour. silhouette_reach_m: farthest that a contour is believed to be that of
             the body's rim near it.
         scan_m: error of a scan where it shows skin. scan_reach_m: farthest skin that is believed.
@@ -30,6 +31,7 @@ class RegisterConfig:
     """
 
     keypoint_px: float = 1.0
+    landmark_m: float = 0.005
     silhouette_px: float = 2.0
     silhouette_reach_m: float = 0.03
     scan_m: float = 0.003
@@ -50,6 +52,7 @@ class RegisterConfig:
     def __post_init__(self) -> None:
         for name in (
             "keypoint_px",
+            "landmark_m",
             "silhouette_px",
             "silhouette_reach_m",
             "scan_m",

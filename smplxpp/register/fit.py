@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.errors import InputError
 from smplxpp.core.spread import spread
 from smplxpp.register.anatomy import Anatomy
 from smplxpp.register.bare import bare_vertices, hands_of
@@ -19,15 +17,16 @@ from smplxpp.register.body_fit import BodyFit
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.keypoint_term import KeypointTerm
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
+from smplxpp.register.landmark_term import LandmarkTerm, PlacedLandmarks
 from smplxpp.register.normal_equations import Columns, NormalEquations
-from smplxpp.register.observations import Observations
+from smplxpp.register.observations import Observations, check_observations
 from smplxpp.register.outline import Outline
 from smplxpp.register.priors import Priors, Start, white_noise
 from smplxpp.register.scan_term import ScanTerm
 from smplxpp.register.seen_keypoints import SeenKeypoints, see_keypoints
 from smplxpp.register.silhouette_term import SilhouetteTerm, Surface
 from smplxpp.register.solver import Terms, gauss_newton
-from smplxpp.register.start import state_from_points
+from smplxpp.register.start import joined_points, state_from_points
 
 Progress = Callable[[str, float], None]
 # Deviations that a fit is believed to have where nothing tells them: radians, metres, betas.
@@ -48,12 +47,13 @@ def register(
     *,
     progress: Progress = lambda what, share: None,
 ) -> BodyFit:
-    """Fit pose, shape and translation of a body to keypoints, masks, label maps and scans in any mixture.
+    """Fit pose, shape and translation of a body to keypoints, landmarks, masks, label maps and scans in any mixture.
 
-    Gauss-Newton on the sum of squares of: keypoints (robust, pixels), masks (`SilhouetteTerm`), scans (`ScanTerm`),
-    joint ranges, a zero-mean pose prior and unit betas (`Anatomy`; no data set was learned from), robust accelerations,
-    and a given fit as far as its own noise says. Keypoints alone come first. One shape for all frames, told by
-    `observed.shape_frames`. Clothes never pull the body onto themselves: they keep a gap that is learned (`Gaps`).
+    Gauss-Newton on the sum of squares of: keypoints (robust, pixels), landmarks (robust, metres), masks
+    (`SilhouetteTerm`), scans (`ScanTerm`), joint ranges, a zero-mean pose prior and unit betas (`Anatomy`; no data set
+    was learned from), robust accelerations, and a given fit as far as its own noise says. Named points alone come
+    first. One shape for all frames, told by `observed.shape_frames`. Clothes never pull the body onto themselves: they
+    keep a gap that is learned (`Gaps`).
 
     Args:
         observed: cameras and everything seen through them; held-out cameras are not in it.
@@ -67,7 +67,7 @@ def register(
         >>> fit.params.save("params.npz")
     """
     config = config or RegisterConfig()
-    _check(body, observed)
+    check_observations(body, observed)
     run = _Registration(body, observed, config, progress)
     return run.fit()
 
@@ -88,7 +88,8 @@ class _Registration:
         self.kinematics, self.frames = Kinematics(body), np.array(observed.frames)
         self.points = BodyPoints.of_vertices(body, np.arange(body.vertex_count))
         self.seen: SeenKeypoints | None = see_keypoints(body, observed, config)
-        self.problems = list(self.seen.problems) if self.seen is not None else []
+        self.placed = PlacedLandmarks.of(body, observed.landmarks, observed.frames)
+        self.problems = [words for one in (self.seen, self.placed) if one is not None for words in one.problems]
         shape_frames = observed.shape_frames or observed.frames
         self.tells_shape = np.isin(self.frames, shape_frames)
         self.outlines = self._outlines()
@@ -108,6 +109,7 @@ class _Registration:
             state = self._solve_shape(state)
             state, confidence = self._solve_windows(state)
         residuals = self._measure(state)
+        self.problems += self._far_landmarks(state)
         start = self._measure(before) if self.observed.initial is not None else {}
         params = state.to_params(self.body, fps=self.observed.fps)
         return BodyFit(tuple(self.observed.frames), params, confidence, residuals, start, tuple(self.problems))
@@ -116,7 +118,7 @@ class _Registration:
 
     def _columns(self) -> Columns:
         names = np.array(self.body.joint_names)
-        landmarks = set(self.seen.landmarks.names) if self.seen is not None else set()
+        landmarks = {name for one in (self.seen, self.placed) if one is not None for name in one.landmarks.names}
         fingers = np.array([not _is_finger(name) for name in names])
         sees_fingers = any(_is_finger(name) or name.endswith("_tip") for name in landmarks)
         face = any(name.startswith(_FACE) for name in landmarks)
@@ -155,8 +157,15 @@ class _Registration:
     def _start(self) -> BodyState:
         if self.observed.initial is not None:
             return BodyState.of_params(self.body, self.observed.initial)
-        assert self.seen is not None
-        state = state_from_points(self.kinematics, self.seen.landmarks, self.seen.points)
+        tables = [(one.landmarks.names, one.points) for one in (self.seen, self.placed) if one is not None]
+        state = state_from_points(self.kinematics, *joined_points(self.body, tables)) if tables else None
+        if state is None and self.seen is None:
+            raise InputError(
+                "landmarks",
+                expected="three points of the trunk (hips, shoulders, pelvis, neck), or four that lie on no line",
+                received=", ".join(tables[0][0]) if tables else "none of these frames that the body has",
+                remedy="place more of them in `smplxpp label RUN`, or give a fit to start from",
+            )
         if state is None:
             raise InputError(
                 "keypoints",
@@ -194,7 +203,7 @@ class _Registration:
         config, rows = self.config, window.rows
         terms = self._terms(state, rows)
         equations = NormalEquations(self.columns, len(state))
-        if terms.keypoints is not None:
+        if terms.points():
             scales = np.geomspace(40.0, 1.0, max(1, 2 * config.joint_steps // 3))
             scales = np.concatenate([scales, np.ones(config.joint_steps - len(scales))])
             state, equations = self._step("joints", state, terms, config.joint_steps, solve_shape, scales)
@@ -206,7 +215,7 @@ class _Registration:
         terms = replace(terms, silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         if terms.surfaces():
             state, equations = self._step("surfaces", state, terms, config.surface_steps, solve_shape, None)
-        elif terms.keypoints is None:
+        elif not terms.points():
             state, equations = self._step("priors", state, terms, config.surface_steps, solve_shape, None)
         return state, equations
 
@@ -232,7 +241,7 @@ class _Registration:
             terms,
             steps=steps,
             solve_shape=solve_shape,
-            keypoint_scales=scales,
+            point_scales=scales,
             step_done=done,
         )
 
@@ -247,7 +256,12 @@ class _Registration:
         if self.seen is not None:
             chosen = {name: k.select(k.names, frames.tolist()) for name, k in self.seen.keypoints.items()}
             keypoints = KeypointTerm(self.body, self.seen.landmarks, self.observed.cameras, chosen, self.seen.noise_px)
-        return Terms(priors, self.tells_shape[rows], keypoints)
+        return Terms(priors, self.tells_shape[rows], keypoints, self._landmark_term(rows))
+
+    def _landmark_term(self, rows: np.ndarray) -> LandmarkTerm | None:
+        return (
+            None if self.placed is None else LandmarkTerm(self.body, self.placed.of_rows(rows), self.config.landmark_m)
+        )
 
     def _believed(self, given: BodyState, rows: np.ndarray) -> Start | None:
         """A given fit as a measurement: as good as it is smooth; beside keypoints what these do not tell, as twists."""
@@ -255,6 +269,8 @@ class _Registration:
         pose, transl = max(pose, _LEAST_NOISE[0]), max(transl, _LEAST_NOISE[1])
         if self.seen is not None:
             return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, np.inf)
+        if self.placed is not None:  # what a hand corrects is believed less; a few points do not tell the shape
+            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, _START_NOISE[2])
         return Start(given.select(rows), pose, transl, _START_NOISE[2])
 
     def _silhouettes(self, state: BodyState, rows: np.ndarray) -> SilhouetteTerm | None:
@@ -301,6 +317,9 @@ class _Registration:
         if terms.keypoints is not None:
             term = terms.keypoints
             out["keypoints_px"] = np.array([term.residual_px(r, self.kinematics, p) for r, p in enumerate(postures)])
+        if terms.landmarks is not None:
+            away = np.array([terms.landmarks.distances(r, self.kinematics, p) for r, p in enumerate(postures)])
+            out["landmarks_mm"] = 1e3 * np.array([np.median(d[d == d]) if (d == d).any() else np.nan for d in away])
         if silhouettes is not None:
             out["silhouette_px"] = np.array(
                 [silhouettes.residual_px(r, self.kinematics, p) for r, p in enumerate(postures)]
@@ -310,53 +329,17 @@ class _Registration:
             out["skin_mm"], out["inside_mm"] = both[:, 0], both[:, 1]
         return out
 
-
-def _check(body: BodyModel, observed: Observations) -> None:
-    """What can be known before work starts.
-
-    Raises:
-        InputError: no frames, nothing to register to, a fit of another length or body.
-    """
-    if not observed.frames:
-        raise InputError("registration", expected="at least one frame", received="none")
-    if not (observed.keypoints or observed.scans or observed.mask or observed.initial):
-        raise InputError(
-            "registration",
-            expected="keypoints, masks, scans or a fit",
-            received="none of them",
-            remedy="give keypoints of a detector (docs/registration.md), or body parameters to start from",
-        )
-    if observed.initial is None and not observed.keypoints:
-        raise InputError(
-            "registration",
-            expected="keypoints, or a fit to start from",
-            received="neither",
-            remedy="detect keypoints in the images, or give parameters that are roughly right with --params",
-        )
-    if observed.initial is not None:
-        _check_initial(body, observed.initial, len(observed.frames))
-
-
-def _check_initial(body: BodyModel, initial: BodyParams, frames: int) -> None:
-    if len(initial) != frames:
-        raise InputError("fit to start from", expected=f"{frames} frames", received=f"{len(initial)} frames")
-    if initial.v_shape is not None:
-        warnings.warn(
-            "fit to start from: its v_shape is left aside, the shape is fitted in betas alone",
-            GeometryWarning,
-            stacklevel=3,
-        )
-    for name, have, known in (
-        ("betas", initial.betas.shape[1], body.num_betas),
-        ("expression", initial.expression.shape[1], body.num_expressions),
-    ):
-        if have > known and np.abs(getattr(initial, name)[:, known:]).max() > 0:
-            raise InputError(
-                f"fit to start from: {name}",
-                expected=f"at most {known} numbers, as the body {body.name!r} has",
-                received=f"{have}",
-                remedy="name the body that the parameters were fitted with (--body)",
-            )
+    def _far_landmarks(self, state: BodyState) -> list[str]:
+        """Which landmarks the body did not come to: misplaced ones, or a fit that went wrong."""
+        out = []
+        for row in range(len(self.frames) if self.placed is not None else 0):
+            term = self._landmark_term(np.array([row]))
+            assert term is not None
+            posture = self.kinematics.posture(state, row)
+            far = term.far(term.distances(0, self.kinematics, posture))
+            if far:
+                out.append(f"frame {self.frames[row]}: landmarks far from the fitted body's: {', '.join(far)}")
+        return out
 
 
 def _is_finger(name: str) -> bool:

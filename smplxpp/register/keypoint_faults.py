@@ -35,20 +35,21 @@ _FACE_PAIRS = (
     *((48, 54), (49, 53), (50, 52), (55, 59), (56, 58)),
     *((60, 64), (61, 63), (65, 67)),
 )
+_FACE_MIRROR = {f"face_{a}": f"face_{b}" for pair in _FACE_PAIRS for a, b in (pair, pair[::-1])}
 
 
 def mirror_index(names: Sequence[str]) -> Int64[np.ndarray, " K"]:
     """Where the other side of each point is among the names; the point itself where it has no side, -1 where its other
     side is not among them."""
-    face = {f"face_{a}": f"face_{b}" for pair in _FACE_PAIRS for a, b in (pair, pair[::-1])}
     place = {name: k for k, name in enumerate(names)}
+    return np.array([place.get(other_side(name), -1) for name in names], dtype=np.int64)
 
-    def other(name: str) -> str:
-        if name in face:
-            return face[name]
-        return name.replace("left_", "right_") if "left_" in name else name.replace("right_", "left_")
 
-    return np.array([place.get(other(name), -1) for name in names], dtype=np.int64)
+def other_side(name: str) -> str:
+    """The name of the same point on the other side; itself where it has no side."""
+    if name in _FACE_MIRROR:
+        return _FACE_MIRROR[name]
+    return name.replace("left_", "right_") if "left_" in name else name.replace("right_", "left_")
 
 
 @dataclass(frozen=True, eq=False)

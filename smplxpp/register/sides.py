@@ -15,10 +15,12 @@ from smplxpp.register.keypoint_faults import mirror_index
 _FORWARD = (
     ("{}_ankle", "{}_foot"),
     ("{}_heel", "{}_big_toe"),
+    ("{}_ankle", "{}_big_toe"),
     ("coco_{}_ankle", "{}_big_toe"),
     ("{}_ear", "nose"),
     ("head", "jaw"),
     ("head", "nose"),
+    ("neck", "nose"),
 )
 _ACROSS = ("{}_hip", "coco_{}_hip", "{}_shoulder", "coco_{}_shoulder")
 _ABOVE = (("pelvis", "neck"), ("coco_{}_hip", "coco_{}_shoulder"), ("{}_hip", "{}_shoulder"))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64
 
 from smplxpp.register.keypoint_term import KeypointTerm
 from smplxpp.register.kinematics import BodyState, Kinematics
+from smplxpp.register.landmark_term import LandmarkTerm
 from smplxpp.register.normal_equations import Columns, NormalEquations
 from smplxpp.register.priors import Priors
 from smplxpp.register.scan_term import ScanTerm
@@ -30,8 +31,13 @@ class Terms:
     priors: Priors
     tells_shape: Bool[np.ndarray, " T"]
     keypoints: KeypointTerm | None = None
+    landmarks: LandmarkTerm | None = None
     silhouettes: SilhouetteTerm | None = None
     scans: ScanTerm | None = None
+
+    def points(self) -> list[KeypointTerm | LandmarkTerm]:
+        """Those of named points, which come first."""
+        return [term for term in (self.keypoints, self.landmarks) if term is not None]
 
     def surfaces(self) -> list[SilhouetteTerm | ScanTerm]:
         """Those that learn gaps."""
@@ -46,21 +52,21 @@ def gauss_newton(
     *,
     steps: int,
     solve_shape: bool,
-    keypoint_scales: Float64[np.ndarray, " n"] | None = None,
+    point_scales: Float64[np.ndarray, " n"] | None = None,
     step_done: Callable[[int], None] = lambda k: None,
 ) -> tuple[BodyState, NormalEquations]:
     """Minimise the terms from a state.
 
     Args:
-        keypoint_scales: by step, multiples of the keypoints' noise, falling to 1: what is far still pulls at first.
+        point_scales: by step, multiples of the named points' noise, falling to 1: what is far still pulls at first.
 
     Returns:
         The state and the equations at its last step.
     """
     equations = NormalEquations(columns, len(state))
     for k in range(steps):
-        if terms.keypoints is not None:
-            terms.keypoints.scale = 1.0 if keypoint_scales is None else float(keypoint_scales[k])
+        for named in terms.points():
+            named.scale = 1.0 if point_scales is None else float(point_scales[k])
         equations = assemble(kinematics, columns, state, terms, solve_shape=solve_shape)
         step = equations.solve(damping=_DAMPING, solve_shape=solve_shape)
         step = step.limited(angle=_LARGEST_TURN, length=_LARGEST_MOVE)
@@ -76,7 +82,7 @@ def assemble(
 ) -> NormalEquations:
     """The normal equations at a state."""
     equations = NormalEquations(columns, len(state))
-    used = [t for t in (terms.keypoints, terms.silhouettes, terms.scans) if t is not None]
+    used = [*terms.points(), *terms.surfaces()]
     for row in range(len(state)):
         posture = kinematics.posture(state, row)
         for term in used:

@@ -22,6 +22,7 @@ from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import BodyParams
+from smplxpp.register.landmark_file import read_landmarks, write_landmarks
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set
 from tests.capture.scene import make_scene
@@ -240,6 +241,18 @@ def _label_doors() -> list[Door]:
     ]
 
 
+def _hand_doors() -> list[Door]:
+    """What is placed and corrected by hand."""
+    points = {"nose": np.array([0.01, 1.62, 0.11]), "left_hip": np.array([0.1, 0.9, 0.0])}
+    return [
+        Door(
+            "landmarks",
+            lambda folder: write_landmarks(folder / "landmarks.json", points),
+            lambda folder: read_landmarks(folder / "landmarks.json"),
+        ),
+    ]
+
+
 def _image_doors() -> list[Door]:
     noise = np.random.default_rng(3).integers(0, 255, (24, 20, 4)).astype(np.uint8)
 
@@ -288,6 +301,6 @@ def _basic_doors() -> list[Door]:
 def doors() -> dict[str, Door]:
     """Every door by name."""
     every = [_capture_door(name) for name in WRITERS] + _params_doors() + _keypoint_doors()
-    every += _mesh_doors() + _label_doors() + _image_doors() + _basic_doors()
+    every += _mesh_doors() + _label_doors() + _hand_doors() + _image_doors() + _basic_doors()
     every += run_doors()
     return {door.name: door for door in every}

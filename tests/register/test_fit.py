@@ -155,7 +155,7 @@ def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
     ("observed", "words"),
     [
         (Observations(()), "at least one frame"),
-        (Observations((0,)), "keypoints, masks, scans or a fit"),
+        (Observations((0,)), "keypoints, landmarks, masks, scans or a fit"),
         (Observations((0,), mask=lambda c, f: None), "a fit to start from"),
         (Observations((0, 1), initial=BodyParams.rest(betas=20, expressions=52)), "2 frames"),
         (Observations((0,), initial=BodyParams.rest(betas=np.ones(100), expressions=52)), "at most 20 numbers"),

@@ -74,6 +74,19 @@ def test_bad_options_are_refused_in_words(tmp_path, solver, capsys, options, wor
     assert not solver.shown
 
 
+def test_named_landmarks_are_kept_in_the_run(tmp_path, solver, capsys):
+    placed, run = tmp_path / "mine.json", tmp_path / "run"
+    placed.write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
+    assert main(["register", *ASKED, "--out", str(run), "--landmarks", str(placed), "--no-report"]) == 0
+    assert (run / "landmarks.json").read_bytes() == placed.read_bytes()
+    assert main(["register", *ASKED, "--out", str(run), "--no-report", "--force"]) == 0
+    assert [set(shown.landmarks[0]) for shown in solver.shown] == [{"nose"}] * 2
+    placed.write_text("[]")
+    assert main(["register", *ASKED, "--out", str(run), "--landmarks", str(placed), "--json"]) == 2
+    assert "an object" in capsys.readouterr().out
+    assert b"nose" in (run / "landmarks.json").read_bytes()
+
+
 # --- builds ---------------------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.layout import REGISTER_STAGE, REGISTERED_PARAMS, REGISTRATION
+from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE, REGISTERED_PARAMS, REGISTRATION
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.params_in_use import params_in_use
@@ -128,6 +128,39 @@ def test_one_scan_with_a_fit(tmp_path, solver):
     np.testing.assert_array_equal(shown.initial.transl[0], load_params(TRACKED).transl[3])
 
 
+# --- landmarks placed by hand ---------------------------------------------------------------------------------------
+
+
+def place(run, **points) -> None:
+    run.mkdir(exist_ok=True)
+    (run / LANDMARKS_FILE).write_text(json.dumps(points))
+
+
+def test_landmarks_in_the_run_are_seen_and_change_the_stage(tmp_path, plain, solver):
+    assert register_capture(tmp_path, inputs_of(plain)).ran
+    place(tmp_path, nose=[0.0, 1.5, 0.1], pelvis=[0.0, 1.0, 0.0])
+    record = register_capture(tmp_path, inputs_of(plain))
+    assert record.ran and not register_capture(tmp_path, inputs_of(plain)).ran
+    before, shown = solver.shown
+    assert not before.landmarks and set(shown.landmarks) == {0}
+    assert shown.landmarks[0]["pelvis"].tolist() == [0.0, 1.0, 0.0]
+    assert json.loads((tmp_path / REGISTRATION).read_text())["seen"]["landmarks"] == 2
+    assert (tmp_path / LANDMARKS_FILE).is_file()
+    register_capture(tmp_path, inputs_of(plain, frames=(1, 13)))  # they are of frame 0
+    assert not solver.shown[-1].landmarks
+
+
+def test_a_scan_with_landmarks_needs_no_fit(tmp_path, solver):
+    place(tmp_path, nose=[0.0, 1.5, 0.1], left_shoulder=[0.2, 1.4, 0.0])
+    scan = FIXTURE / "scans" / "scan_000000.ply"
+    register_capture(tmp_path, RegisterInputs(scan=scan, frame=3))
+    (shown,) = solver.shown
+    assert shown.initial is None and set(shown.landmarks[3]) == {"nose", "left_shoulder"}
+    place(tmp_path, tail=[0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match=r"joints of the body.*received tail"):
+        register_capture(tmp_path, RegisterInputs(scan=scan, frame=3))
+
+
 # --- files and gates ------------------------------------------------------------------------------------------------
 
 
@@ -242,7 +275,10 @@ def test_parameters_of_another_body_are_named(tmp_path, plain, solver):
         ({"frames": (13, 14)}, "one that is trained on"),
         ({"hold_out": tuple(f"Cam00{k}" for k in range(1, 7)) + ("Face1", "Face2")}, "not held out"),
         ({"capture": None}, "--capture, or --scan"),
-        ({"capture": None, "scan": FIXTURE / "scans" / "scan_000000.ply", "params": None}, "a fit to start from"),
+        (
+            {"capture": None, "scan": FIXTURE / "scans" / "scan_000000.ply", "params": None},
+            "a fit, or landmarks",
+        ),
     ],
 )
 def test_unusable_inputs_are_refused_in_words(tmp_path, solver, changes, words):
