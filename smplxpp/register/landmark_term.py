@@ -64,7 +64,7 @@ class PlacedLandmarks:
     def _table(body: BodyModel, placed: PlacedPoints, frames: Sequence[int]) -> PlacedLandmarks | None:
         asked = tuple(dict.fromkeys(name for frame in frames for name in placed.get(frame, {})))
         landmarks = LandmarkModel.of(body, asked)
-        problems = ()
+        problems: tuple[str, ...] = ()
         if landmarks.unknown:
             shown = ", ".join(landmarks.unknown[:8]) + (", ..." if len(landmarks.unknown) > 8 else "")
             problems = (f"landmarks that the body {body.name!r} does not have are left out: {shown}",)
