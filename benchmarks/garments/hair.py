@@ -45,15 +45,15 @@ def hairstyles(mannequin: Mannequin) -> list[Garment]:
     ]
 
 
-def _cap(mannequin: Mannequin) -> ClothMesh:
-    """The hair on the skull, rigid to the head."""
+def skull_cap(mannequin: Mannequin, *, ease: float = 0.017) -> ClothMesh:
+    """The hair on the skull, `ease` metres thick, rigid to the head."""
     j = mannequin.joints
 
     def level(p: np.ndarray) -> np.ndarray:
         hairline = j["head"][1] + 0.02 + 1.25 * np.clip(p[:, 2] - j["head"][2] + 0.02, 0, None)
         return p[:, 1] - hairline
 
-    cloth = layer(mannequin, level, ease=0.017, fairing=12)
+    cloth = layer(mannequin, level, ease=ease, fairing=12)
     return ClothMesh(cloth.vertices, cloth.faces, mannequin.rigid("head", len(cloth.vertices)))
 
 
@@ -91,12 +91,12 @@ def _handed_over(mannequin: Mannequin, cloth: ClothMesh, below: np.ndarray, *, k
 
 def _lying(mannequin: Mannequin, curtain: ClothMesh) -> ClothMesh:
     lower = _handed_over(mannequin, curtain, mannequin.below(curtain.vertices), keeps=0.0, over=0.10)
-    return joined(_cap(mannequin), lower)
+    return joined(skull_cap(mannequin), lower)
 
 
 def _hanging(mannequin: Mannequin, curtain: ClothMesh, *, keeps: float) -> ClothMesh:
     lower = _handed_over(mannequin, curtain, mannequin.trunk_weights(curtain.vertices), keeps=keeps, over=0.16)
-    return joined(_cap(mannequin), lower)
+    return joined(skull_cap(mannequin), lower)
 
 
 def _braid(mannequin: Mannequin) -> ClothMesh:
@@ -122,4 +122,4 @@ def _braid(mannequin: Mannequin) -> ClothMesh:
     middle = np.repeat(curve, 24, axis=0)
     line = ClothMesh(middle, cloth.faces, cloth.weights)
     weights = _handed_over(mannequin, line, mannequin.trunk_weights(middle), keeps=0.0, over=0.14).weights
-    return joined(_cap(mannequin), ClothMesh(cloth.vertices, cloth.faces, weights))
+    return joined(skull_cap(mannequin), ClothMesh(cloth.vertices, cloth.faces, weights))

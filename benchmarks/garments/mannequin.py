@@ -44,10 +44,14 @@ class Mannequin:
         posed = body.forward(params)
         skin, used = body.mesh(posed.vertices[0]).submesh((body.part_labels == 0)[body.faces].all(axis=1))
         cloth = ClothMesh(skin.vertices, skin.faces, body.weights[used])
-        joints = dict(zip(body.joint_names, posed.joints[0], strict=True))
-        torso = shares(body, cloth.weights, (*_ARM, *_HEAD)) < 0.5
+        return Mannequin.cut_on(body, params, cloth, dict(zip(body.joint_names, posed.joints[0], strict=True)))
+
+    @staticmethod
+    def cut_on(body: BodyModel, params: BodyParams, skin: ClothMesh, joints: dict[str, np.ndarray]) -> Mannequin:
+        """Make the mannequin of a skin and its joints, of any size."""
+        torso = shares(body, skin.weights, (*_ARM, *_HEAD)) < 0.5
         low, outlines = _outlines(skin.vertices[torso], joints["pelvis"][2])
-        return Mannequin(body, params, cloth, joints, outlines, low)
+        return Mannequin(body, params, skin, joints, outlines, low)
 
     @property
     def axis(self) -> np.ndarray:

@@ -49,10 +49,10 @@ def load_person(topology_file: Path) -> Person:
     )
 
 
-def face_landmarks() -> Float[np.ndarray, "51 3"]:
-    """Return the face landmarks on the open body's T-pose at the person's shape; dlib's order from 17."""
+def face_landmarks(betas: Float[np.ndarray, " B"] = PERSON_BETAS) -> Float[np.ndarray, "51 3"]:
+    """Return the face landmarks on the open body's T-pose, by default at the person's shape; dlib's order from 17."""
     with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path:
         data = read_arrays(path, subject="open body")
-    shaped = data["v_template"] + data["shapedirs"][..., : len(PERSON_BETAS)] @ PERSON_BETAS
+    shaped = data["v_template"] + data["shapedirs"][..., : len(betas)] @ betas
     corners = shaped[data["f"][data["lmk_faces_idx"]]]
     return np.einsum("lk,lkx->lx", data["lmk_bary_coords"], corners)

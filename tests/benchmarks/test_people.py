@@ -1,0 +1,148 @@
+"""Procedural people: their truth, their variants, and that the cast is made of what there is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+
+from benchmarks.people import CAST, VARIANTS, access, captured, captured_names, person, variant
+from benchmarks.people.__main__ import body_outside
+from benchmarks.people.builds import BUILDS, betas_of, fitting_mannequin
+from benchmarks.people.making import make_person
+from benchmarks.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
+from benchmarks.people.stances import STANCES, Posing
+from benchmarks.people.tailor import all_cuts
+from pipelines.synth.scan_simulation import ScanConfig
+from smplxpp.body import load_body
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LABEL_BY_NAME
+
+NAME = "man shirt trousers short hair, arms down"
+COARSE = ScanConfig(cell=0.012, views=24, resolution=384, faces=12_000)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def scan(body):
+    """One person, scanned coarsely."""
+    return make_person(NAME, CAST[NAME], body, seed=0, scan=COARSE)
+
+
+def test_a_person_is_a_scan_with_its_truth(body, scan):
+    assert abs(scan.mesh.face_count - COARSE.faces) < 0.05 * COARSE.faces
+    assert scan.colors.shape == scan.mesh.vertices.shape
+    np.testing.assert_array_equal(body.forward(scan.params).vertices[0], scan.body_vertices)
+    assert scan.mesh.vertices[:, 1].min() == pytest.approx(0.0, abs=0.02)
+    assert np.median(body_outside(scan)) < -0.003
+    assert (body_outside(scan) > 0.01).mean() < 0.005
+
+
+def test_labels_lie_where_they_are_worn(scan):
+    height = scan.mesh.face_centers[:, 1] / scan.mesh.vertices[:, 1].max()
+
+    def middle(name):
+        return np.median(height[scan.face_labels == LABEL_BY_NAME[name].id])
+
+    assert middle("shoe") < 0.1 < middle("lower") < 0.55 < middle("upper") < 0.85 < middle("hair")
+    assert set(np.unique(scan.face_labels)) == {LABEL_BY_NAME[n].id for n in ("skin", "hair", "shoe", "upper", "lower")}
+    assert 0.5 < scan.seen.mean() < 1.0
+
+
+def test_a_person_is_the_same_again(body, scan):
+    again = make_person(NAME, CAST[NAME], body, seed=0, scan=COARSE)
+    np.testing.assert_array_equal(scan.mesh.vertices, again.mesh.vertices)
+    np.testing.assert_array_equal(scan.colors, again.colors)
+
+
+def test_a_folder_remembers_people(monkeypatch, tmp_path, scan):
+    calls = []
+
+    def make(name, *_, **__):
+        calls.append(name)
+        return scan
+
+    monkeypatch.setattr(access, "make_person", make)
+    made, read = (person(NAME, cache=tmp_path) for _ in range(2))
+    assert calls == [NAME] and made is scan
+    for field in ("face_labels", "seen", "colors", "body_vertices", "joints"):
+        np.testing.assert_array_equal(getattr(read, field), getattr(scan, field))
+    np.testing.assert_array_equal(read.mesh.vertices, scan.mesh.vertices)
+    person(NAME, seed=1, cache=tmp_path)
+    assert len(calls) == 2
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_keep_scan_and_truth_together(body, scan, name):
+    """The nearest point of the surface to every joint is as far as it was."""
+    changed = variant(scan, name)
+    shown = changed.as_read()
+    np.testing.assert_allclose(body.forward(changed.params).vertices[0], changed.body_vertices, atol=1e-12)
+    before, after = (
+        np.sqrt(igl.point_mesh_squared_distance(one.joints, one.mesh.vertices, one.mesh.faces)[0])
+        for one in (scan, shown)
+    )
+    exact = name in ("as it is", "turned", "z up", "in cm")
+    places = np.arange(len(before))
+    if name == "mirrored":
+        places = np.array([body.joint_names.index(_other(n)) for n in body.joint_names])
+    np.testing.assert_allclose(after[places], before, atol=1e-9 if exact else 0.012)
+    assert len(shown.face_labels) == len(shown.seen) == shown.mesh.face_count
+    assert len(shown.colors) == shown.mesh.vertex_count
+    size = np.ptp(changed.mesh.vertices[:, 2 if name == "z up" else 1]) / np.ptp(scan.mesh.vertices[:, 1])
+    assert size == pytest.approx(100.0 if name == "in cm" else 1.0, rel=0.02)
+
+
+def _other(name: str) -> str:
+    return name.replace("left", "right") if "left" in name else name.replace("right", "left")
+
+
+def test_mirroring_twice_gives_the_person_back(scan):
+    twice = variant(variant(scan, "mirrored"), "mirrored")
+    np.testing.assert_allclose(twice.body_vertices, scan.body_vertices, atol=1e-9)
+    np.testing.assert_array_equal(twice.mesh.vertices, scan.mesh.vertices)
+    once = variant(replace(scan, mesh=scan.mesh), "mirrored")
+    gap = igl.point_mesh_squared_distance(once.body_vertices * [-1, 1, 1], scan.body_vertices, load_body().faces)[0]
+    assert np.sqrt(gap).max() < 0.006 and np.percentile(np.sqrt(gap), 99) < 0.001
+
+
+def test_what_nobody_has_is_refused(scan):
+    for ask in (lambda: person("nobody"), lambda: variant(scan, "eaten"), lambda: captured("nobody")):
+        with pytest.raises(InputError):
+            ask()
+
+
+def test_the_cast_is_made_of_what_there_is(body):
+    mannequin, _ = fitting_mannequin(body, betas_of(body, "mean", np.random.default_rng(0)))
+    cuts = all_cuts(mannequin)
+    for name, member in CAST.items():
+        assert member.build in BUILDS and member.stance in STANCES and member.tone in SKIN_TONES, name
+        for wear in member.wears:
+            dyes = HAIR_COLORS if cuts[wear.cut].label == "hair" else DYES
+            assert wear.dye.color in dyes and wear.dye.second in DYES and wear.dye.pattern in PATTERNS, name
+
+
+def test_another_seed_gives_another_body_of_that_build(body):
+    one, other = (betas_of(body, "heavy man", np.random.default_rng(seed)) for seed in (0, 1))
+    assert 0.1 < np.abs(one - other).max() < 4.0
+    assert np.linalg.norm((one - other)[:6]) < np.linalg.norm(one[:6])
+
+
+def test_stances_turn_the_person_to_her_left(body):
+    posing = Posing.of(body, "T", np.zeros(body.num_betas), facing=90.0, rng=np.random.default_rng(0))
+    joints = dict(zip(body.joint_names, body.forward(posing.params(1.0)).joints[0], strict=True))
+    assert joints["left_wrist"][2] - joints["right_wrist"][2] < -1.0
+
+
+def test_captures_are_read_with_their_truth():
+    assert "fixture" in captured_names()
+    scan = captured("fixture")
+    assert (body_outside(scan) > 0.01).mean() < 0.02
+    assert scan.seen.mean() > 0.5
+    assert set(np.unique(scan.face_labels)) == {0, 1, 2, 3, 4}
