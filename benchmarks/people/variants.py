@@ -47,7 +47,7 @@ def turned(scan: PersonScan, degrees: float, shift: tuple[float, float, float] =
         body,
         scan,
         replace(scan.params, global_orient=orient, transl=transl),
-        scan.mesh.with_vertices(turn.apply(scan.mesh.vertices) + shift),
+        scan.mesh.with_vertices(scan.mesh.vertices @ turn.as_matrix().T + shift),
     )
 
 
