@@ -71,6 +71,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "CaptureConvertCommand",
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
+    "capture masks": (
+        "pipelines.commands.masks",
+        "CaptureMasks",
+        "masks of a capture's images by a matting model, empty plates or MediaPipe",
+    ),
     "capture degrade": (
         "pipelines.commands.degrade",
         "CaptureDegradeCommand",
@@ -80,6 +85,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "pipelines.commands.keypoints",
         "KeypointsConvert",
         "keypoints of OpenPose, EasyMocap, mmpose, COCO or MediaPipe to ours",
+    ),
+    "keypoints detect": (
+        "pipelines.commands.keypoints",
+        "KeypointsDetect",
+        "keypoints of a capture's images by MediaPipe or your own ONNX model",
     ),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }

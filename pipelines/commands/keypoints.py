@@ -1,11 +1,11 @@
-"""`smplxpp keypoints convert`: keypoints of any known detector to ours."""
+"""`smplxpp keypoints convert` and `smplxpp keypoints detect`: keypoints of any known detector to ours, or our own."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -67,6 +67,61 @@ class KeypointsConvert:
                 "%s: %d frames, %d points, %.0f %% of them seen", name, *list(summary[name].values())[:2], 100 * seen
             )
         return {"input": str(self.input), "out": str(self.out), "cameras": summary}
+
+
+@dataclass(frozen=True)
+class KeypointsDetect:
+    """Options of the command."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of the capture, in any layout of docs/captures.md."""
+    out: Path
+    """Folder to write CAM.npz into, for --keypoints of the other commands, or `keypoints` of the capture itself; what
+    stands there of the same images and the same detector is kept."""
+    detector: str = "mediapipe"
+    """mediapipe (extra `detect`), or the path of your own model.onnx (docs/detectors.md)."""
+    cameras: OptionalText = None
+    """Names of cameras with commas between, or all; by default those that training may see, without the held-out."""
+    frames: OptionalText = None
+    """Frames to look at: numbers and ranges START:STOP:STEP with commas between; by default all."""
+    masks: OptionalPath = None
+    """Folder of mattes to take instead of the capture's own masks; the person is looked for in the mask's box."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Detect; returns what was found of each camera."""
+        from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
+        from pipelines.commands.capture import selected_frames
+        from pipelines.commands.progress import counted_progress
+        from pipelines.runs.places import keep_out_of_capture, same_place
+        from smplxpp.capture import open_capture
+        from smplxpp.detect import load_detector
+
+        if not same_place(self.out, self.capture / "keypoints"):
+            keep_out_of_capture(self.out, self.capture)
+        capture = open_capture(self.capture, masks=self.masks, cache_bytes=0)
+        names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
+        frames = selected_frames(self.frames, capture)
+        detector = load_detector(self.detector)
+        with counted_progress("images", enabled=not self.json) as progress:
+            found = detect_keypoints(
+                capture,
+                detector,
+                self.out,
+                cameras=tuple(capture.cameras) if names == ("all",) else names,
+                frames=frames,
+                progress=progress,
+            )
+        summary = {}
+        for name, one in found.items():
+            seen = float((one.people > 0).mean())
+            summary[name] = {"frames": len(one.people), "with_a_person": seen, "detected_now": one.detected}
+            log.info("%s: %d frames, a person in %.0f %% of them", name, len(one.people), 100 * seen)
+        problems = problems_of(found, capture.splits.novel_view_cameras)
+        for words in problems:
+            log.warning(words)
+        return {"out": str(self.out), "detector": self.detector, "cameras": summary, "problems": problems}
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

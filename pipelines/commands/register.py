@@ -37,6 +37,10 @@ class Register:
     """Scan of the frame --frame, in the place of the capture's, or alone with --params."""
     params: OptionalPath = None
     """Body parameters to start from, in the place of the capture's own."""
+    keypoints: OptionalPath = None
+    """Folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of the capture's own."""
+    masks: OptionalPath = None
+    """Folder of masks, in the place of the capture's own."""
     initial: Literal["params", "none"] = "params"
     """none: no parameters are looked at, and the fit starts from keypoints alone."""
     protocol: OptionalText = None
@@ -120,6 +124,9 @@ class Register:
             path = getattr(self, name)
             if path is not None and not path.exists():
                 raise InputError(f"option {name}", expected="an existing file", received=str(path))
+        for name in ("keypoints", "masks"):
+            if getattr(self, name) is not None and self.capture is None:
+                raise InputError(f"option {name}", expected="a --capture whose cameras they are of", received="none")
         if self.initial == "none" and self.params is not None:
             raise InputError("option initial", expected="none without --params", received="both")
         if self.frames is not None and self.capture is None:
@@ -142,6 +149,8 @@ class Register:
             units=self.units,
             up=self.up,
             seed=self.seed,
+            keypoints=self.keypoints,
+            masks=self.masks,
         )
 
     def _report(self, record: StageRecord) -> Path:

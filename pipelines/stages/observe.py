@@ -112,7 +112,7 @@ def observe(inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None =
             f"capture {capture.name}",
             expected="keypoints of its training cameras, or a fit to start from",
             received="neither",
-            remedy="detect keypoints (docs/captures.md says which files are read), or name a fit with --params",
+            remedy="detect keypoints (smplxpp keypoints detect, then --keypoints), or name a fit with --params",
         )
     shape = tuple(frame for frame in frames if frame not in held_out)
     if not shape:
@@ -184,7 +184,14 @@ def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
     """Open the capture of a registration with the parameters that it starts from."""
     assert inputs.capture is not None
     params = inputs.params if inputs.start else None
-    return open_capture(inputs.capture, params=params, body=body, protocol=inputs.protocol)
+    return open_capture(
+        inputs.capture,
+        params=params,
+        body=body,
+        protocol=inputs.protocol,
+        keypoints=inputs.keypoints,
+        masks=inputs.masks,
+    )
 
 
 def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keypoints2D], list[str]]:

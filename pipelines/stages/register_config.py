@@ -26,6 +26,7 @@ class RegisterInputs:
 
     Attributes:
         capture: folder of any known layout.
+        keypoints, masks: folders of the cameras' keypoints and masks, in the place of the capture's own.
         params: the fit to start from, in the place of the capture's own.
         start: False: no fit is looked at, keypoints are where it begins.
         protocol: name of the capture's files that are read, None without one.
@@ -52,6 +53,8 @@ class RegisterInputs:
     units: str = "m"
     up: str = "y"
     seed: int = 0
+    keypoints: Path | None = None
+    masks: Path | None = None
 
 
 def named_params(capture: Path | None, params: Path | None) -> Path | None:
@@ -59,7 +62,7 @@ def named_params(capture: Path | None, params: Path | None) -> Path | None:
     return stacked_params(capture, params) if params is not None and capture is not None else params
 
 
-_PATHS = ("capture", "params", "body", "scan", "labels")
+_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks")
 
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:
@@ -87,6 +90,6 @@ def _inputs(values: dict[str, Any]) -> RegisterInputs:
     frames, hold_out = values["frames"], as_list(values["hold_out"], subject="hold_out")
     if frames is not None:
         frames = tuple(as_integer(frame, subject="frames") for frame in as_list(frames, subject="frames"))
-    found = values | {key: Path(values[key]) for key in _PATHS if values[key] is not None}
+    found = values | {key: Path(values[key]) for key in _PATHS if values.get(key) is not None}
     found |= {"frames": frames, "hold_out": tuple(as_text(name, subject="hold_out") for name in hold_out)}
     return RegisterInputs(**found)

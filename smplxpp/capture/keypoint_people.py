@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.capture.keypoint_names import (
+from smplxpp.body.keypoint_names import (
     BODY_25B,
     BY_COUNT,
     FACE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from smplxpp.capture.capture import Capture
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_path
-from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files.onnx_file import OnnxModel
 
 # Side of the square that models of free input size are fed with.
 _DEFAULT_SIDE = 1024
@@ -48,20 +48,10 @@ class MattingModel:
     """
 
     def __init__(self, path: str | Path, config: MattingConfig | None = None) -> None:
-        try:
-            import onnxruntime
-        except ImportError:
-            raise MissingExtraError("onnxruntime", extra="matting", purpose="matting with an ONNX model") from None
-        path = regular_file(path, subject="matting model", remedy="name an existing ONNX file")
         self.config = config or MattingConfig()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = self.config.threads
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
-            raise InputError(f"matting model {path}", expected="an ONNX model", received=f"{error}") from None
-        self._subject = f"matting model {path}"
-        entries = self._session.get_inputs()
+        self._model = OnnxModel(path, kind="matting model", extra="matting", threads=self.config.threads)
+        self._subject = self._model.subject
+        entries = self._model.inputs
         sizes = [self._size_of(entry) for entry in entries]
         if len(sizes) != 1 or sizes[0] is None:
             raise InputError(
@@ -91,10 +81,7 @@ class MattingModel:
         tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
             2, 0, 1
         )[None]
-        try:
-            outputs = self._session.run(None, {self._name: tensor.astype(self._dtype)})
-        except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for whatever a model cannot do
-            raise InputError(self._subject, expected="a model that runs", received=f"{error}"[:400]) from None
+        outputs = self._model.run({self._name: tensor.astype(self._dtype)})
         matte = self._opacity(outputs)
         back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
         return np.clip(np.asarray(back) * 255.0 + 0.5, 0, 255).astype(np.uint8)
@@ -117,8 +104,17 @@ class MattingModel:
         return self._size[0] * self._size[1]
 
 
+def matte_path(folder: str | Path, camera: str, frame: int) -> Path:
+    """Where the matte of a view lies in a folder of masks."""
+    return Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
+
+
 def write_mattes(
-    capture: Capture, model: MattingModel, folder: str | Path, *, views: Iterable[tuple[str, int]] | None = None
+    capture: Capture,
+    model: Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]],
+    folder: str | Path,
+    *,
+    views: Iterable[tuple[str, int]] | None = None,
 ) -> Iterator[Path]:
     """Make the mattes of a capture's views, `folder/CAM/CAM_maskFFFFFF.png`; those that exist are left as they are.
 
@@ -126,7 +122,7 @@ def write_mattes(
 
     Args:
         capture: at full size; distorted images are matted as the lens drew them.
-        model: the user's.
+        model: gives the opacity of the person in an sRGB image: a `MattingModel`, or anything else that does.
         folder: where to.
         views: (camera, frame); None: every image there is.
 
@@ -138,7 +134,7 @@ def write_mattes(
     from smplxpp.capture.images import read_color
 
     for camera, frame in capture.views() if views is None else views:
-        target = Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
+        target = matte_path(folder, camera, frame)
         if not target.is_file():
             image = np.asarray(read_color(capture.required_file(camera, frame)))
             with atomic_path(target) as temporary:

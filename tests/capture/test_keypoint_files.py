@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smplxpp.capture.keypoint_files import KeypointOptions, find_places, read_keypoints
-from smplxpp.capture.keypoint_names import (
+from smplxpp.body.keypoint_names import (
     BODY_25,
     BODY_25B,
     BODY_135,
@@ -21,6 +20,7 @@ from smplxpp.capture.keypoint_names import (
     VOCABULARY,
     WHOLE_BODY_133,
 )
+from smplxpp.capture.keypoint_files import KeypointOptions, find_places, read_keypoints
 from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 

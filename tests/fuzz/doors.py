@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pipelines.captures.detect_keypoints import standing_rows
 from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.images import read_alpha, read_color, read_normals
@@ -22,6 +23,7 @@ from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import BodyParams
+from smplxpp.detect.model_card import load_card
 from smplxpp.register.landmark_file import read_landmarks, write_landmarks
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set
@@ -270,6 +272,26 @@ def _image_doors() -> list[Door]:
     ]
 
 
+def _detector_doors() -> list[Door]:
+    """The card of a user's keypoint model, and the record of what was detected."""
+    card = {"names": ["nose", None, "left_ear"], "size": [192, 256], "mean": [1.5, 2, 3], "std": [1, 1, 1]}
+    card |= {"channels": "bgr", "padding": 1.2, "simcc_split": 2.0, "alignment": "corners"}
+    record = {"keypoints": np.ones((2, 2, 3)), "joint_names": np.array(["nose", "left_ear"]), "frames": np.arange(2)}
+    record |= {"image_digest": np.array(["a", "b"]), "people": np.array([1, 0]), "detector": np.array(["fuzz"])}
+
+    class Known:
+        names, identity = ("nose", "left_ear"), "fuzz"
+
+    return [
+        Door("model card", lambda f: _write_json(f / "m.json", card), lambda f: load_card(f / "m.onnx")),
+        Door(
+            "detected keypoints",
+            lambda folder: np.savez(folder / "k.npz", **record),
+            lambda folder: standing_rows(folder / "k.npz", Known()),
+        ),
+    ]
+
+
 def _basic_doors() -> list[Door]:
     arrays = {"a": np.arange(12.0).reshape(3, 4), "names": np.array(["x", "yz"]), "n": np.array(3)}
     content = {"array": arrays["a"], "list": [1, 2.5, "x", None, {"k": (1, 2)}], "objects": np.array([{}, 1], object)}
@@ -301,6 +323,6 @@ def _basic_doors() -> list[Door]:
 def doors() -> dict[str, Door]:
     """Every door by name."""
     every = [_capture_door(name) for name in WRITERS] + _params_doors() + _keypoint_doors()
-    every += _mesh_doors() + _label_doors() + _hand_doors() + _image_doors() + _basic_doors()
+    every += _mesh_doors() + _label_doors() + _hand_doors() + _image_doors() + _detector_doors() + _basic_doors()
     every += run_doors()
     return {door.name: door for door in every}

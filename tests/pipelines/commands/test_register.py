@@ -11,7 +11,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.register import Register
-from pipelines.stages.register_config import RegisterInputs
+from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.core.errors import InputError
 from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
 
@@ -140,3 +140,22 @@ def test_options_reach_the_inputs(tmp_path):
     command = Register(out=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2)
     inputs = command.inputs()
     assert (inputs.start, inputs.frames, inputs.hold_out, inputs.frame) == (False, (0, 2), ("Cam001",), 2)
+
+
+def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp_path):
+    """What a detector wrote apart from the capture is what the registration sees, and its record says so."""
+    from pipelines.stages.observe import observe
+    from smplxpp.body import load_body
+
+    apart = shutil.copytree(FIXTURE / "keypoints", tmp_path / "k")
+    (apart / "Cam001.npz").unlink()
+    options = Register(out=tmp_path / "run", capture=FIXTURE, initial="none", keypoints=apart, masks=FIXTURE / "masks")
+    inputs = options.inputs()
+    assert (inputs.keypoints, inputs.masks) == (apart, FIXTURE / "masks")
+    seen = observe(inputs, load_body()).observations
+    assert "Cam001" in seen.cameras and "Cam001" not in seen.keypoints and len(seen.keypoints) > 3
+    (tmp_path / "run").mkdir()
+    save_register(tmp_path / "run", inputs)
+    assert load_register(tmp_path / "run") == inputs
+    with pytest.raises(InputError, match="option keypoints"):
+        Register(out=tmp_path, scan=FIXTURE / "scans/scan_000000.ply", keypoints=apart).inputs()
