@@ -17,6 +17,7 @@ from pipelines.runs.by_hand import take_file
 from pipelines.runs.layout import (
     BIND_STAGE,
     BUILD_STAGES,
+    CORRECTIONS_FILE,
     EVALUATE_STAGE,
     LANDMARKS_FILE,
     REFINE_STAGE,
@@ -55,6 +56,9 @@ class Build:
     landmarks: OptionalPath = None
     """Landmarks of the scan, a JSON object of points by name: with --scan they stand in for --params. Kept in the run
     as landmarks.json, which is read whenever it lies there."""
+    corrections: OptionalPath = None
+    """Labels corrected by hand, as `smplxpp label` writes them. Kept in the run as labels_corrections.json, which is
+    read whenever it lies there."""
     label_set: str = "auto"
     """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
     auto: `capture` with --capture, else 4ddress."""
@@ -106,10 +110,12 @@ class Build:
         from pipelines.report.sections.build import write_build_report
         from pipelines.stages.build import build
         from smplxpp.register.landmark_file import read_landmarks
+        from smplxpp.segment import Corrections
 
         keep_out_of_capture(self.out, self.capture)
         config, inputs = self.config(), self.inputs()
         take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
+        take_file(self.out, CORRECTIONS_FILE, self.corrections, read=Corrections.load)
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
         count = sum(name in inputs.stages for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report

@@ -17,6 +17,7 @@ from pipelines.runs.layout import (
     BUILD_STAGES,
     CAPTURE_STAGE,
     CLEAN_STAGE,
+    CORRECTIONS_FILE,
     METRICS_FILE,
     POSE_BODY_STAGE,
     REGISTER_STAGE,
@@ -49,12 +50,14 @@ class _Part:
         module: its `run(folder, build)` does the work; its imports are the stage's code.
         needs: stages that it reads, where the build has them.
         settings: fields of the configuration or the inputs that it depends on. files: inputs that it reads.
+        by_hand: files that it reads where they lie in the run.
     """
 
     module: ModuleType
     needs: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
+    by_hand: tuple[str, ...] = ()
 
 
 PARTS: dict[str, _Part] = {
@@ -63,7 +66,11 @@ PARTS: dict[str, _Part] = {
     ),
     POSE_BODY_STAGE: _Part(pose_body, (CAPTURE_STAGE,), files=("body",)),
     SEGMENT_STAGE: _Part(
-        segment, (CAPTURE_STAGE,), settings=("label_set",), files=("labels", "label_maps", "cameras", "scan")
+        segment,
+        (CAPTURE_STAGE,),
+        settings=("label_set",),
+        files=("labels", "label_maps", "cameras", "scan"),
+        by_hand=(CORRECTIONS_FILE,),
     ),
     CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
     TRANSFER_STAGE: _Part(
@@ -156,6 +163,7 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
     digests: dict[str, str] = {}
     for key in part.files:
         digests |= _file_digests(key, getattr(inputs, key))
+    digests |= {file: sha256_file(context.run / file) for file in part.by_hand if (context.run / file).exists()}
     for other in (name for name in part.needs if name in records):
         digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
     return Stage(

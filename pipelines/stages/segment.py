@@ -11,7 +11,7 @@ from pipelines.runs.artefacts import (
     load_source_faces,
 )
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import SCAN
+from pipelines.runs.layout import CORRECTIONS_FILE, SCAN
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
@@ -20,7 +20,14 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, display_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
-from smplxpp.segment import read_label_map, read_labels, segment_scan, vote_on_faces
+from smplxpp.segment import (
+    Corrections,
+    SegmentedScan,
+    read_label_map,
+    read_labels,
+    segment_scan,
+    vote_on_faces,
+)
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
@@ -59,12 +66,24 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             with values_of(build.run / SCAN):
                 of_vertices = labels[source_vertex]
             result = segment_scan(scan, vertex_labels=of_vertices)
-    np.savez(folder / "labels.npz", face_labels=result.face_labels, confidence=result.confidence, seen=result.seen)
+    result = _corrected(build.run, scan, result)
+    assert result.corrected is not None
+    np.savez(
+        folder / "labels.npz",
+        face_labels=result.face_labels,
+        confidence=result.confidence,
+        seen=result.seen,
+        corrected=result.corrected,
+    )
     write_ply(
         folder / "labels.ply",
         scan,
         vertex_colors=display_colors(vertex_labels(scan, result.face_labels)),
-        face_properties={"label": result.face_labels, "confidence": result.confidence},
+        face_properties={
+            "label": result.face_labels,
+            "confidence": result.confidence,
+            "corrected": result.corrected.astype(np.uint8),
+        },
     )
     areas = scan.face_areas / scan.face_areas.sum()
     checks = [
@@ -86,7 +105,18 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             explanation="labelled from its neighbours alone",
         ),
     ]
-    return StageOutput(checks, {"area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)}})
+    numbers = {
+        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
+        "corrected_by_hand": float(areas @ result.corrected),
+    }
+    return StageOutput(checks, numbers)
+
+
+def _corrected(run: Path, scan: TriangleMesh, result: SegmentedScan) -> SegmentedScan:
+    """The labels with what a hand has corrected in the run."""
+    path = run / CORRECTIONS_FILE
+    corrections = Corrections.load(path) if path.exists() else Corrections()
+    return corrections.apply(scan, result)
 
 
 def vertex_labels(mesh: TriangleMesh, face_labels: np.ndarray) -> np.ndarray:

@@ -1,15 +1,20 @@
 """Segmentation of a scan: label files and label maps in, a label with its confidence on every face out."""
 
+from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import labels_from_colors, read_label_map, read_labels
 from smplxpp.segment.labels import LABEL_SETS, LabelSet, find_label_set, map_labels
 from smplxpp.segment.segment import SegmentConfig, SegmentedScan, segment_scan
 from smplxpp.segment.votes import vote_on_faces
 
 __all__ = [
+    "BoxCorrection",
+    "Corrections",
+    "FaceCorrection",
     "LABEL_SETS",
     "LabelSet",
     "SegmentConfig",
     "SegmentedScan",
+    "StrokeCorrection",
     "find_label_set",
     "labels_from_colors",
     "map_labels",

@@ -66,6 +66,7 @@ class SegmentedScan:
         seen: (M,) bool: some vote fell on the face.
         island_faces: faces relabelled because their patch was too small.
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
+        corrected: (M,) bool: a hand has set the label (`Corrections.apply`); None: nobody was asked.
     """
 
     face_labels: Int64[np.ndarray, " M"]
@@ -74,6 +75,7 @@ class SegmentedScan:
     island_faces: int
     energy_before: float
     energy_after: float
+    corrected: Bool[np.ndarray, " M"] | None = None
 
 
 def segment_scan(

@@ -25,6 +25,7 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
 from smplxpp.register.landmark_file import read_landmarks, write_landmarks
+from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set
 from tests.capture.scene import make_scene
@@ -245,12 +246,20 @@ def _label_doors() -> list[Door]:
 
 def _hand_doors() -> list[Door]:
     """What is placed and corrected by hand."""
+    mesh, _ = _patch()
+    stroke = StrokeCorrection(3, mesh.vertices[:4], 0.2, mesh.vertex_normals[:4])
+    box = BoxCorrection(4, np.array([0.5, 0.5, 0.0]), np.array([0.5, 0.2, 1.0]), np.eye(3))
     points = {"nose": np.array([0.01, 1.62, 0.11]), "left_hip": np.array([0.1, 0.9, 0.0])}
     return [
         Door(
             "landmarks",
             lambda folder: write_landmarks(folder / "landmarks.json", points),
             lambda folder: read_landmarks(folder / "landmarks.json"),
+        ),
+        Door(
+            "corrections",
+            lambda folder: Corrections((stroke, box, FaceCorrection.of(mesh, 2, np.arange(5)))).save(folder / "c.json"),
+            lambda folder: Corrections.load(folder / "c.json").face_labels(mesh, np.zeros(mesh.face_count, np.int64)),
         ),
     ]
 

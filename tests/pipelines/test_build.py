@@ -15,6 +15,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
+from pipelines.runs.artefacts import load_scan
 from pipelines.runs.layout import TEMPLATE_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
@@ -23,8 +24,9 @@ from smplxpp.body import load_params
 from smplxpp.body.stress_poses import stress_poses
 from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.labels import CLOTH_LABELS, HAIR
 from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.segment import BoxCorrection, Corrections
 from smplxpp.template.template import Template
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -103,6 +105,53 @@ def test_a_hard_pose_is_held_against_what_it_asks_of_the_hem(person_run):
     worst = max(one["p999"] / max(one["opening"], 1.0) for part in poses.values() for one in part.values())
     (check,) = (c for c in metrics["checks"] if c["name"] == "edge stretch p99.9, hard poses")
     assert check["value"] == pytest.approx(worst)
+
+
+def test_labels_corrected_by_hand_are_taken_up_and_kept(small):
+    """The run's file is found, a change of it makes the labels anew, and no run removes it."""
+    before = small.build("run", small.inputs(), last="30_clean")
+    scan, run = load_scan(small.folder / "run")[0], small.folder / "run"
+    low, high = scan.vertices.min(axis=0), scan.vertices.max(axis=0)
+    head = BoxCorrection(
+        HAIR.id, 0.5 * (low + high) + [0, 0.45 * np.ptp(scan.vertices[:, 1]), 0], np.ones(3), np.eye(3)
+    )
+    Corrections((head,)).save(run / "labels_corrections.json")
+    written = (run / "labels_corrections.json").read_bytes()
+    after = small.build("run", small.inputs(), last="30_clean")
+    ran = {name: record.ran for name, record in after.items()}
+    assert ran == {"00_capture": False, "10_body": False, "20_segment": True, "30_clean": True}
+    with np.load(run / "20_segment" / "labels.npz") as labels:
+        corrected = labels["corrected"]
+        inside = np.abs(scan.face_centers - head.center).max(axis=1) <= 0.5
+        np.testing.assert_array_equal(corrected, inside)
+        assert (labels["face_labels"][inside] == HAIR.id).all() and (labels["confidence"][inside] == 1).all()
+    numbers = [records["20_segment"].manifest["numbers"]["corrected_by_hand"] for records in (before, after)]
+    assert numbers[0] == 0 and numbers[1] == pytest.approx(scan.face_areas[inside].sum() / scan.face_areas.sum())
+    again = small.build("run", small.inputs(), last="30_clean")
+    assert not any(record.ran for record in again.values())
+    assert (run / "labels_corrections.json").read_bytes() == written
+    (run / "labels_corrections.json").write_text("{}")
+    with pytest.raises(InputError, match="corrections"):
+        small.build("run", small.inputs(), last="30_clean")
+
+
+def test_corrections_of_another_run_are_copied(small, capsys):
+    small.inputs()
+    Corrections((BoxCorrection(HAIR.id, np.array([0.0, 9.0, 0.0]), np.full(3, 20.0), np.eye(3)),)).save(
+        small.folder / "mine.json"
+    )
+    files = {"--scan": "scan.npz", "--labels": "labels.npz", "--corrections": "mine.json", "--out": "run"}
+    options = [word for option, name in files.items() for word in (option, str(small.folder / name))]
+    command = ["build", *options, "--params", str(PARAMS), "--label-set", "capture", "--until-stage", "20_segment"]
+    assert main([*command, "--json"]) == 0
+    run = small.folder / "run"
+    assert (run / "labels_corrections.json").read_bytes() == (small.folder / "mine.json").read_bytes()
+    with np.load(run / "20_segment" / "labels.npz") as labels:
+        assert (labels["face_labels"] == HAIR.id).all()
+    (small.folder / "mine.json").write_text("[]")
+    capsys.readouterr()
+    assert main([*command, "--json"]) == 2 and "an object" in capsys.readouterr().out
+    assert b"hair" in (run / "labels_corrections.json").read_bytes()
 
 
 def test_webs_stay_where_the_user_wants_them(small):

@@ -1,0 +1,320 @@
+"""Labels corrected by hand: what a hand has said of which surface, its file, and labels with it applied."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64, Integer
+
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_numbers, as_object, as_text, read_json
+from smplxpp.core.labels import LABEL_BY_NAME, LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.validation import require_choice
+from smplxpp.segment.corrected_faces import ScanSurface, nearest_faces, stroked_faces
+from smplxpp.segment.segment import SegmentedScan
+
+FORMAT_VERSION = 1
+LEAST_RADIUS, MOST_RADIUS = 0.001, 0.5
+"""Metres, of a stroke."""
+LONGEST_STEP = 0.25
+"""Metres between two points of a stroke: what lies farther apart is not one stroke on a surface."""
+_MOST_CORRECTIONS, _MOST_POINTS, _MOST_FACES = 20_000, 10_000, 5_000_000
+_MOST_METRES = 1e3
+_MARK = {"faces", "stroke", "box"}
+
+
+@dataclass(frozen=True, eq=False)
+class FaceCorrection:
+    """Faces of a scan.
+
+    Attributes:
+        label: id. faces: their numbers in the scan.
+        triangles: where they lie, metres: how they are found again in another triangulation; None: not at all.
+        scan: digest of the scan that they are numbers of; None: of whichever scan there is.
+    """
+
+    label: int
+    faces: Int64[np.ndarray, " n"]
+    triangles: Float64[np.ndarray, "n 3 3"] | None = None
+    scan: str | None = None
+
+    @staticmethod
+    def of(mesh: TriangleMesh, label: int, faces: Integer[np.ndarray, " n"]) -> FaceCorrection:
+        """Faces of this mesh, with all that finds them again."""
+        faces = np.asarray(faces, dtype=np.int64)
+        return FaceCorrection(label, faces, mesh.triangles[faces], scan_digest(mesh))
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeCorrection:
+    """A stroke of a brush: the surface within a distance of a line on it, measured along the surface.
+
+    Attributes:
+        label: id. points: of the line, metres, at most 25 cm apart. radius: metres.
+        normals: of the surface under the points, which tell its front from its back; None: of the nearest faces.
+    """
+
+    label: int
+    points: Float64[np.ndarray, "n 3"]
+    radius: float
+    normals: Float64[np.ndarray, "n 3"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BoxCorrection:
+    """Everything in a box, on all sides: faces whose centres lie in it.
+
+    Attributes:
+        label: id. center: metres. size: lengths of its edges, metres.
+        rotation: world from the box's own axes.
+    """
+
+    label: int
+    center: Float64[np.ndarray, " 3"]
+    size: Float64[np.ndarray, " 3"]
+    rotation: Float64[np.ndarray, "3 3"]
+
+
+Correction = FaceCorrection | StrokeCorrection | BoxCorrection
+
+
+def scan_digest(mesh: TriangleMesh) -> str:
+    """SHA-256 of a scan's vertices and faces: whether numbers of faces still mean the same."""
+    whole = hashlib.sha256(np.ascontiguousarray(mesh.vertices, dtype=np.float64).tobytes())
+    whole.update(np.ascontiguousarray(mesh.faces, dtype=np.int64).tobytes())
+    return whole.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """Corrections in the order in which they were made: a later one covers an earlier one.
+
+    They are applied to finished labels, after the graph cut, and hold as they are painted: nothing smooths them away.
+
+    Example:
+        >>> corrections = Corrections.load("runs/me/labels_corrections.json")
+        >>> corrected = corrections.apply(mesh, segment_scan(mesh, votes=votes))
+    """
+
+    items: tuple[Correction, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def with_added(self, correction: Correction) -> Corrections:
+        """One more at the end."""
+        return Corrections((*self.items, correction))
+
+    @staticmethod
+    def load(path: str | Path) -> Corrections:
+        """Read `labels_corrections.json` (docs/corrections.md).
+
+        Raises:
+            InputError: no such file, another version, unknown labels, numbers out of range; the entry is named.
+        """
+        subject = f"corrections {path}"
+        content = as_object(read_json(path, subject="corrections"), subject=subject)
+        version = as_integer(content.get("version", FORMAT_VERSION), subject=f"{subject}: version")
+        if version != FORMAT_VERSION:
+            raise InputError(f"{subject}: version", expected=f"{FORMAT_VERSION}", received=f"{version}")
+        rows = as_list(content.get("corrections"), subject=f"{subject}: corrections")
+        if len(rows) > _MOST_CORRECTIONS:
+            raise InputError(subject, expected=f"at most {_MOST_CORRECTIONS} corrections", received=f"{len(rows)}")
+        return Corrections(tuple(_read(row, f"{subject}: correction {k + 1}") for k, row in enumerate(rows)))
+
+    def save(self, path: str | Path) -> None:
+        """Write what `load` reads, a line a correction, to a tenth of a millimetre, whole or not at all."""
+        rows = ",\n  ".join(json.dumps(_written(item), separators=(",", ":")) for item in self.items)
+        inner = f"[\n  {rows}\n ]" if rows else "[]"
+        atomic_write_text(path, f'{{\n "version": {FORMAT_VERSION},\n "corrections": {inner}\n}}\n')
+
+    def face_labels(
+        self, mesh: TriangleMesh, labels: Integer[np.ndarray, " M"], *, surface: ScanSurface | None = None
+    ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
+        """The labels of a scan's faces with all corrections applied, and the number of the correction that set each,
+        -1 where none did.
+
+        Args:
+            surface: of the mesh, where there is one already.
+
+        Raises:
+            InputError: numbers of faces of another scan, without the places of these.
+        """
+        surface, out = surface or ScanSurface(mesh), np.array(labels, dtype=np.int64)
+        by = np.full(mesh.face_count, -1, dtype=np.int64)
+        for k, item in enumerate(self.items):
+            faces = faces_of(item, surface, subject=f"correction {k + 1} ({LABELS[item.label].name})")
+            out[faces], by[faces] = item.label, k
+        return out, by
+
+    def apply(self, mesh: TriangleMesh, segmented: SegmentedScan) -> SegmentedScan:
+        """Labels with the corrections: what a hand has set has confidence 1, is seen, and is marked as `corrected`."""
+        labels, by = self.face_labels(mesh, segmented.face_labels)
+        corrected = by >= 0
+        return replace(
+            segmented,
+            face_labels=labels,
+            confidence=np.where(corrected, 1.0, segmented.confidence),
+            seen=segmented.seen | corrected,
+            corrected=corrected,
+        )
+
+
+def faces_of(item: Correction, surface: ScanSurface, *, subject: str = "correction") -> Int64[np.ndarray, " n"]:
+    """The faces of a scan that a correction means.
+
+    Warns:
+        GeometryWarning: it means none, or the scan has changed since and its faces are found again by their places.
+
+    Raises:
+        InputError: numbers of faces of another scan, without the places of these.
+    """
+    if isinstance(item, StrokeCorrection):
+        faces = stroked_faces(surface, item.points, item.radius, normals=item.normals)
+    elif isinstance(item, BoxCorrection):
+        inside = np.abs((surface.centers - item.center) @ item.rotation) <= 0.5 * item.size
+        faces = np.flatnonzero(inside.all(axis=1))
+    else:
+        faces = _numbered_faces(item, surface, subject)
+    if not len(faces):
+        warnings.warn(f"{subject}: nothing of the scan is there; it changes nothing", GeometryWarning, stacklevel=2)
+    return faces
+
+
+def _numbered_faces(item: FaceCorrection, surface: ScanSurface, subject: str) -> Int64[np.ndarray, " n"]:
+    count = surface.mesh.face_count
+    if item.scan is None or item.scan == surface.digest(scan_digest):
+        if len(item.faces) and item.faces.max() >= count:
+            raise InputError(
+                subject,
+                expected=f"faces 0 to {count - 1}, as the run's scan has them",
+                received=f"{item.faces.max()}",
+                remedy="name faces of RUN/00_capture/scan.npz, or use a box or a stroke",
+            )
+        return item.faces
+    if item.triangles is None:
+        raise InputError(
+            subject,
+            expected="faces of this scan, or their `triangles`",
+            received="numbers of faces of another scan",
+            remedy="correct it anew with `smplxpp label RUN`, or remove the entry",
+        )
+    faces, share = nearest_faces(surface, item.triangles)
+    warnings.warn(
+        f"{subject}: the scan has changed since; its {len(item.faces)} faces are found again by their places: "
+        f"{len(faces)} faces, {100 * share:.0f} % of their area",
+        GeometryWarning,
+        stacklevel=3,
+    )
+    return faces
+
+
+# -- the file
+
+
+def _read(row: Any, subject: str) -> Correction:
+    values = as_object(row, subject=subject)
+    name = as_text(values.get("label"), subject=f"{subject}: label")
+    require_choice(f"{subject}: label", name, list(LABEL_BY_NAME))
+    label, marks = LABEL_BY_NAME[name].id, sorted(_MARK & set(values))
+    if len(marks) != 1:
+        raise InputError(subject, expected=f"one of {', '.join(sorted(_MARK))}", received=", ".join(marks) or "none")
+    if marks == ["faces"]:
+        return _read_faces(values, label, subject)
+    if marks == ["box"]:
+        return _read_box(as_object(values["box"], subject=f"{subject}: box"), label, f"{subject}: box")
+    points = _points(values["stroke"], f"{subject}: stroke")
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if (steps > LONGEST_STEP).any():
+        raise InputError(
+            f"{subject}: stroke",
+            expected=f"points at most {LONGEST_STEP:g} m apart, along the surface",
+            received=f"{steps.max():.3g} m",
+        )
+    radius = as_number(values.get("radius"), subject=f"{subject}: radius", least=LEAST_RADIUS, most=MOST_RADIUS)
+    normals = None
+    if values.get("normals") is not None:
+        normals = as_numbers(values["normals"], points.shape, subject=f"{subject}: normals")
+    return StrokeCorrection(label, points, radius, normals)
+
+
+def _read_faces(values: Mapping[str, Any], label: int, subject: str) -> FaceCorrection:
+    listed = as_list(values["faces"], subject=f"{subject}: faces")
+    if not 0 < len(listed) <= _MOST_FACES:
+        raise InputError(f"{subject}: faces", expected=f"1 to {_MOST_FACES}", received=f"{len(listed)}")
+    numbers = as_numbers(listed, (None,), subject=f"{subject}: faces")
+    if (numbers < 0).any() or (numbers > 2**31).any() or (numbers != np.floor(numbers)).any():
+        raise InputError(f"{subject}: faces", expected="whole numbers from 0", received="others")
+    triangles = None
+    if values.get("triangles") is not None:
+        triangles = as_numbers(values["triangles"], (len(listed), 3, 3), subject=f"{subject}: triangles")
+        _require_near(triangles, f"{subject}: triangles")
+    scan = values.get("scan")
+    digest = None if scan is None else as_text(scan, subject=f"{subject}: scan")
+    return FaceCorrection(label, numbers.astype(np.int64), triangles, digest)
+
+
+def _read_box(values: Mapping[str, Any], label: int, subject: str) -> BoxCorrection:
+    def vector(name: str) -> Float64[np.ndarray, " 3"]:
+        found = as_numbers(values.get(name), (3,), subject=f"{subject}: {name}")
+        _require_near(found, f"{subject}: {name}")
+        return found
+
+    if "min" in values:
+        low, high = vector("min"), vector("max")
+        center, size, turn = 0.5 * (low + high), high - low, np.zeros(3)
+    else:
+        center, size = vector("center"), vector("size")
+        turn = vector("rotvec") if "rotvec" in values else np.zeros(3)
+    if not (size > 0).all():
+        raise InputError(subject, expected="edges longer than 0", received=f"{np.array2string(size, precision=3)}")
+    return BoxCorrection(label, center, size, matrix_from_rotvec(turn))
+
+
+def _points(value: Any, subject: str) -> Float64[np.ndarray, "n 3"]:
+    listed = as_list(value, subject=subject)
+    if not 0 < len(listed) <= _MOST_POINTS:
+        raise InputError(subject, expected=f"1 to {_MOST_POINTS} points", received=f"{len(listed)}")
+    points = as_numbers(listed, (None, 3), subject=subject)
+    _require_near(points, subject)
+    return points
+
+
+def _require_near(values: Float[np.ndarray, "*n"], subject: str) -> None:
+    if np.abs(values).max(initial=0.0) > _MOST_METRES:
+        raise InputError(subject, expected="metres, as the run's scan has them", received=f"{np.abs(values).max():.3g}")
+
+
+def _written(item: Correction) -> dict[str, Any]:
+    def rounded(values: Any, digits: int = 4) -> list:
+        return np.round(values, digits).tolist()
+
+    out: dict[str, Any] = {"label": LABELS[item.label].name}
+    if isinstance(item, StrokeCorrection):
+        out |= {"stroke": rounded(item.points), "radius": round(float(item.radius), 5)}
+        return out if item.normals is None else out | {"normals": rounded(item.normals, 3)}
+    if isinstance(item, BoxCorrection):
+        turn = rotvec_from_matrix(item.rotation)
+        if not np.any(np.abs(turn) > 1e-9):
+            return out | {
+                "box": {
+                    "min": rounded(item.center - 0.5 * item.size, 5),
+                    "max": rounded(item.center + 0.5 * item.size, 5),
+                }
+            }
+        box = {"center": rounded(item.center, 5), "size": rounded(item.size, 5), "rotvec": rounded(turn, 6)}
+        return out | {"box": box}
+    out["faces"] = item.faces.tolist()
+    if item.scan is not None:
+        out["scan"] = item.scan
+    return out if item.triangles is None else out | {"triangles": rounded(item.triangles)}
