@@ -6,7 +6,7 @@ import warnings
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Int64, Integer, Num
+from jaxtyping import Int64, Integer, Num, UInt8
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -71,12 +71,27 @@ class Sanitized:
         mesh: two-manifold (with borders), every vertex referenced, winding consistent in each component.
         source_vertex: (n,) index into the raw vertices. source_face: (m,) index into the raw faces.
         report: the changes.
+        merged_into: (N,) for every raw vertex the one that it was welded to; its own index for most.
     """
 
     mesh: TriangleMesh
     source_vertex: Int64[np.ndarray, " n"]
     source_face: Int64[np.ndarray, " m"]
     report: CleanReport
+    merged_into: Int64[np.ndarray, " N"]
+
+    def mean_colors(self, colors: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "n 3"]:
+        """Colours of the raw vertices as the mesh's: each the mean of the vertices that were welded to one.
+
+        Files split vertices along the seams of their textures; the two sides' colours differ a little.
+        """
+        used = self.merged_into[self.source_vertex]
+        count = np.bincount(self.merged_into, minlength=len(colors))
+        out = colors[used]
+        for k in range(3):
+            sums = np.bincount(self.merged_into, colors[:, k], minlength=len(colors))
+            out[:, k] = np.rint(sums[used] / count[used])
+        return out
 
 
 def sanitize(
@@ -146,7 +161,7 @@ def sanitize(
     )
     if not report.is_clean:
         warnings.warn(f"mesh repaired: {report}", GeometryWarning, stacklevel=2)
-    return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report)
+    return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report, target)
 
 
 def _strays(vertices: np.ndarray, referenced: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The colours of a glTF primitive's vertices: picture, vertex colours, base colour."""
+"""The colours of a glTF primitive's vertices: picture times vertex colours times base colour, in linear light."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ from smplxpp.core.files.image_file import decode_image
 from smplxpp.core.files.json_file import as_number, as_numbers, as_text
 from smplxpp.core.mesh_files.gltf_document import GltfDocument
 from smplxpp.core.mesh_files.raw_mesh import warn
-from smplxpp.core.mesh_files.texture import sample_texture
+from smplxpp.core.mesh_files.texture import CLAMP, MIRROR, REPEAT, sample_texture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+# Values of a sampler's wrapS and wrapT.
+_REPEATED = 10497
+_WRAPS = {_REPEATED: REPEAT, 33071: CLAMP, 33648: MIRROR}
+
 
 def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
     """The colours of a primitive's vertices; None where it has none, or, with a warning, where they are damaged.
+
+    Picture, vertex colours and the base colour's factor are multiplied, as glTF 2.0 says in section 3.9.2.
 
     Args:
         document: the file.
@@ -27,10 +33,20 @@ def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: i
         count: its vertices.
     """
     try:
-        colors = _picture_colors(document, primitive, count)
-        if colors is None:
-            colors = _vertex_colors(document, primitive, count)
-        return _base_color(document, primitive, count) if colors is None else colors
+        factor = _factor(document, primitive)
+        found: list[np.ndarray] = [
+            colors
+            for colors in (_picture_colors(document, primitive, count), _vertex_colors(document, primitive, count))
+            if colors is not None
+        ]
+        if factor is None and not found:
+            return None
+        if len(found) == 1 and found[0].dtype == np.uint8 and (factor is None or (factor == 1).all()):
+            return found[0]  # the file's own bytes
+        light = np.ones((count, 3)) if factor is None else np.repeat(factor[None], count, axis=0)
+        for colors in found:
+            light *= linear_from_srgb(colors) if colors.dtype == np.uint8 else colors
+        return srgb_from_linear(light)
     except InputError as error:
         warn(f"{document.subject}: colours of a primitive are lost: {error}")
         return None
@@ -61,7 +77,15 @@ def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: in
     if uv.shape != (count, 2):
         raise InputError("texture coordinates", expected="two a vertex", received=f"shape {uv.shape}")
     picture = _picture(document, use)
-    return sample_texture(picture, _transformed(uv, transform), top_down=True)
+    return sample_texture(picture, _transformed(uv, transform), top_down=True, wrap=_wrap(document, use))
+
+
+def _wrap(document: GltfDocument, use: dict[str, Any]) -> tuple[str, str]:
+    """What a texture shows beyond its edges, along u and v."""
+    texture = document.entry("textures", use.get("index"))
+    sampler = document.entry("samplers", texture["sampler"]) if "sampler" in texture else {}
+    modes = [_WRAPS.get(document.number(sampler, name, _REPEATED), REPEAT) for name in ("wrapS", "wrapT")]
+    return modes[0], modes[1]
 
 
 def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "H W 3"]:
@@ -103,7 +127,8 @@ def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> F
         return (uv * scale) @ turn.T + offset
 
 
-def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
+def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> Num[np.ndarray, "N 3"] | None:
+    """The vertex colours: sRGB bytes, or else linear and float."""
     attributes = document.part(primitive, "attributes")
     if "COLOR_0" not in attributes:
         return None
@@ -115,15 +140,22 @@ def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int
     if stored == 5121:
         # glTF's vertex colours are linear, but those of eight bits are in practice the sRGB bytes of another file.
         return np.rint(rgb * (255.0 if colors.dtype.kind == "f" else 1.0)).astype(np.uint8)
-    return srgb_from_linear(rgb if colors.dtype.kind == "f" else rgb / 65535.0)
+    rgb = rgb if colors.dtype.kind == "f" else rgb / 65535.0
+    return np.clip(np.nan_to_num(rgb), 0.0, 1.0)
 
 
-def _base_color(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
-    surface, picture, factor = _surface(document, primitive)
-    if factor not in surface or picture in surface:
+def _factor(document: GltfDocument, primitive: dict[str, Any]) -> Float64[np.ndarray, " 3"] | None:
+    """The base colour's factor, linear; None where the material states none."""
+    surface, _, factor = _surface(document, primitive)
+    if factor not in surface:
         return None
-    color = as_numbers(surface[factor], (4,), subject="base colour")
-    return np.repeat(srgb_from_linear(color[None, :3]), count, axis=0)
+    return as_numbers(surface[factor], (4,), subject="base colour")[:3]
+
+
+def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """8-bit sRGB as linear RGB in [0, 1] (IEC 61966-2-1)."""
+    c = colors / 255.0
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(colors: Num[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:

@@ -18,7 +18,7 @@ from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.number_text import IS_SPACE, as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.mesh_files.obj_material import Material, read_materials
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices, warn
-from smplxpp.core.mesh_files.texture import LOST, Pictures, sample_texture
+from smplxpp.core.mesh_files.texture import CLAMP, LOST, REPEAT, Pictures, mean_of_corners, sample_texture
 
 # Lines that are numbers are read together up to this many bytes, so that the work space stays small.
 _BLOCK = 1 << 24
@@ -27,8 +27,8 @@ _BLOCK = 1 << 24
 def read_obj(path: Path) -> RawMesh:
     """Read an OBJ file.
 
-    Colours are those of the `v` lines (`v x y z r g b`); without them the material's: its picture at the vertex's
-    first texture coordinate, or its `Kd`.
+    Colours are those of the `v` lines (`v x y z r g b`); without them the material's: its picture's mean over the
+    texture coordinates that the vertex has at its corners, or its `Kd`.
 
     Raises:
         InputError: a word that is no number, a vertex of fewer than three, indices of vertices that do not exist.
@@ -188,19 +188,24 @@ def _material_colors(
     *,
     vertex_count: int,
 ) -> UInt8[np.ndarray, "N 3"] | None:
-    """The colours that the materials of the vertices' first corners give; None where no material has any."""
+    """The colours that the materials give, the mean over a vertex's corners; None where no material has any."""
     uses, libraries = lines.words(b"usemtl"), lines.words(b"mtllib")
     if not uses or not libraries:
         return None
     materials = read_materials(path, [name for _, name in libraries])
     names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
-    corners = np.where((corners >= 0) & (corners < vertex_count), corners, 0)  # of faces that were left out
-    vertices, first = np.unique(corners, return_index=True)
-    use = np.searchsorted([line for line, _ in uses], corner_lines[first]) - 1
+    inside = (corners >= 0) & (corners < vertex_count)  # others are of faces that were left out
+    corners, uv_references, corner_lines = corners[inside], uv_references[inside], corner_lines[inside]
+    use = np.searchsorted([line for line, _ in uses], corner_lines) - 1
     used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
+    # A vertex between two materials has the colour of its first corner's.
+    first = np.zeros(vertex_count, np.int64)
+    vertices, places = np.unique(corners, return_index=True)
+    first[vertices] = used[places]
+    used = np.where(used == first[corners], used, -1)
     rows = _rows(lines, b"vt", f"mesh file {path}")
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
-    index = _resolve(uv_references[first], lines.of_kind(b"vt"), corner_lines[first])
+    index = _resolve(uv_references, lines.of_kind(b"vt"), corner_lines)
     index = np.where(index < len(uv), index, -1)
     colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
     pictures = Pictures(f"mesh file {path}")
@@ -212,10 +217,14 @@ def _material_colors(
             picture = pictures.beside(path, material.picture)
             chosen = chosen[index[chosen] >= 0]
             if picture is not None:
-                colors[vertices[chosen]] = sample_texture(picture, uv[index[chosen]])
+                with np.errstate(all="ignore"):
+                    place = uv[index[chosen]] * material.scale + material.offset
+                wrap = (CLAMP, CLAMP) if material.clamp else (REPEAT, REPEAT)
+                at, mean = mean_of_corners(corners[chosen], sample_texture(picture, place, wrap=wrap))
+                colors[at] = mean
                 found = True
         elif material.color is not None:
-            colors[vertices[chosen]] = material.color
+            colors[corners[chosen]] = material.color
             found = True
     return colors if found else None
 

@@ -22,11 +22,16 @@ _MOST_BYTES = 1 << 24
 class Material:
     """A material's colour: `color` (3,) of its `Kd`, `picture` the name in its `map_Kd`; None for what it lacks.
 
-    Beside a picture `Kd` is a factor and no colour: it is left out.
+    Beside a picture `Kd` is left out: it should be a factor, but exporters write 0.8 or 0 there without meaning it.
+    Texture coordinates are multiplied by `scale` and moved by `offset` before the picture is looked up; `clamp`: its
+    last texels go on beyond its edges, where it would else be repeated.
     """
 
     color: UInt8[np.ndarray, " 3"] | None = None
     picture: str | None = None
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamp: bool = False
 
 
 def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
@@ -63,7 +68,7 @@ def _parse(text: str) -> dict[str, Material]:
         elif keyword == "kd" and known.picture is None:
             out[name] = Material(_kd(rest))
         elif keyword == "map_kd" and rest:
-            out[name] = Material(picture=_without_options(rest))
+            out[name] = _picture(rest)
     return out
 
 
@@ -77,15 +82,29 @@ def _kd(text: str) -> UInt8[np.ndarray, " 3"] | None:
     return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
 
 
-def _without_options(text: str) -> str:
-    words = text.split()
+def _picture(text: str) -> Material:
+    """What follows `map_Kd`: options, then a name, which may hold blanks."""
+    words, given = text.split(), dict[str, list[str]]()
     while words and words[0] in (*_OPTIONS, *_VECTORS) and len(words) > 1:
         option = words.pop(0)
+        given[option] = []
         for _ in range(3 if option in _VECTORS else _OPTIONS[option]):
             # Of a vector's three numbers the last two may be left out.
             if len(words) > 1 and (option not in _VECTORS or _is_number(words[0])):
-                words.pop(0)
-    return " ".join(words) if words[:1] != text.split()[:1] else text
+                given[option].append(words.pop(0))
+    return Material(
+        picture=" ".join(words) if given else text,
+        scale=_pair(given.get("-s", []), 1.0),
+        offset=_pair(given.get("-o", []), 0.0),
+        clamp=given.get("-clamp") == ["on"],
+    )
+
+
+def _pair(words: list[str], default: float) -> tuple[float, float]:
+    """The first two numbers of an option; the default for one that is left out or infinite."""
+    values = [float(word) for word in words[:2]]
+    values = [value if np.isfinite(value) else default for value in values] + [default, default]
+    return values[0], values[1]
 
 
 def _is_number(word: str) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.image_file import open_image
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # The colour of a vertex that has none in a file of which others have.
 LOST = 128
+# What a picture shows beyond its edges.
+REPEAT, MIRROR, CLAMP = "repeat", "mirror", "clamp"
 # A hundred pictures of 4096 x 4096 are fewer.
 _MOST_DECODED = 2_000_000_000
 
@@ -78,18 +80,47 @@ class Pictures:
 
 
 def sample_texture(
-    picture: UInt8[np.ndarray, "H W 3"], uv: Float[np.ndarray, "N 2"], *, top_down: bool = False
+    picture: UInt8[np.ndarray, "H W 3"],
+    uv: Float[np.ndarray, "N 2"],
+    *,
+    top_down: bool = False,
+    wrap: tuple[str, str] = (REPEAT, REPEAT),
 ) -> UInt8[np.ndarray, "N 3"]:
-    """The colours of the texels that hold the coordinates, which repeat outside [0, 1].
+    """The colours of the texels that hold the coordinates.
 
     Args:
         picture: rows from the top.
         uv: texture coordinates; v is 0 at the bottom row's lower edge. NaN and infinity count as 0.
         top_down: v is 0 at the top row's upper edge, as in glTF.
+        wrap: what lies beyond [0, 1] along u and v: the picture again, its mirror image and so on, or its last texel.
     """
     uv = np.where(np.isfinite(uv), uv, 0.0)
-    uv = np.where((uv >= 0) & (uv <= 1), uv, uv % 1.0)
+    u, v = (_within(uv[:, k], wrap[k]) for k in range(2))
     height, width = picture.shape[:2]
-    down = uv[:, 1] if top_down else 1.0 - uv[:, 1]
-    column = np.minimum((uv[:, 0] * width).astype(np.int64), width - 1)
+    down = v if top_down else 1.0 - v
+    column = np.minimum((u * width).astype(np.int64), width - 1)
     return picture[np.minimum((down * height).astype(np.int64), height - 1), column]
+
+
+def _within(x: Float[np.ndarray, " N"], wrap: str) -> Float[np.ndarray, " N"]:
+    """Coordinates brought into [0, 1]; those that are there stay, 1 among them."""
+    if wrap == CLAMP:
+        return np.clip(x, 0.0, 1.0)
+    inside = (x >= 0) & (x <= 1)
+    if wrap == MIRROR:
+        return np.where(inside, x, 1.0 - np.abs(x % 2.0 - 1.0))
+    return np.where(inside, x, x % 1.0)
+
+
+def mean_of_corners(
+    vertices: Int64[np.ndarray, " C"], colors: UInt8[np.ndarray, "C 3"]
+) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n 3"]]:
+    """The vertices that occur, and each one's mean of the colours of its corners.
+
+    A vertex on a seam of the texture has several places in the picture, whose colours differ where the picture was
+    packed or painted loosely.
+    """
+    found, place = np.unique(vertices, return_inverse=True)
+    corners = np.bincount(place, minlength=len(found))
+    sums = np.stack([np.bincount(place, colors[:, k], minlength=len(found)) for k in range(3)], axis=1)
+    return found, np.rint(sums / corners[:, None]).astype(np.uint8)

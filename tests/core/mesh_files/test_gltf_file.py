@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import copy
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
@@ -124,6 +127,53 @@ def test_vertex_colours_of_16_bits_are_linear_and_base_colours_too(tmp_path: Pat
     assert (_read(tmp_path, (gltf, data)).vertex_colors == [255, 127, 0]).all()
     gltf["materials"] = [{}]
     assert _read(tmp_path, (gltf, data)).vertex_colors is None
+
+
+def _srgb(linear: float) -> int:
+    """IEC 61966-2-1, the slow way."""
+    return round(255 * (12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def test_picture_vertex_colours_and_base_colour_are_multiplied_in_linear_light(tmp_path: Path, document):
+    gltf, data = document
+    stream = io.BytesIO()
+    Image.fromarray(np.full((1, 1, 3), 188, np.uint8)).save(stream, "PNG")  # 188 of sRGB is half of the light
+    gltf["images"] = [{"uri": "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()}]
+    gltf["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [1, 0.5, 0.25, 0.1]
+    light = ((188 / 255 + 0.055) / 1.055) ** 2.4
+    expected = [188, _srgb(light * 0.5), _srgb(light * 0.25)]
+    assert (_read(tmp_path, (gltf, data)).vertex_colors == expected).all()
+    start = gltf["bufferViews"][2]["byteOffset"]
+    data = data[:start] + np.full(20, 13107, "<u2").tobytes() + data[start + 40 :]  # a fifth of the light
+    expected = [_srgb(light * 0.2 * factor) for factor in (1, 0.5, 0.25)]
+    assert (_read(tmp_path, (gltf, data)).vertex_colors == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("mode", "offset", "expected"),
+    [
+        (None, 0.0, 10),  # the maker's coordinates are all 0.25: the first of four texels
+        (None, 1.25, 20),
+        (10497, -0.25, 40),
+        (10497, -0.5, 30),
+        (33071, 1.25, 40),
+        (33071, -9.0, 10),
+        (33648, 1.25, 30),
+        (33648, -0.5, 20),
+        (33648, -0.75, 30),
+    ],
+)
+def test_pictures_repeat_mirror_or_end_at_their_edges(tmp_path: Path, document, mode, offset: float, expected: int):
+    gltf, _ = document
+    stream = io.BytesIO()
+    row = np.array([[10, 20, 30, 40]], np.uint8)
+    Image.fromarray(row.repeat(4, axis=0)).convert("RGB").save(stream, "PNG")
+    gltf["images"] = [{"uri": "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()}]
+    use = gltf["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    use["extensions"] = {"KHR_texture_transform": {"offset": [offset - 0.125, 0]}}
+    if mode is not None:
+        gltf["samplers"], gltf["textures"][0]["sampler"] = [{"wrapS": mode}], 0
+    assert (_read(tmp_path, document).vertex_colors == expected).all()
 
 
 @pytest.mark.parametrize(

@@ -78,12 +78,39 @@ def test_colours_that_are_no_numbers_or_not_everywhere_are_said(tmp_path: Path):
 TEXTURED = "mtllib a.mtl\n" + PLACES + "vt 0.1 0.1\nvt 0.9 0.9\nvt 1 0\nusemtl m\nf 1/1 2/2 3/3\nf 1/2 3/2 4/2\n"
 
 
-def test_the_picture_gives_a_vertex_the_colour_of_its_first_corner(tmp_path: Path):
-    colors = np.array([[[1, 0, 0], [2, 0, 0]], [[3, 0, 0], [4, 0, 0]]], np.uint8)
+def test_the_picture_gives_a_vertex_the_mean_over_its_corners(tmp_path: Path):
+    colors = np.array([[[10, 0, 0], [20, 0, 0]], [[30, 0, 0], [40, 0, 0]]], np.uint8)
     Image.fromarray(colors).save(tmp_path / "my picture.png")
     (tmp_path / "a.mtl").write_text("newmtl\tm\t\nKd 0 0 1\nmap_Kd -clamp on -s 1 1 my picture.png\n")
     raw = read_raw_mesh(_write(tmp_path, TEXTURED))
-    np.testing.assert_array_equal(raw.vertex_colors[:, 0], [3, 2, 4, 2])  # v is 0 at the picture's lower edge
+    # v is 0 at the picture's lower edge; the corners of the first vertex have 30 and 20, of the third 40 and 20
+    np.testing.assert_array_equal(raw.vertex_colors[:, 0], [25, 20, 30, 20])
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("", [30, 40, 10]),
+        ("-s 1 2", [30, 40, 30]),  # 0.75 * 2 is 0.5 of the next picture, its upper half
+        ("-o 0.5 0", [40, 30, 20]),
+        ("-s -1 -o 1 0 0", [40, 30, 20]),
+        ("-clamp on -o 0.5 0", [40, 40, 20]),
+    ],
+)
+def test_options_of_a_picture_move_scale_and_clamp_it(tmp_path: Path, options: str, expected: list[int]):
+    Image.fromarray(np.array([[[10], [20]], [[30], [40]]], np.uint8).repeat(3, axis=2)).save(tmp_path / "p.png")
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {options} p.png\n")
+    text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.2 0.2\nvt 0.8 0.2\nvt 0.2 0.7\nusemtl m\nf 1/1 2/2 3/3\n"
+    raw = read_raw_mesh(_write(tmp_path, text))
+    np.testing.assert_array_equal(raw.vertex_colors[:, 0], expected)
+
+
+def test_a_vertex_between_two_materials_has_the_colour_of_the_first(tmp_path: Path):
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
+    text = "mtllib a.mtl\n" + PLACES + "usemtl blue\nf 1 2 3\nusemtl red\nf 1 3 4\n"
+    np.testing.assert_array_equal(
+        read_raw_mesh(_write(tmp_path, text)).vertex_colors[:, ::2], [[0, 255], [0, 255], [0, 255], [255, 0]]
+    )
 
 
 def test_names_of_other_machines_are_looked_for_beside_the_file(tmp_path: Path):
