@@ -25,16 +25,16 @@ GREY = 180
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
     scan = read_scan(build.inputs.scan, units=build.config.units, up=build.config.up)
-    raw, clean = scan.raw, scan.clean
+    clean = scan.clean
     smoothed = smooth_if_rough(clean.mesh)
-    colors = np.full((len(raw.vertices), 3), GREY, np.uint8) if raw.vertex_colors is None else raw.vertex_colors
+    colors = np.full((clean.mesh.vertex_count, 3), GREY, np.uint8) if scan.colors is None else scan.colors
     save_arrays(
         folder / "scan.npz",
         {
             "scan": {
                 "vertices": smoothed.mesh.vertices,
                 "faces": clean.mesh.faces,
-                "colors": colors[clean.source_vertex],
+                "colors": colors,
                 "source_vertex": clean.source_vertex,
                 "source_face": clean.source_face,
             }

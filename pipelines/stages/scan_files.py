@@ -1,13 +1,22 @@
-"""A user's scan: read, brought to metres and +Y up, repaired, and known to be a person's."""
+"""A user's scan: read, brought to metres and +Y up, repaired, and known to be a person's.
+
+A cloud of points becomes a surface here. Its vertices stand for points of the file (`Sanitized.source_vertex`), so
+that labels and colours of points go along as those of a mesh's vertices do; it has no faces that labels could be of.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 
-from smplxpp.clean import check_human_scale, convert_points, sanitize
+import numpy as np
+from jaxtyping import UInt8
+
+from smplxpp.clean import PointSurface, check_human_scale, convert_points, sanitize, surface_from_points
 from smplxpp.clean.repair import Sanitized
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
 
@@ -17,24 +26,31 @@ class ScanFile:
     """A scan as its file has it, and repaired.
 
     Attributes:
-        raw: in the file's units and axes.
-        clean: metres, +Y up, with the places of its elements in the file.
+        raw: in the file's units and axes; without faces where it is a cloud of points.
+        clean: metres, +Y up, with the places of its elements in the file; faces of a cloud's surface come from none
+            (-1).
     """
 
     raw: RawMesh
     clean: Sanitized
 
+    @cached_property
+    def colors(self) -> UInt8[np.ndarray, "n 3"] | None:
+        """sRGB of the repaired scan's vertices: the mean of those of the file that became one; None without colours."""
+        return None if self.raw.vertex_colors is None else self.clean.mean_colors(self.raw.vertex_colors)
+
 
 def read_scan(path: Path, *, units: str = "m", up: str = "y") -> ScanFile:
-    """Read a scan.
+    """Read a scan: a mesh, or a cloud of points, whose surface is reconstructed.
 
     Raises:
         InputError: a file without a surface, or no person that stands upright in metres; the file is named.
+        MissingExtraError: a cloud of points without the package that reconstructs its surface.
     """
-    raw = read_raw_mesh(path)
+    raw = read_raw_mesh(path, clouds=True)
     vertices = convert_points(raw.vertices, units=units, up=up)
     try:
-        clean = sanitize(vertices, raw.faces)
+        clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
     except InputError as error:
         raise InputError(
             f"scan {path.name}: {error.subject}",
@@ -44,3 +60,45 @@ def read_scan(path: Path, *, units: str = "m", up: str = "y") -> ScanFile:
         ) from None
     check_human_scale(clean.mesh.vertices, subject=f"scan {path.name}")
     return ScanFile(raw, clean)
+
+
+def _of_cloud(path: Path, raw: RawMesh, units: str, up: str) -> Sanitized:
+    """The repaired surface of a cloud, its vertices traced to points."""
+    state = path.stat()
+    surface = _surface(_Cloud(path, state.st_mtime_ns, state.st_size, units, up, raw))
+    warnings.warn(f"{path.name}: {surface.said}", GeometryWarning, stacklevel=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # what the reconstruction left is not the user's doing
+        clean = sanitize(surface.mesh.vertices, surface.mesh.faces)
+    return Sanitized(
+        clean.mesh,
+        surface.source_point[clean.source_vertex],
+        np.full(clean.mesh.face_count, -1, dtype=np.int64),
+        clean.report,
+        np.arange(len(raw.vertices)),
+    )
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """What tells one cloud from another; its points are no part of the comparison."""
+
+    path: Path
+    changed: int
+    size: int
+    units: str
+    up: str
+    raw: RawMesh = field(compare=False)
+
+
+@lru_cache(maxsize=2)
+def _surface(cloud: _Cloud) -> PointSurface:
+    """The surface of a cloud; several stages of a build read one file, and the reconstruction takes its time."""
+    raw = cloud.raw
+    normals = raw.vertex_normals
+    if normals is not None:
+        normals = convert_points(normals, units="m", up=cloud.up)
+    points = convert_points(raw.vertices, units=cloud.units, up=cloud.up)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # said at each reading
+        return surface_from_points(points, normals)

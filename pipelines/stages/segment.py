@@ -50,7 +50,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         ]
         result = segment_scan(scan, votes=vote_on_faces(scan, views))
     else:
-        raw = read_raw_mesh(build.inputs.scan)
+        raw = read_raw_mesh(build.inputs.scan, clouds=True)
         labels = read_labels(
             build.inputs.labels or build.inputs.scan,
             vertex_count=len(raw.vertices),

@@ -2,6 +2,8 @@
 
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
+from smplxpp.clean.point_normals import estimate_normals
+from smplxpp.clean.poisson import PointSurface, PoissonConfig, surface_from_points
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
 from smplxpp.clean.simplify import Simplified, simplify
 from smplxpp.clean.smooth import ROUGH, Smoothed, roughness, smooth_if_rough
@@ -15,6 +17,8 @@ __all__ = [
     "CleanedPart",
     "PartReport",
     "PartsConfig",
+    "PointSurface",
+    "PoissonConfig",
     "Sanitized",
     "Simplified",
     "Smoothed",
@@ -24,6 +28,7 @@ __all__ = [
     "convert_points",
     "cut_webs",
     "drop_specks",
+    "estimate_normals",
     "fill_pinholes",
     "find_webs",
     "loop_lengths",
@@ -31,4 +36,5 @@ __all__ = [
     "sanitize",
     "simplify",
     "smooth_if_rough",
+    "surface_from_points",
 ]

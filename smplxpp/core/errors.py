@@ -24,7 +24,17 @@ class GeometryWarning(UserWarning):
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is not installed."""
+    """An optional dependency is not installed.
 
-    def __init__(self, package: str, *, extra: str, purpose: str) -> None:
-        super().__init__(f"{purpose} needs {package}, which is not installed: pip install 'smplxpp[{extra}]'")
+    Args:
+        package: its name.
+        extra: of smplxpp that brings it.
+        purpose: what needs it.
+        apt: packages of the system that it needs on Debian and Ubuntu; named where it is installed but does not start.
+    """
+
+    def __init__(self, package: str, *, extra: str, purpose: str, apt: str = "") -> None:
+        message = f"{purpose} needs {package}, which is not installed: pip install 'smplxpp[{extra}]'"
+        if apt:
+            message = f"{purpose} needs {package}, which lacks libraries of the system: apt-get install {apt}"
+        super().__init__(message)

@@ -17,7 +17,7 @@ from smplxpp.core.files.json_file import as_numbers
 from smplxpp.core.files.paths import regular_file
 from smplxpp.core.files.safe_pickle import safe_load
 from smplxpp.core.labels import BACKGROUND, LABELS
-from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.segment.labels import LabelSet, map_labels
 
 _KEYS = (
@@ -156,17 +156,17 @@ def _as_array(values: Any, path: Path) -> np.ndarray:
 def _read_from_mesh(
     path: Path, vertex_count: int, face_count: int, label_set: str | Path | LabelSet, color_tolerance: float
 ) -> np.ndarray:
-    file = read_mesh(path)
-    if (file.mesh.vertex_count, file.mesh.face_count) != (vertex_count, face_count):
+    file = read_raw_mesh(path, clouds=True)
+    if (len(file.vertices), len(file.faces)) != (vertex_count, face_count):
         raise InputError(
             f"label file {path}",
             expected=f"the scan's {vertex_count} vertices and {face_count} faces",
-            received=f"{file.mesh.vertex_count} and {file.mesh.face_count}",
-            remedy=_why_not(file.mesh.vertex_count, vertex_count),
+            received=f"{len(file.vertices)} and {len(file.faces)}",
+            remedy=_why_not(len(file.vertices), vertex_count),
         )
     for properties in (file.vertex_properties, file.face_properties):
         found = [key for key in _KEYS if key in properties]
-        if found:
+        if found and len(properties[found[0]]):
             return map_labels(properties[found[0]], label_set)
     if file.vertex_colors is None:
         raise InputError(

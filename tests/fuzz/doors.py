@@ -21,7 +21,7 @@ from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
 from smplxpp.register.landmark_file import read_landmarks, write_landmarks
@@ -190,6 +190,16 @@ def _write_mesh(path: Path) -> None:
             path.write_bytes(written if isinstance(written, bytes) else written.encode())
 
 
+def _write_cloud(path: Path) -> None:
+    mesh, colors = _patch()
+    if path.suffix == ".npz":
+        np.savez(path, points=mesh.vertices, normals=mesh.vertex_normals, colors=colors)
+        return
+    normals = dict(zip(("nx", "ny", "nz"), mesh.vertex_normals.T, strict=True))
+    empty = TriangleMesh(mesh.vertices, np.empty((0, 3), np.int64))
+    write_ply(path, empty, vertex_colors=colors, vertex_properties=normals)
+
+
 def _mesh_doors() -> list[Door]:
     files = ("ascii.ply", "binary.ply", "textured.obj", "m.glb", "m.gltf", "m.stl", "m.off", "m.npz", "m.pkl")
     return [
@@ -199,6 +209,13 @@ def _mesh_doors() -> list[Door]:
             lambda f, file=file: read_mesh(f / file),
         )
         for file in files
+    ] + [
+        Door(
+            f"cloud {file}",
+            lambda folder, file=file: _write_cloud(folder / file),
+            lambda f, file=file: read_raw_mesh(f / file, clouds=True),
+        )
+        for file in ("c.ply", "c.npz")
     ]
 
 

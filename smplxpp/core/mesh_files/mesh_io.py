@@ -54,8 +54,12 @@ def read_mesh(path: str | Path) -> MeshFile:
     return MeshFile(mesh, raw.vertex_colors, raw.vertex_properties, raw.face_properties)
 
 
-def read_raw_mesh(path: str | Path) -> RawMesh:
+def read_raw_mesh(path: str | Path, *, clouds: bool = False) -> RawMesh:
     """Read the arrays of a mesh file; they may hold NaN and infinity, which `smplxpp.clean.sanitize` repairs.
+
+    Args:
+        path: of the file.
+        clouds: a file of points without faces is read, too (`RawMesh.is_cloud`).
 
     Raises:
         InputError: missing, unknown, damaged or compressed file, no faces, or coordinates beyond 1e12.
@@ -65,7 +69,7 @@ def read_raw_mesh(path: str | Path) -> RawMesh:
     if reader is None:
         raise InputError(f"mesh file {path}", expected=f"one of {', '.join(SUFFIXES)}", received=path.suffix or "none")
     raw = reader(path)
-    if not len(raw.faces) or not len(raw.vertices):
+    if not len(raw.vertices) or (raw.is_cloud and not clouds):
         raise InputError(
             f"mesh file {path}",
             expected="a triangle mesh",
@@ -89,11 +93,13 @@ def _read_pickle(path: Path) -> RawMesh:
 
 def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
     subject = f"mesh file {path}"
-    names = {"vertices": ("vertices", "verts", "v"), "faces": ("faces", "f")}
+    names = {"vertices": ("vertices", "verts", "v", "points"), "faces": ("faces", "f"), "normals": ("normals",)}
     found = {key: next((values[k] for k in known if k in values), None) for key, known in names.items()}
+    if found["faces"] is None and "points" in values:
+        found["faces"] = np.empty((0, 3), np.int64)
     if found["vertices"] is None or found["faces"] is None:
         keys = sorted(map(str, values))
-        raise InputError(subject, expected="arrays `vertices` and `faces`", received=f"keys {keys}"[:300])
+        raise InputError(subject, expected="arrays `vertices` and `faces`, or `points`", received=f"keys {keys}"[:300])
     vertices = as_numbers(found["vertices"], (None, 3), subject=f"{subject}: vertices", finite=False)
     faces = as_numbers(found["faces"], (None, 3), subject=f"{subject}: faces")
     if not ((faces == np.rint(faces)) & (np.abs(faces) < 2**53)).all():
@@ -108,7 +114,10 @@ def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
                 f"{subject}: vertex colours", expected=f"shape ({len(vertices)}, 3 or 4)", received=f"{array.shape}"
             )
         colors = color_bytes(array, subject=subject)
-    return RawMesh(vertices, faces.astype(np.int64), colors)
+    normals = None
+    if not len(faces) and found["normals"] is not None:
+        normals = as_numbers(found["normals"], (len(vertices), 3), subject=f"{subject}: normals", finite=False)
+    return RawMesh(vertices, faces.astype(np.int64), colors, vertex_normals=normals)
 
 
 _READERS = {

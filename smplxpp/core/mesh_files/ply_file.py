@@ -13,7 +13,7 @@ from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.number_text import as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.mesh_files.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
-from smplxpp.core.mesh_files.texture import LOST, Pictures, sample_texture
+from smplxpp.core.mesh_files.texture import LOST, Pictures, mean_of_corners, sample_texture
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
@@ -28,8 +28,8 @@ def read_ply(path: Path) -> RawMesh:
     """Read a PLY mesh: the vertex element's rows, the face element's rows, polygons cut into fans.
 
     Face properties are repeated for each triangle of a polygon. Colours are those of the vertices; without them, or
-    where all are the same, the picture's (`comment TextureFile`), at the vertex's coordinates, or at its first corner's
-    of the faces' lists.
+    where all are the same, the picture's (`comment TextureFile`), at the vertex's coordinates, or their mean over its
+    corners in the faces' lists.
 
     Raises:
         InputError: no PLY, a damaged header, fewer data than it announces, indices of vertices that do not exist.
@@ -72,6 +72,7 @@ def read_ply(path: Path) -> RawMesh:
         _extra(vertex),
         {name: column[fans.polygons] for name, column in _extra(face).items()},
         source_faces=fans.source_faces,
+        vertex_normals=None if len(fans.faces) else _normals(vertex),
     )
 
 
@@ -136,6 +137,13 @@ def _vertices(vertex: Columns, subject: str) -> Float64[np.ndarray, "N 3"]:
     return np.stack([np.asarray(column, np.float64) for column in axes], axis=1)
 
 
+def _normals(vertex: Columns) -> Float64[np.ndarray, "N 3"] | None:
+    axes = [vertex.get(axis) for axis in ("nx", "ny", "nz")]
+    if not all(isinstance(column, np.ndarray) for column in axes):
+        return None
+    return np.stack([np.asarray(column, np.float64) for column in axes], axis=1)
+
+
 def _extra(columns: Columns) -> dict[str, np.ndarray]:
     return {name: c for name, c in columns.items() if isinstance(c, np.ndarray) and name not in _KNOWN}
 
@@ -160,18 +168,20 @@ def _picture_colors(
         lists = face.get("texcoord")
         if not isinstance(lists, ListColumn) or not np.array_equal(lists.lengths, 2 * corners.lengths):
             return None
-        vertices, first = np.unique(corners.values, return_index=True)
-        coordinates = lists.values.reshape(-1, 2)[first]
+        vertices, coordinates = corners.values.astype(np.int64), lists.values.reshape(-1, 2)
+        page = np.zeros(len(vertices), np.int64)
         number = face.get("texnumber")
         if isinstance(number, np.ndarray):
-            page = np.repeat(number, corners.lengths)[first]
-        else:
-            page = page[vertices]
+            # A vertex between two pictures has the colour of its first corner's.
+            pages = np.repeat(number, corners.lengths)
+            found_at, first = np.unique(vertices, return_index=True)
+            page = np.where(pages == pages[first][np.searchsorted(found_at, vertices)], pages, -1)
     colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
     pictures = Pictures(f"mesh file {path}")
     for k in np.unique(page[(page >= 0) & (page < len(names))]):
         picture = pictures.beside(path, names[int(k)])
         if picture is not None:
-            colors[vertices[page == k]] = sample_texture(picture, coordinates[page == k])
+            at, mean = mean_of_corners(vertices[page == k], sample_texture(picture, coordinates[page == k]))
+            colors[at] = mean
             found = True
     return colors if found else None

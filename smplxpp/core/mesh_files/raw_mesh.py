@@ -24,6 +24,7 @@ class RawMesh:
         vertex_colors: (N, 3) uint8 or None.
         vertex_properties, face_properties: other per-element arrays by name (PLY); (N,) and (M,).
         source_faces: (M,) int64, the file's face that each triangle comes from; None where all are triangles.
+        vertex_normals: (N, 3) float64 of a file without faces (PLY, npz), as it has them; else None.
     """
 
     vertices: Float64[np.ndarray, "N 3"]
@@ -32,6 +33,12 @@ class RawMesh:
     vertex_properties: dict[str, np.ndarray] = field(default_factory=dict)
     face_properties: dict[str, np.ndarray] = field(default_factory=dict)
     source_faces: Int64[np.ndarray, " M"] | None = None
+    vertex_normals: Float64[np.ndarray, "N 3"] | None = None
+
+    @property
+    def is_cloud(self) -> bool:
+        """Points without faces."""
+        return not len(self.faces)
 
 
 @dataclass(frozen=True, eq=False)

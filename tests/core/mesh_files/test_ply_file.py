@@ -103,10 +103,11 @@ SEAMS = (
 
 
 def test_seams_of_texture_split_no_vertex(tmp_path: Path):
-    Image.fromarray(np.array([[[1, 0, 0], [2, 0, 0]], [[3, 0, 0], [4, 0, 0]]], np.uint8)).save(tmp_path / "p.png")
+    Image.fromarray(np.array([[[10, 0, 0], [20, 0, 0]], [[30, 0, 0], [40, 0, 0]]], np.uint8)).save(tmp_path / "p.png")
     raw = read_raw_mesh(_ascii(tmp_path, SEAMS))
     np.testing.assert_array_equal(raw.vertices, VERTICES)
-    np.testing.assert_array_equal(raw.vertex_colors[:, 0], [3, 4, 2, 1])  # of each vertex's first corner
+    # the first vertex has corners of 30 and 20, the third of 20 and 30
+    np.testing.assert_array_equal(raw.vertex_colors[:, 0], [25, 40, 25, 10])
 
 
 def test_rows_with_more_numbers_than_properties(tmp_path: Path):
@@ -192,3 +193,17 @@ def test_coordinates_too_large_to_compute_with_are_named(tmp_path: Path):
     text = (_header() + "3 0 1 2\n").replace("1 1 0\n", "1 1e30 0\n")
     with pytest.raises(InputError, match=r"within 1e\+12.*first at index 2: \(1, 1e\+30, 0\)"):
         read_raw_mesh(_ascii(tmp_path, text))
+
+
+@pytest.mark.parametrize("normals", [False, True])
+def test_points_without_faces_are_read_where_they_are_asked_for(tmp_path: Path, normals: bool):
+    names = XYZ + "".join(f"property float {name}\n" for name in ("nx", "ny", "nz") if normals)
+    rows = [line + (" 0 0 1" if normals else "") for line in PLACES.splitlines()]
+    path = _ascii(tmp_path, f"ply\nformat ascii 1.0\nelement vertex 4\n{names}end_header\n" + "\n".join(rows) + "\n")
+    with pytest.raises(InputError, match="not the point cloud"):
+        read_raw_mesh(path)
+    raw = read_raw_mesh(path, clouds=True)
+    assert raw.is_cloud and raw.faces.shape == (0, 3)
+    np.testing.assert_array_equal(raw.vertices, VERTICES)
+    assert (raw.vertex_normals is None) != normals
+    assert not normals or (raw.vertex_normals == [0, 0, 1]).all()
