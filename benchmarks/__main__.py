@@ -14,6 +14,7 @@ SUPPORT = {
     "rin23",
     "page_tables",
     "gaussian_scene",
+    "detection_rooms",
     "rasterizer_peers",
 }
 

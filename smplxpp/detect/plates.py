@@ -16,6 +16,9 @@ from smplxpp.core.validation import require_at_least, require_between, require_p
 _HOLE = 0.002
 # Share of a neighbourhood that has to be the person for its colour to count.
 _LEAST_SHARE = 0.02
+# Exposure: pixels of the blur that takes the noise out, how many pixels vote and propose, what counts as one ratio, and
+# the largest change that is believed.
+_GAIN_BLUR, _GAIN_VOTERS, _GAIN_PROPOSALS, _SAME_GAIN, _MOST_GAIN = 2.0, 10_000, 200, 0.02, 1.3
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,13 @@ class PlateModel:
             )
         config = self.config
         shown = image.astype(np.float32) / self._gain(image)
-        score = self._deviations(shown)
+        score, changed = self._deviations(shown)
         sure, weak = score > 1.0, score > config.weak
         pieces, _ = scipy.ndimage.label(weak, structure=np.ones((3, 3)))
         kept = np.isin(pieces, np.unique(pieces[sure & weak])) & weak
         person = cleaned(kept, least_share=config.least_share)
+        # Clothes of a shadow's colour leave holes in which nothing is the plate's; behind an arm it is.
+        person |= _changed_holes(person, changed > 1.0)
         return np.round(255.0 * self._opacity(shown, person)).astype(np.uint8)
 
     def _opacity(
@@ -125,17 +130,28 @@ class PlateModel:
         return out
 
     def _gain(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " 3"]:
-        """What exposure and white balance have changed since the plate: the ratio that most of the image agrees on."""
-        bright = (self._mean > 16) & (self._mean < 240) & (image < 250)
-        gains = [
-            np.median(image[..., k][bright[..., k]] / self._mean[..., k][bright[..., k]]) if bright[..., k].any() else 1
-            for k in range(3)
-        ]
-        # A person who fills the image, or shadow on most of it, is no change of exposure.
-        return np.asarray(gains if 0.8 < min(gains) and max(gains) < 1.25 else [1.0] * 3, dtype=np.float32)
+        """What exposure and white balance have changed since the plate: of the ratios that some pixel proposes the one
+        that most pixels agree with. A person may fill most of the image: what covers the plate has no common ratio.
+        """
+        blur = (_GAIN_BLUR, _GAIN_BLUR, 0)
+        shown, plate = (scipy.ndimage.gaussian_filter(x.astype(np.float32), blur) for x in (image, self._mean))
+        usable = ((plate > 16) & (plate < 240) & (shown < 250)).all(axis=2)
+        ratios = (shown[usable] / plate[usable]).astype(np.float32)
+        ratios = ratios[((ratios > 1 / _MOST_GAIN) & (ratios < _MOST_GAIN)).all(axis=1)]
+        if not len(ratios):
+            return np.ones(3, dtype=np.float32)
+        rng = np.random.default_rng(0)
+        voters = ratios[rng.permutation(len(ratios))[:_GAIN_VOTERS]]
+        proposals = np.concatenate([np.ones((1, 3), dtype=np.float32), voters[:_GAIN_PROPOSALS]])
+        votes = np.array([(np.abs(voters / one - 1.0) < _SAME_GAIN).all(axis=1).sum() for one in proposals])
+        best = proposals[votes.argmax()]
+        return np.median(voters[(np.abs(voters / best - 1.0) < _SAME_GAIN).all(axis=1)], axis=0)
 
-    def _deviations(self, image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-        """How far pixels are from the background and from any shadow on it, in units of the thresholds.
+    def _deviations(
+        self, image: Float32[np.ndarray, "H W 3"]
+    ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+        """How far pixels are from the background and any shadow on it, and from the background alone, in units of the
+        thresholds.
 
         The image is split as Horprasert et al. (1999) do: a pixel is the plate's colour times a brightness, and what is
         left is colour. A brightness between `darkest_shadow` and 1 with little colour left is a shadow.
@@ -148,10 +164,10 @@ class PlateModel:
         colour = np.linalg.norm(image - brightness[..., None] * mean, axis=2) / self._noise
         length = np.linalg.norm(image - mean, axis=2) / self._noise
         # Dark plates have no colour to compare: a shadow on them is within the noise anyhow.
-        shadow = np.clip((1.0 - brightness) / (1.0 - config.darkest_shadow), 0.0, None)
-        lit = (brightness <= 1.0) & (shadow <= 1.0)
-        score = np.where(lit, colour / config.shadow_colour, length / config.threshold)
-        return np.minimum(score, length / config.threshold).astype(np.float32)
+        lit = (brightness <= 1.0) & (brightness >= config.darkest_shadow)
+        changed = (length / config.threshold).astype(np.float32)
+        score = np.where(lit, np.minimum(colour / config.shadow_colour, changed), changed)
+        return score.astype(np.float32), changed
 
 
 def cleaned(person: Bool[np.ndarray, "H W"], *, least_share: float = 0.05) -> Bool[np.ndarray, "H W"]:
@@ -162,7 +178,7 @@ def cleaned(person: Bool[np.ndarray, "H W"], *, least_share: float = 0.05) -> Bo
         return np.zeros_like(person)
     sizes = np.bincount(pieces.ravel())[1:]
     kept = np.isin(pieces, 1 + np.flatnonzero(sizes >= max(least_share, 1e-9) * sizes.max()))
-    closed = scipy.ndimage.binary_closing(np.pad(kept, 2), structure=np.ones((3, 3)), iterations=2)[2:-2, 2:-2] | kept
+    closed = scipy.ndimage.binary_closing(np.pad(kept, 2))[2:-2, 2:-2] | kept
     return closed | _small_holes(closed, int(_HOLE * sizes.max()))
 
 
@@ -172,3 +188,13 @@ def _small_holes(mask: Bool[np.ndarray, "H W"], most: int) -> Bool[np.ndarray, "
     sizes = np.bincount(holes.ravel())
     small = np.flatnonzero(sizes <= most)
     return np.isin(holes, small[small > 0])
+
+
+def _changed_holes(mask: Bool[np.ndarray, "H W"], changed: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Holes of which most pixels are not the plate's."""
+    outside = ~scipy.ndimage.binary_fill_holes(mask)
+    holes, count = scipy.ndimage.label(~mask & ~outside)
+    if not count:
+        return np.zeros_like(mask)
+    share = scipy.ndimage.mean(changed, holes, np.arange(1, count + 1))
+    return np.isin(holes, 1 + np.flatnonzero(share > 0.5))

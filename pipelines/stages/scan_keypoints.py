@@ -1,0 +1,147 @@
+"""Landmarks of a bare scan: it is drawn from all around, a detector looks at the pictures, rays meet at the points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from pipelines.figures import ShadeStyle, render_shaded, turntable_cameras
+from smplxpp.core.errors import InputError
+from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_at_least
+from smplxpp.detect import Detector
+from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
+
+Progress = Callable[[int, int], None]
+Landmarks = dict[str, tuple[Float64[np.ndarray, " 3"], float]]
+# Confidence from which a view counts as one that sees a point.
+_SEEN = 0.3
+_GREY = (128, 128, 128)
+# Pairs of which the lines from right to left tell where the front is, the wider the more.
+_PAIRS = ("coco_{}_shoulder", "coco_{}_hip", "{}_eye", "{}_ear")
+
+
+@dataclass(frozen=True)
+class ScanViews:
+    """How a scan is drawn.
+
+    Attributes:
+        count: pictures, on one turn about the scan's upright axis.
+        height: of a picture, pixels.
+        relief: of light and shadow over a scan with colours; without colours it is all there is to see.
+        least_views: that have to agree on a point.
+    """
+
+    count: int = 12
+    height: int = 720
+    relief: float = 0.6
+    least_views: int = 3
+
+    def __post_init__(self) -> None:
+        require_at_least("scan views: count", self.count, 3)
+        require_at_least("scan views: height", self.height, 64)
+        require_at_least("scan views: least_views", self.least_views, 2)
+
+
+def keypoints_of_scan(
+    mesh: TriangleMesh,
+    colors: UInt8[np.ndarray, "V 3"] | None,
+    detector: Detector,
+    *,
+    config: ScanViews | None = None,
+    progress: Progress = lambda done, count: None,
+) -> Landmarks:
+    """Find the landmarks that a detector knows on a scan that stands upright.
+
+    Args:
+        mesh: metres, +Y up; which way it faces is not assumed.
+        colors: sRGB; None: drawn as grey clay.
+        detector: see `smplxpp.detect`.
+        config: see there.
+
+    Returns:
+        By name the point in the scan's space and a confidence from 0 to 1: the detector's own mean, times the share of
+        the views that agree among those that saw the point.
+
+    Raises:
+        InputError: nobody in the pictures, or nothing that several of them agree on.
+    """
+    config = config or ScanViews()
+    seen = views_of_scan(mesh, colors, detector, config, progress=progress)
+    landmarks = _landmarks(seen, config)
+    if not landmarks:
+        raise InputError(
+            "scan",
+            expected="a person whose keypoints its pictures agree on",
+            received="points that no two pictures agree on",
+            remedy="check that it stands upright (--up), or place landmarks by hand",
+        )
+    return landmarks
+
+
+def views_of_scan(
+    mesh: TriangleMesh,
+    colors: UInt8[np.ndarray, "V 3"] | None,
+    detector: Detector,
+    config: ScanViews,
+    *,
+    progress: Progress = lambda done, count: None,
+) -> Triangulation:
+    """What the detector sees in pictures all around, triangulated; one frame.
+
+    Raises:
+        InputError: fewer than two pictures with anybody in them.
+    """
+    used = mesh.vertices[np.unique(mesh.faces)]
+    style = ShadeStyle(background=_GREY, relief=1.0 if colors is None else config.relief)
+    keypoints, cameras = {}, {}
+    for k, camera in enumerate(turntable_cameras(used, count=config.count, height=config.height)):
+        people = detector(render_shaded(mesh, camera, vertex_colors=colors, style=style))
+        if people:
+            name = f"view {k}"
+            cameras[name] = camera
+            keypoints[name] = Keypoints2D(
+                detector.names, np.array([0]), people[0].points[None], people[0].confidence[None]
+            )
+        progress(k + 1, config.count)
+    if len(cameras) < 2:
+        raise InputError(
+            "scan",
+            expected="a person who is found in pictures of it",
+            received=f"somebody in {len(cameras)} of {config.count} pictures",
+            remedy="check that it stands upright (--up), or place landmarks by hand",
+        )
+    return triangulate(keypoints, cameras, config=TriangulationConfig(least_confidence=_SEEN))
+
+
+def facing(landmarks: Mapping[str, tuple[Float64[np.ndarray, " 3"], float]]) -> Float64[np.ndarray, " 3"] | None:
+    """The horizontal unit vector to the person's front, from shoulders, hips, eyes and ears together; None without any.
+
+    With up +Y and the left side at +X the front is at +Z.
+    """
+    across = np.zeros(3)
+    for pair in _PAIRS:
+        left, right = (landmarks.get(pair.format(side)) for side in ("left", "right"))
+        if left is not None and right is not None:
+            across += left[0] - right[0]
+    front = np.array([-across[2], 0.0, across[0]])
+    length = float(np.linalg.norm(front))
+    return front / length if length > 0 else None
+
+
+def _landmarks(seen: Triangulation, config: ScanViews) -> Landmarks:
+    weights = np.stack([seen.keypoints[name].confidence[0] for name in seen.cameras if name in seen.keypoints])
+    rows = [k for k, name in enumerate(seen.cameras) if name in seen.keypoints]
+    agree = seen.inliers[0][:, rows].T & (weights > 0)
+    out: Landmarks = {}
+    for k, name in enumerate(seen.names):
+        count = int(agree[:, k].sum())
+        if count < config.least_views or not np.isfinite(seen.points[0, k]).all():
+            continue
+        sure = weights[agree[:, k], k].mean() * count / max((weights[:, k] >= _SEEN).sum(), count)
+        out[name] = (seen.points[0, k], float(np.clip(sure, 0.0, 1.0)))
+    return out
