@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipelines.figures.colors import linear_from_srgb, srgb8_from_linear
 from pipelines.figures.occlusion import unoccluded
 from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
+from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
-from pipelines.figures.colors import srgb8_from_linear
 from pipelines.figures.shading import shade_layer
 from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
+from smplxpp.core.colors import srgb8_from_linear
 from smplxpp.core.mesh import TriangleMesh
 
 BONE, JOINT = (255, 214, 64), (214, 40, 40)

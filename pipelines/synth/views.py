@@ -8,10 +8,10 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 
-from pipelines.figures.colors import linear_from_srgb, srgb8_from_linear
 from pipelines.synth.person import PART_NAMES, Person
 from pipelines.synth.soft_light import bounced
 from smplxpp.core.camera import Camera
+from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import MeshMaps, rasterize_mesh
 

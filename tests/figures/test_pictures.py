@@ -25,8 +25,8 @@ from pipelines.figures import (
     row,
     turntable_cameras,
 )
-from pipelines.figures.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
 from smplxpp.core.camera import Camera
+from smplxpp.core.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
