@@ -1,5 +1,6 @@
-"""Segmentation of a scan: label files and label maps in, a label with its confidence on every face out."""
+"""Segmentation of a scan: label files, label maps, or the fitted body in, a label with its confidence a face out."""
 
+from smplxpp.segment.by_body import ByBodyConfig, label_by_body
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import labels_from_colors, read_label_map, read_labels
 from smplxpp.segment.labels import LABEL_SETS, LabelSet, find_label_set, map_labels
@@ -11,11 +12,13 @@ __all__ = [
     "Corrections",
     "FaceCorrection",
     "LABEL_SETS",
+    "ByBodyConfig",
     "LabelSet",
     "SegmentConfig",
     "SegmentedScan",
     "StrokeCorrection",
     "find_label_set",
+    "label_by_body",
     "labels_from_colors",
     "map_labels",
     "read_label_map",

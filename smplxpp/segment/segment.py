@@ -9,23 +9,22 @@ from jaxtyping import Bool, Float64, Int64, Num
 from scipy.sparse import csr_matrix, identity
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, LABELS, SKIN
+from smplxpp.core.labels import BACKGROUND, LABELS, OUTER, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.topology import component_labels, face_adjacency
+from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
+from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors
 
 _LOOKS_DOWN = -0.3
 """Height of a unit normal below which a face looks down; +Y is up."""
+_SURE_PRIOR = 0.6
 
 
 @dataclass(frozen=True)
-class SegmentConfig:
-    """Options of `segment_scan`.
+class SegmentConfig(SmoothingConfig):
+    """Options of `segment_scan`, beside those of smoothing.
 
     Attributes:
-        smoothness: factor of the pairwise cost. floor: its least value at any edge.
-        eta_convex, eta_concave: how much a fold lowers the cost of a label change there.
-        fold: cosine deficit that counts as a fold.
         pseudo_votes: added to every label, so that no probability is zero.
         full_votes: sum of votes from which a face is trusted fully.
         rings: of neighbours whose votes speak for a face's confidence where its own are fewer than that: a pixel is
@@ -33,26 +32,15 @@ class SegmentConfig:
         label_trust: weight of the labels given with the scan, as a share of full votes.
         underside: cost, over sqrt(M), of any label but skin for a face that no vote fell on and that looks down (+Y is
             up). A scan closes a skirt from below; that surface is no cloth, and the hem is a fold as the legs are.
-        speck_area: patches below this fraction of the surface's area take their surroundings' label.
-        island_area: patches of anything worn do so below this fraction: a label map that is wrong beside a border
-            leaves a bit of skirt on the fingers, and nothing worn is that small (57 of 19,000 square centimetres).
-        doubtful_area, doubtful: so does a patch of any label below this fraction whose mean confidence is lower.
+        prior_weight: nats of a prior that count where votes are certain, as a share of those where there are none.
     """
 
-    smoothness: float = 1.2
-    floor: float = 0.05
-    eta_convex: float = 0.15
-    eta_concave: float = 1.0
-    fold: float = 0.1
     pseudo_votes: float = 0.1
     full_votes: float = 3.0
     rings: int = 4
     label_trust: float = 0.75
     underside: float = 6.0
-    speck_area: float = 1e-4
-    island_area: float = 3e-3
-    doubtful_area: float = 5e-3
-    doubtful: float = 0.7
+    prior_weight: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +55,7 @@ class SegmentedScan:
         island_faces: faces relabelled because their patch was too small.
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
         corrected: (M,) bool: a hand has set the label (`Corrections.apply`); None: nobody was asked.
+        doubts: what is not sure, in words for the user; empty where labels or votes were given.
     """
 
     face_labels: Int64[np.ndarray, " M"]
@@ -76,6 +65,7 @@ class SegmentedScan:
     energy_before: float
     energy_after: float
     corrected: Bool[np.ndarray, " M"] | None = None
+    doubts: tuple[str, ...] = ()
 
 
 def segment_scan(
@@ -84,6 +74,8 @@ def segment_scan(
     votes: Num[np.ndarray, "M L"] | None = None,
     vertex_labels: Num[np.ndarray, " N"] | None = None,
     face_labels: Num[np.ndarray, " M"] | None = None,
+    colors: Num[np.ndarray, "N C"] | None = None,
+    prior: SegmentedScan | None = None,
     config: SegmentConfig | None = None,
 ) -> SegmentedScan:
     """Label every face of a scan from one of: votes, labels of its vertices, labels of its faces.
@@ -96,6 +88,8 @@ def segment_scan(
 
     Args:
         votes: (M, L) of `vote_on_faces`. vertex_labels: (N,). face_labels: (M,). In our ids.
+        colors: sRGB of the vertices, bytes or 0..1: borders then settle on edges of colour, too.
+        prior: of the same mesh (`label_by_body`): what holds where no vote fell or votes are few.
 
     Raises:
         InputError: none or several of the three, other lengths, unknown ids, or not a single label.
@@ -118,14 +112,20 @@ def segment_scan(
     if not votes.any():
         raise InputError("labels", expected="at least one labelled face", received="none")
 
+    if prior is not None:
+        _check_prior(mesh, prior)
+        votes = _votes_with_outer(votes, prior)
+    lab = None if colors is None else face_colors(mesh, colors)
     total = votes.sum(axis=1)
     share = (votes + config.pseudo_votes) / (total + config.pseudo_votes * len(LABELS))[:, None]
     certainty = np.minimum(total, config.full_votes) / config.full_votes
     pairs, ends = face_adjacency(mesh.faces)
-    weights = _fold_weights(mesh, pairs, ends, config)
-    # A label that nobody voted for anywhere cannot win.
-    candidates = np.flatnonzero(votes.any(axis=0))
+    weights = edge_weights(mesh, pairs, ends, config, lab=lab)
+    # A label that nobody voted for anywhere cannot win, but for what the prior knows.
+    candidates = np.flatnonzero(votes.any(axis=0) | _known_to(prior))
     unary = -np.log(share) * (trust * certainty)[:, None]
+    if prior is not None:
+        unary += (1.0 - (1.0 - config.prior_weight) * certainty)[:, None] * _prior_costs(prior)
     below = (total == 0) & (mesh.face_normals[:, 1] < _LOOKS_DOWN)
     # Borders have about sqrt(faces) edges: so that a finer scan is cut in the same place.
     unary[below] += config.underside / np.sqrt(mesh.face_count) * (np.arange(len(LABELS)) != SKIN.id)
@@ -134,11 +134,51 @@ def segment_scan(
     before = problem.energy(unary.argmin(axis=1))
     index, after = minimize_potts(problem)
     cut = candidates[index]
-    labels = _absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config)
+    labels = absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config)
     confidence = _confidence(votes, labels, pairs, config)
+    if prior is not None:
+        agrees = np.where(labels == prior.face_labels, prior.confidence, 1.0 - prior.confidence)
+        confidence = np.where(total > 0, confidence, agrees)
     return SegmentedScan(
-        labels, confidence, total > 0, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE
+        labels,
+        confidence,
+        total > 0,
+        int((labels != cut).sum()),
+        before / COST_SCALE,
+        after / COST_SCALE,
+        doubts=() if prior is None else prior.doubts,
     )
+
+
+def _check_prior(mesh: TriangleMesh, prior: SegmentedScan) -> None:
+    if len(prior.face_labels) != mesh.face_count:
+        raise InputError(
+            "prior", expected=f"labels of the scan's {mesh.face_count} faces", received=f"{len(prior.face_labels)}"
+        )
+
+
+def _known_to(prior: SegmentedScan | None) -> Bool[np.ndarray, " L"]:
+    named = np.zeros(len(LABELS), dtype=bool)
+    if prior is not None:
+        named[prior.face_labels[prior.confidence > _SURE_PRIOR]] = True
+    return named
+
+
+def _prior_costs(prior: SegmentedScan) -> Float64[np.ndarray, "M L"]:
+    """-log of a distribution that gives the label its confidence and all others equal parts of the rest."""
+    share = np.clip(prior.confidence, 1.0 / len(LABELS), 0.99)
+    out = np.repeat(-np.log((1.0 - share) / (len(LABELS) - 1))[:, None], len(LABELS), axis=1)
+    out[np.arange(len(share)), prior.face_labels] = -np.log(share)
+    return out
+
+
+def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan) -> np.ndarray:
+    """Where votes never name outer clothes, their set may not tell coats from shirts: the prior does."""
+    if votes[:, OUTER.id].any() or not _known_to(prior)[OUTER.id]:
+        return votes
+    votes = votes.copy()
+    votes[:, OUTER.id] = votes[:, UPPER.id]
+    return votes
 
 
 def _confidence(
@@ -188,52 +228,3 @@ def _votes_of_labels(
     face, _ = np.nonzero(corner >= 0)
     slot = face * len(LABELS) + corner[corner >= 0]
     return np.bincount(slot, minlength=mesh.face_count * len(LABELS)).reshape(-1, len(LABELS)).astype(np.float64)
-
-
-def _fold_weights(mesh: TriangleMesh, pairs: np.ndarray, ends: np.ndarray, config: SegmentConfig) -> np.ndarray:
-    """The cost (P,) of a label change across each edge."""
-    length = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
-    normal = mesh.face_normals
-    n0, n1 = normal[pairs[:, 0]], normal[pairs[:, 1]]
-    deficit = 1.0 - np.einsum("ij,ij->i", n0, n1)
-    middle = mesh.triangles.mean(axis=1)
-    # Concave: the neighbour lies on the side that the normal points to.
-    concave = np.einsum("ij,ij->i", middle[pairs[:, 1]] - middle[pairs[:, 0]], n0 - n1) > 0
-    eta = np.where(concave, config.eta_concave, config.eta_convex)
-    mean = length.mean() if len(length) else 1.0
-    return config.smoothness * length / mean * np.exp(-eta * deficit / config.fold) + config.floor
-
-
-def _absorb_islands(
-    mesh: TriangleMesh,
-    labels: np.ndarray,
-    confidence: np.ndarray,
-    pairs: np.ndarray,
-    ends: np.ndarray,
-    config: SegmentConfig,
-) -> np.ndarray:
-    """Give patches that are too small for their label the one that they share the longest border with.
-
-    Only patches that are large enough hand on their label; a small one that touches none of them stays.
-    """
-    same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
-    patch = component_labels(pairs[same], len(labels))
-    area = np.bincount(patch, mesh.face_areas)
-    label_of_patch = np.empty(len(area), dtype=np.int64)
-    label_of_patch[patch] = labels
-    doubtful = np.bincount(patch, mesh.face_areas * confidence) < config.doubtful * area
-    least = np.where(label_of_patch == SKIN.id, config.speck_area, config.island_area)
-    least = np.where(doubtful, np.maximum(least, config.doubtful_area), least)
-    small = area < least * area.sum()
-    if not small.any():
-        return labels
-    crossing = pairs[~same]
-    length = np.linalg.norm(np.diff(mesh.vertices[ends[~same]], axis=1)[:, 0], axis=1)
-    here = np.concatenate([patch[crossing[:, 0]], patch[crossing[:, 1]]])
-    there = np.concatenate([patch[crossing[:, 1]], patch[crossing[:, 0]]])
-    usable = small[here] & ~small[there]
-    border = np.zeros((len(area), len(LABELS)))
-    np.add.at(border, (here[usable], label_of_patch[there[usable]]), np.concatenate([length, length])[usable])
-    absorbed = border.any(axis=1)
-    label_of_patch[absorbed] = border[absorbed].argmax(axis=1)
-    return label_of_patch[patch]

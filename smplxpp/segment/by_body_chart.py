@@ -1,0 +1,127 @@
+"""Where every face of a scan lies on the fitted body: region, place along the limb, direction on the head, distance.
+
+Places are in metres of a standard person (joints at fixed heights), so that rules about clothes hold for everyone: a
+sleeve is as long as a share of the arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.spatial import cKDTree
+
+from smplxpp.body import BodyModel
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.params import BodyParams
+
+HEAD, NECK, TRUNK, ARM, HAND, LEG, FOOT = range(7)
+REGION_NAMES = ("head", "neck", "trunk", "arm", "hand", "leg", "foot")
+
+# Heights of the standard person's joints; arms are measured outwards from the shoulder joint.
+SOLE, ANKLE, KNEE, HIP, NECK_BASE, HEAD_BASE, TOP = 0.0, 0.08, 0.48, 0.90, 1.45, 1.54, 1.75
+ELBOW, WRIST, FINGERTIP = 0.26, 0.50, 0.68
+# A turn of the surface's normal by 180 degrees weighs like 2 x this many metres in the search for the body's place.
+_NORMAL_WEIGHT = 0.06
+_FINGERS = ("index", "middle", "pinky", "ring", "thumb", "_hand")
+
+
+@dataclass(frozen=True, eq=False)
+class BodyChart:
+    """Places on a body, of its vertices or of a scan's faces.
+
+    Attributes:
+        region: one of `HEAD` to `FOOT`.
+        height: along the column of feet, legs, trunk, neck and head, standard metres (`SOLE` to `TOP`).
+        reach: along the arm from the shoulder joint, standard metres (0 to `FINGERTIP`); negative on the trunk.
+        azimuth: about the head's (and the trunk's) vertical axis, radians: 0 in front, pi at the back.
+        face_height: within the head: 0 at the chin, 1 at the top.
+        distance: of a scan's faces to the body, metres along the body's normal, negative within; 0 on the body.
+        side: +1 left, -1 right.
+    """
+
+    region: Int64[np.ndarray, " n"]
+    height: Float64[np.ndarray, " n"]
+    reach: Float64[np.ndarray, " n"]
+    azimuth: Float64[np.ndarray, " n"]
+    face_height: Float64[np.ndarray, " n"]
+    distance: Float64[np.ndarray, " n"]
+    side: Int64[np.ndarray, " n"]
+
+    def __getitem__(self, index: np.ndarray) -> BodyChart:
+        names = ("region", "height", "reach", "azimuth", "face_height", "distance", "side")
+        return BodyChart(*(getattr(self, name)[index] for name in names))
+
+
+def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
+    """The places of a body's own vertices, from its joints and weights in the rest pose (one frame's shape)."""
+    rest = body.forward(params)
+    vertices, joints = rest.rest_vertices[0], rest.rest_joints[0]
+    names = list(body.joint_names)
+    at = {name: joints[k] for k, name in enumerate(names)}
+
+    def share(*wanted: str) -> np.ndarray:
+        chosen = [k for k, name in enumerate(names) if any(part in name for part in wanted)]
+        return body.weights[:, chosen].sum(axis=1)
+
+    shares = np.stack(
+        [
+            share("head", "jaw", "eye"),
+            share("neck"),
+            share("pelvis", "spine", "collar"),
+            share("shoulder", "elbow"),
+            share("wrist", *_FINGERS),
+            share("hip", "knee"),
+            share("ankle", "foot"),
+        ]
+    )
+    region = shares.argmax(axis=0)
+    x, y, z = (vertices - [at["pelvis"][0], 0.0, 0.0]).T
+    head = region == HEAD
+    if not head.any():
+        raise InputError("body model", expected="vertices that follow a head", received=f"none in {body.name!r}")
+    mean = {name: 0.5 * (at[f"left_{name}"] + at[f"right_{name}"]) for name in ("hip", "knee", "ankle")}
+    knots = [y.min(), mean["ankle"][1], mean["knee"][1], mean["hip"][1], at["neck"][1], at["head"][1], y.max()]
+    height = np.interp(y, np.maximum.accumulate(knots), [SOLE, ANKLE, KNEE, HIP, NECK_BASE, HEAD_BASE, TOP])
+    reach = np.empty(len(vertices))
+    for sign, side in ((1, "left"), (-1, "right")):
+        own = np.sign(x) * sign >= 0
+        start = sign * (at[f"{side}_shoulder"][0] - at["pelvis"][0])
+        elbow = start + float(np.linalg.norm(at[f"{side}_elbow"] - at[f"{side}_shoulder"]))
+        wrist = elbow + float(np.linalg.norm(at[f"{side}_wrist"] - at[f"{side}_elbow"]))
+        tip = max((sign * x).max(), wrist + 0.01)
+        reach[own] = np.interp(sign * x[own], [0.0, start, elbow, wrist, tip], [-start, 0.0, ELBOW, WRIST, FINGERTIP])
+    middle = 0.5 * (z[head].min() + z[head].max())
+    azimuth = np.where(region >= TRUNK, np.arctan2(x, z - at["spine2"][2]), np.arctan2(x, z - middle))
+    chin = y[head & (z > middle)].min()
+    face_height = (y - chin) / (y.max() - chin)
+    left = np.where(x >= 0, 1, -1)
+    return BodyChart(region, height, reach, azimuth, face_height, np.zeros(len(y)), left)
+
+
+def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> BodyChart:
+    """The places of a scan's faces: those of the body's vertex that is nearest in position and normal together.
+
+    Args:
+        mesh: the scan, posed as `params` (one frame) poses the body, metres.
+
+    Raises:
+        InputError: more than one frame.
+    """
+    if len(params) != 1:
+        raise InputError("body parameters", expected="one frame", received=f"{len(params)} frames")
+    own = chart_of_body(body, params)
+    posed = body.mesh(body.forward(params).vertices[0])
+    normals = posed.vertex_normals
+    tree = cKDTree(np.concatenate([posed.vertices, _NORMAL_WEIGHT * normals], axis=1))
+    points = mesh.face_centers
+    _, nearest = tree.query(np.concatenate([points, _NORMAL_WEIGHT * mesh.face_normals], axis=1))
+    offset = points - posed.vertices[nearest]
+    along = np.einsum("ij,ij->i", offset, normals[nearest])
+    # Near the body the plane through the vertex tells, far from it the way to the vertex.
+    far = row_lengths(offset)
+    distance = np.where(far < 0.04, along, np.copysign(far, along))
+    place = own[nearest]
+    return BodyChart(place.region, place.height, place.reach, place.azimuth, place.face_height, distance, place.side)

@@ -1,0 +1,260 @@
+"""What somebody wears, in outline: where shoes, legs, trousers, shirt and sleeves begin and end along the body.
+
+The column of feet, legs and trunk is cut into a run of shoe, skin, lower, skin and upper, the arm into sleeve and skin;
+any of them may be empty. Each way to cut has a cost: how badly the colours within a run go together, how much skin lies
+in cloth and how much else in skin, and how usual such clothes are. The cheapest is found exactly (dynamic programming
+over rings of the body).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HIP, KNEE, LEG, TRUNK, WRIST, BodyChart
+
+STEP = 0.015  # of a ring, standard metres
+COLUMN_END, ARM_START, ARM_END = 1.32, -0.06, 0.62
+_COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
+
+
+@dataclass(frozen=True)
+class OutfitConfig:
+    """Costs of `find_outfit`, in nats.
+
+    Attributes:
+        samples: independent samples of colour that a ring is worth.
+        skin_in_cloth: a sample of cloth that looks like skin, a nat of log ratio; in all at most `skin_colored`, what
+            it costs that a garment has the colour of skin, or `skin_colored_shoe`.
+        other_in_skin: a sample of skin that does not look like it, a nat of log ratio.
+        distance: a ring's mean distance to the body, a nat of log ratio.
+        bare_pelvis: a ring of skin about the pelvis.
+        split: of two garments where one would do. midriff: of skin between two garments.
+        crease: bonus of a border with a full step or ring of folds.
+    """
+
+    samples: float = 8.0
+    skin_in_cloth: float = 0.8
+    skin_colored: float = 25.0
+    skin_colored_shoe: float = 60.0
+    other_in_skin: float = 1.0
+    distance: float = 0.7
+    bare_pelvis: float = 6.0
+    split: float = 25.0
+    midriff: float = 12.0
+    crease: float = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """What is seen along a column or an arm, a row a ring of `STEP`.
+
+    Attributes:
+        start: of the first ring. weight: 0 to 1, how much of the ring is seen. colors: histograms; rows sum to 1.
+        skin: mean log ratio for skin, positive and negative parts: (R, 2), none negative.
+        distance: mean to the body, metres: a body that is a little misplaced is too near on one side and too far on the
+            other, which leaves the mean.
+    """
+
+    start: float
+    weight: Float64[np.ndarray, " R"]
+    colors: Float64[np.ndarray, "R K"]
+    skin: Float64[np.ndarray, "R 2"]
+    distance: Float64[np.ndarray, " R"]
+
+    @staticmethod
+    def of(
+        place: np.ndarray,
+        start: float,
+        end: float,
+        *,
+        area: np.ndarray,
+        color: np.ndarray,
+        color_count: int,
+        skin: np.ndarray,
+        distance: np.ndarray,
+    ) -> Rings:
+        """Gather faces by their place along the column.
+
+        Args:
+            place, area, skin, distance: of some faces; skin: log ratios. color: their palette index.
+        """
+        count = round((end - start) / STEP)
+        ring = np.floor((place - start) / STEP).astype(np.int64)
+        inside = (ring >= 0) & (ring < count)
+        ring, area, color, skin, distance = (x[inside] for x in (ring, area, color, skin, distance))
+        total = np.bincount(ring, area, minlength=count)
+        share = np.maximum(total, 1e-12)
+        colors = np.bincount(ring * color_count + color, area, minlength=count * color_count)
+        parts = [np.bincount(ring, area * np.maximum(sign * skin, 0), minlength=count) / share for sign in (1, -1)]
+        usual = float(np.median(total[total > 0])) if (total > 0).any() else 1.0
+        return Rings(
+            start,
+            np.clip(2.0 * total / usual, 0, 1),
+            colors.reshape(count, color_count) / share[:, None],
+            np.stack(parts, axis=1),
+            np.bincount(ring, area * np.clip(distance, -0.03, 0.08), minlength=count) / share,
+        )
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    @property
+    def places(self) -> Float64[np.ndarray, " R1"]:
+        """Where rings begin, and where the last one ends."""
+        return self.start + STEP * np.arange(len(self) + 1)
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Borders in standard metres.
+
+    Attributes:
+        shoe_top: 0 for bare feet. lower_start: the lower hem. lower_end: its upper end; not above `lower_start` where
+            there is no lower garment. upper_start: the upper garment's hem. cuff: the sleeve's end along the arm.
+        margins: by border, what the next best clothes with another border (by more than 6 cm) cost more, nats.
+    """
+
+    shoe_top: float
+    lower_start: float
+    lower_end: float
+    upper_start: float
+    cuff: float
+    margins: dict[str, float]
+
+    @property
+    def has_lower(self) -> bool:
+        return self.lower_end > self.lower_start
+
+
+def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float) -> Outfit:
+    """The cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
+
+    Args:
+        misfit: metres by which the body usually misses bare skin.
+    """
+    borders, margins = _cut_column(column, config, misfit)
+    cuff, margins["cuff"] = _cut_arm(arm, config, misfit)
+    return Outfit(*borders, cuff, margins)
+
+
+def _run_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(R + 1, R + 1) each: at [i, j] what rings i..j-1 cost as a shoe, as another cloth, and as skin; infinite where
+    i > j."""
+    n = rings.weight * config.samples
+    cross = _cross_costs(rings, n)
+    cloth_far, skin_far = _distance_costs(rings, config, misfit)
+    like_skin = _between(config.skin_in_cloth * n * rings.skin[:, 0])
+    cloth = cross + _between(cloth_far)
+    skin = cross + _between(config.other_in_skin * n * rings.skin[:, 1] + skin_far)
+    shoe = cloth + np.minimum(like_skin, config.skin_colored_shoe)
+    cloth = cloth + np.minimum(like_skin, config.skin_colored)
+    there = np.triu(np.ones(cross.shape, dtype=bool))
+    return np.where(there, shoe, np.inf), np.where(there, cloth, np.inf), np.where(there, skin, np.inf)
+
+
+def _between(ring: np.ndarray) -> np.ndarray:
+    """At [i, j]: the sum over rings i..j-1."""
+    total = np.concatenate([[0.0], np.cumsum(ring)])
+    return total[None, :] - total[:, None]
+
+
+def _cross_costs(rings: Rings, n: np.ndarray) -> Float64[np.ndarray, "R1 R1"]:
+    """At [i, j]: sum over rings i..j-1 of n KL(ring's colours | colours of them all)."""
+    count = len(rings)
+
+    def plogp(p: np.ndarray) -> np.ndarray:
+        return np.where(p > 0, p * np.log(np.where(p > 0, p, 1.0)), 0.0).sum(axis=-1)
+
+    mass = np.concatenate([np.zeros((1, rings.colors.shape[1])), np.cumsum(rings.colors * n[:, None], axis=0)])
+    total = np.concatenate([[0.0], np.cumsum(n * (rings.colors.sum(axis=1) > 0))])
+    own = np.concatenate([[0.0], np.cumsum(n * plogp(rings.colors))])
+    out = np.zeros((count + 1, count + 1))
+    for i in range(count):
+        run, size = mass[i + 1 :] - mass[i], total[i + 1 :] - total[i]
+        # sum n h log h - sum m log (m / size)
+        out[i, i + 1 :] = own[i + 1 :] - own[i] - plogp(run) + size * np.log(np.maximum(size, 1e-12))
+    return np.maximum(out, 0.0)
+
+
+def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[np.ndarray, np.ndarray]:
+    """(R,) nats of each ring as cloth and as skin: skin lies on the body, cloth some way above it."""
+    spread = np.hypot(0.5 * misfit, 0.003)
+    z = rings.distance / spread
+    # A normal distribution against one shifted outwards by an exponential one of 12 mm, up to where it is flat.
+    ratio = np.clip(0.5 * z**2 - np.maximum(rings.distance, 0) / 0.012 - np.log(0.012 / spread), -0.7, 3.0)
+    ratio = np.where(z < 0, -0.7, ratio) * config.distance * rings.weight
+    return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
+
+
+def _cut_column(
+    rings: Rings, config: OutfitConfig, misfit: float
+) -> tuple[tuple[float, float, float, float], dict[str, float]]:
+    place, count = rings.places, len(rings)
+    shoe, cloth, skin = _run_costs(rings, config, misfit)
+    i, j = np.indices(cloth.shape)
+    empty, length = i == j, place[j] - place[i]
+    # Steps of the distance to the body: hems.
+    mean = np.convolve(rings.distance, np.ones(2) / 2, mode="valid")
+    jump = np.concatenate([[0.0, 0.0], np.abs(mean[2:] - mean[:-2]), [0.0, 0.0]])
+    fold = config.crease * np.clip(jump / 0.010, 0.0, 1.0)
+    middle = 0.5 * (place[1:] + place[:-1])
+    on_foot = _between(_COVERS_FOOT * (middle < 0.045))
+    skin = skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
+    # What is usual of the place and length of each run.
+    shoe = shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
+    usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
+    usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
+    lower = np.where(empty, 6.0, cloth + config.split + usual + on_foot)
+    midriff = skin + np.where(empty, 0.0, config.midriff)
+    upper = cloth + on_foot + _usual(place[i], -0.1, 1.2, 60.0) - np.where(i > 0, fold[i], 0.0)
+    runs = [shoe, skin, lower, midriff, upper]
+    # forward[k][j]: runs before k end at j. backward[k][i]: runs from k on start at i.
+    forward = [np.where(np.arange(count + 1) == 0, 0.0, np.inf)]
+    for cost in runs:
+        forward.append((forward[-1][:, None] + cost).min(axis=0))
+    backward = [np.where(np.arange(count + 1) == count, 0.0, np.inf)]
+    for cost in reversed(runs):
+        backward.append((cost + backward[-1][None, :]).min(axis=1))
+    backward.reverse()
+    cuts = [count]
+    for k in range(len(runs) - 1, -1, -1):
+        cuts.append(int((forward[k] + runs[k][:, cuts[-1]]).argmin()))
+    cuts = cuts[::-1][1:-1]
+    names = ("shoe_top", "lower_start", "lower_end", "upper_start")
+    margins = {
+        name: _margin(forward[k] + backward[k], place, cut)
+        for k, (name, cut) in enumerate(zip(names, cuts, strict=True), start=1)
+    }
+    shoe_top, lower_start, lower_end, upper_start = (float(place[cut]) for cut in cuts)
+    return (shoe_top, lower_start, lower_end, upper_start), margins
+
+
+def _cut_arm(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[float, float]:
+    _, cloth, skin = _run_costs(rings, config, misfit)
+    cost = cloth[0] + skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
+    best = int(cost.argmin())
+    return float(rings.places[best]), _margin(cost, rings.places, best)
+
+
+def _margin(cost: np.ndarray, place: np.ndarray, best: int) -> float:
+    """What the cheapest cost farther than 6 cm away is above the best."""
+    elsewhere = np.abs(place - place[best]) > 0.06
+    return float(cost[elsewhere].min() - cost[best])
+
+
+def _usual(place: np.ndarray, low: float, high: float, nats: float) -> np.ndarray:
+    """0 between, `nats` at 20 cm beyond, linear."""
+    return nats * np.maximum(np.maximum(low - place, place - high), 0.0) / 0.2
+
+
+def in_column(chart: BodyChart) -> np.ndarray:
+    """Faces of feet, legs and trunk."""
+    return np.isin(chart.region, (FOOT, LEG, TRUNK))
+
+
+def in_arm(chart: BodyChart) -> np.ndarray:
+    """Faces of arms and hands."""
+    return np.isin(chart.region, (ARM, HAND))

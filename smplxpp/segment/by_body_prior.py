@@ -1,0 +1,114 @@
+"""How likely each label is at a place on the body, given in outline what somebody wears."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
+from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK_BASE, TRUNK, WRIST, BodyChart
+from smplxpp.segment.by_body_outfit import Outfit
+
+# What else may be there, by region, whatever the outline says: a share of the whole, over all labels.
+_ELSE: dict[int, dict[int, float]] = {
+    TRUNK: {SKIN.id: 0.03, HAIR.id: 0.02, UPPER.id: 0.03, LOWER.id: 0.02, OUTER.id: 0.005},
+    ARM: {SKIN.id: 0.03, HAIR.id: 0.003, UPPER.id: 0.04, LOWER.id: 0.0005, OUTER.id: 0.005},
+    HAND: {SKIN.id: 0.05, UPPER.id: 0.03, LOWER.id: 0.002, OUTER.id: 0.003},
+    LEG: {SKIN.id: 0.04, SHOE.id: 0.01, UPPER.id: 0.02, LOWER.id: 0.04, OUTER.id: 0.003},
+    FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
+}
+_NEVER = 1e-6
+
+
+def place_prior(
+    chart: BodyChart, outfit: Outfit, *, softness: float, body_softness: float
+) -> Float64[np.ndarray, "M L"]:
+    """P(label) at each face's place, before its colour is looked at; rows sum to 1.
+
+    Args:
+        softness: metres by which a hem may hang lower or higher than its ring. body_softness: by which regions of the
+            head and hands may be misplaced.
+    """
+    out = np.full((len(chart.region), len(LABELS)), _NEVER)
+    for region, shares in _ELSE.items():
+        here = chart.region == region
+        for label, share in shares.items():
+            out[here, label] += share
+    column, arm = np.isin(chart.region, (TRUNK, LEG, FOOT)), chart.region == ARM
+    rest = 1.0 - out.sum(axis=1)
+    out[column] += rest[column, None] * _column(chart.height[column], outfit, softness)
+    # Where trunk meets neck: necklines.
+    top = chart.region == TRUNK
+    bare = 0.45 * _above(chart.height[top], NECK_BASE - 0.05, 0.03)
+    out[top, SKIN.id], out[top, UPPER.id] = out[top, SKIN.id] + bare, out[top, UPPER.id] * (1 - bare)
+    sleeve = 1.0 - _above(chart.reach[arm], outfit.cuff, softness)
+    out[arm, UPPER.id] += rest[arm] * sleeve
+    out[arm, SKIN.id] += rest[arm] * (1 - sleeve)
+    hand = chart.region == HAND
+    sleeve = 1.0 - _above(chart.reach[hand], min(outfit.cuff, WRIST) + 0.02, softness)
+    out[hand, UPPER.id] += rest[hand] * sleeve
+    out[hand, SKIN.id] += rest[hand] * (1 - sleeve)
+    neck = chart.region == NECK
+    out[neck] += _neck(chart.azimuth[neck])
+    head = chart.region == HEAD
+    out[head] += _head(chart.azimuth[head], chart.face_height[head], body_softness)
+    return out / out.sum(axis=1, keepdims=True)
+
+
+def face_core(chart: BodyChart) -> Bool[np.ndarray, " M"]:
+    """Well within the face, between chin and brows."""
+    return (
+        (chart.region == HEAD) & (np.abs(chart.azimuth) < 0.8) & (chart.face_height > 0.05) & (chart.face_height < 0.62)
+    )
+
+
+def hand_core(chart: BodyChart) -> Bool[np.ndarray, " M"]:
+    """Well within the hands."""
+    return (chart.region == HAND) & (chart.reach > WRIST + 0.04)
+
+
+def skull_cap(chart: BodyChart) -> Bool[np.ndarray, " M"]:
+    """Where hair grows on those who have any: the top and the back of the head."""
+    back = (np.abs(chart.azimuth) > 2.0) & (chart.face_height > 0.4)
+    return (chart.region == HEAD) & (back | (chart.face_height > 0.9))
+
+
+def _above(x: np.ndarray, border: float, softness: float) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-np.clip((x - border) / (0.5 * softness), -40, 40)))
+
+
+def _column(height: np.ndarray, outfit: Outfit, softness: float) -> np.ndarray:
+    out = np.zeros((len(height), len(LABELS)))
+    borders = [outfit.shoe_top, outfit.lower_start, outfit.lower_end, outfit.upper_start]
+    above = [np.ones(len(height))]
+    for k, border in enumerate(borders):
+        # Nothing below what is not worn.
+        never = (k == 0 and outfit.shoe_top <= 0) or (k == 3 and outfit.upper_start <= 0)
+        above.append(np.ones(len(height)) if never else _above(height, border, softness))
+    above.append(np.zeros(len(height)))
+    above = list(np.minimum.accumulate(above))
+    for k, label in enumerate((SHOE, SKIN, LOWER, SKIN, UPPER)):
+        out[:, label.id] += above[k] - above[k + 1]
+    return np.maximum(out, 0.0)
+
+
+def _neck(azimuth: np.ndarray) -> np.ndarray:
+    back = np.abs(azimuth) / np.pi
+    out = np.zeros((len(azimuth), len(LABELS)))
+    out[:, SKIN.id], out[:, HAIR.id] = 0.75 - 0.35 * back, 0.03 + 0.35 * back
+    out[:, UPPER.id], out[:, OUTER.id] = 0.2, 0.02
+    return out
+
+
+def _head(azimuth: np.ndarray, height: np.ndarray, softness: float) -> np.ndarray:
+    """Face, ears and nape are skin, the cap is hair; between them the colour decides."""
+    side = np.abs(azimuth)
+    # The hairline: over the forehead in front, before and behind the ears, down to the nape.
+    line = np.interp(side, [0.0, 0.8, 1.2, 1.5, 2.0, np.pi], [0.82, 0.76, 0.62, 0.50, 0.15, 0.02])
+    width = np.interp(side, [0.0, 0.8, 1.2, np.pi], [0.10, 0.12, 0.2, 0.22]) + 2.0 * softness
+    hair = 1.0 / (1.0 + np.exp(-np.clip((height - line) / (0.35 * width), -30, 30)))
+    hair = np.clip(hair, np.interp(side, [0.5, 1.0, 1.4], [0.002, 0.03, 0.1]), 0.95)
+    out = np.zeros((len(azimuth), len(LABELS)))
+    out[:, HAIR.id], out[:, SKIN.id] = hair, 1.0 - hair
+    out[:, UPPER.id] = 0.01
+    return out

@@ -1,0 +1,129 @@
+"""Labels of a clothed scan from geometry, colours and the fitted body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.synth.tracker import tracker_noise
+from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.segment import label_by_body, read_labels, segment_scan
+
+PERSON = Path(__file__).resolve().parents[2] / "data/fixtures/person"
+_SKIN_RGB, _BLUE, _GREY = (222, 176, 150), (58, 98, 170), (90, 90, 94)
+
+
+@pytest.fixture(scope="module")
+def body() -> BodyModel:
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
+    """The fixture's scan, its colours, true labels of its faces, and the parameters of its body."""
+    file = read_mesh(PERSON / "scans/scan_000000.ply")
+    labels = read_labels(
+        PERSON / "scans/scan_000000_labels.npz",
+        vertex_count=file.mesh.vertex_count,
+        face_count=file.mesh.face_count,
+        label_set="capture",
+    )
+    corner = labels[file.mesh.faces]
+    truth = np.where(corner[:, 1] == corner[:, 2], corner[:, 1], corner[:, 0])
+    return file.mesh, file.vertex_colors, truth, load_params(PERSON / "params/params.npz", body=body).frame(0)
+
+
+def accuracy(mesh: TriangleMesh, labels: np.ndarray, truth: np.ndarray) -> float:
+    return float(mesh.face_areas @ (labels == truth) / mesh.face_areas.sum())
+
+
+def test_a_clothed_scan_is_labelled_though_the_body_is_a_little_wrong(body, scanned):
+    mesh, colors, truth, params = scanned
+    wrong = tracker_noise(params, seed=3, degrees=2.5, transl=0.01, betas=0.4)
+    result = label_by_body(mesh, body, wrong, colors=colors)
+    assert accuracy(mesh, result.face_labels, truth) > 0.95
+    right = result.face_labels == truth
+    sure = result.confidence > np.median(result.confidence)
+    assert right[sure].mean() > right[~sure].mean()
+    assert result.seen.mean() > 0.9
+    again = label_by_body(mesh, body, wrong, colors=colors)
+    assert np.array_equal(again.face_labels, result.face_labels)
+
+
+def test_the_direction_she_faces_does_not_matter(body, scanned):
+    mesh, colors, _, params = scanned
+    before = label_by_body(mesh, body, params, colors=colors)
+    angle = np.radians(110.0)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    root = body.forward(params).joints[0, 0]
+    vertices = (mesh.vertices - root) @ turn.T + root
+    turned = replace(params, global_orient=rotvec_from_matrix(turn @ matrix_from_rotvec(params.global_orient)))
+    after = label_by_body(mesh.with_vertices(vertices), body, turned, colors=colors)
+    assert accuracy(mesh, after.face_labels, before.face_labels) > 0.999
+
+
+def test_without_colours_it_says_so(body, scanned):
+    mesh, colors, _, params = scanned
+    for given in (None, np.full_like(colors, 128)):
+        result = label_by_body(mesh, body, params, colors=given)
+        assert any("no colours" in doubt for doubt in result.doubts)
+
+
+def painted(body: BodyModel, paint: dict[str, tuple]) -> tuple[TriangleMesh, np.ndarray, BodyParams]:
+    """A naked body whose regions are painted: what colours alone say."""
+    params = BodyParams.rest()
+    mesh = body.mesh(body.forward(params).vertices[0])
+    colors = np.tile(np.array(_SKIN_RGB, dtype=np.uint8), (mesh.vertex_count, 1))
+    x, y, _ = mesh.vertices.T
+    joint = {name: body.forward(params).joints[0, k] for k, name in enumerate(body.joint_names)}
+    where = {
+        "hair": y > joint["head"][1] + 0.16,
+        "shirt": (y > joint["pelvis"][1] + 0.05) & (y < joint["neck"][1] - 0.03) & (np.abs(x) < joint["left_elbow"][0]),
+        "trousers": (y < joint["pelvis"][1] + 0.05) & (y > joint["left_ankle"][1] + 0.03),
+        "shoes": y < joint["left_ankle"][1] + 0.03,
+    }
+    for name, rgb in paint.items():
+        colors[where[name] & (np.abs(x) < joint["left_elbow"][0])] = rgb
+    return mesh, colors, params
+
+
+def test_a_bald_person_with_bare_feet_has_neither_hair_nor_shoes(body):
+    mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": _GREY})
+    labels = label_by_body(mesh, body, params, colors=colors).face_labels
+    area = mesh.face_areas / mesh.face_areas.sum()
+    share = np.array([area[labels == k].sum() for k in range(6)])
+    assert share[HAIR.id] < 0.002 and share[SHOE.id] < 0.002
+    assert share[UPPER.id] > 0.2 and share[LOWER.id] > 0.2 and share[SKIN.id] > 0.15
+
+
+def test_wrong_input_is_refused(body, scanned):
+    mesh, colors, _, params = scanned
+    with pytest.raises(InputError, match="one frame"):
+        label_by_body(mesh, body, BodyParams.concatenate([params, params]), colors=colors)
+    with pytest.raises(InputError, match="vertex colours"):
+        label_by_body(mesh, body, params, colors=colors[:-1])
+    with pytest.raises(InputError, match="out of range"):
+        label_by_body(mesh, body, params, colors=colors.astype(np.float64))
+
+
+def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
+    mesh, colors, truth, params = scanned
+    votes = np.zeros((mesh.face_count, 6))
+    front = mesh.face_normals[:, 2] > 0.3
+    votes[np.flatnonzero(front), truth[front]] = 3.0
+    prior = label_by_body(mesh, body, params, colors=colors)
+    alone = segment_scan(mesh, votes=votes)
+    both = segment_scan(mesh, votes=votes, colors=colors, prior=prior)
+    assert accuracy(mesh, both.face_labels, truth) > max(accuracy(mesh, alone.face_labels, truth), 0.98)
+    assert (both.face_labels == truth)[front].mean() > 0.995
+    with pytest.raises(InputError, match="prior"):
+        segment_scan(mesh.submesh(np.arange(1000))[0], votes=votes[:1000], prior=prior)
