@@ -22,13 +22,15 @@ SUPPORT = {
 def main() -> int:
     """Run `benchmarks.NAME`, or list the names with what each measures."""
     folder = Path(__file__).parent
-    names = sorted(path.stem for path in folder.glob("*.py") if path.stem not in SUPPORT)
+    files = {path.stem: path for path in folder.glob("*.py") if path.stem not in SUPPORT}
+    files |= {path.parent.name: path for path in folder.glob("*/__main__.py")}
+    names = sorted(files)
     if len(sys.argv) > 1 and sys.argv[1] in names:
         name = sys.argv.pop(1)
         runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
         return 0
     for name in names:
-        text = (folder / f"{name}.py").read_text().split('"""')[1].strip().splitlines()[0]
+        text = files[name].read_text().split('"""')[1].strip().splitlines()[0]
         print(f"{name:<16} {text}")
     return 0 if len(sys.argv) == 1 else 2
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache as remembered
 from pathlib import Path
 
@@ -50,12 +51,18 @@ def person(name: str | int, *, seed: int = 0, cache: Path | None = None) -> Pers
         raise InputError("person", expected=f"one of {', '.join(CAST)}", received=name)
     folder = cache or (Path(os.environ[CACHE_VARIABLE]) if os.environ.get(CACHE_VARIABLE) else None)
     if folder is None:
-        return make_person(name, CAST[name], _body(), seed=seed)
-    path = folder / f"{_key(name, seed)}.npz"
+        made = make_person(name, CAST[name], _body(), seed=seed)
+    else:
+        made = _remembered(folder / f"{_key(name, seed)}.npz", name, seed)
+    return replace(made, name=f"{name} ({seed})") if seed else made
+
+
+def _remembered(path: Path, name: str, seed: int) -> PersonScan:
+    """The person of a file, which is written where it is not there."""
     if path.is_file():
         return _read(path, name)
     made = make_person(name, CAST[name], _body(), seed=seed)
-    folder.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     _write(path, made)
     return made
 

@@ -97,6 +97,10 @@ STANCES: dict[str, Stance] = {
     "T": Stance(lambda _: _arms(2.0, elbow=2.0)),
     "wide A": Stance(lambda _: _arms(30.0) | _legs(out=4.0)),
     "arms down": Stance(lambda s: _hanging("left", s) | _hanging("right", s) | _legs(), ("left", "right")),
+    "at attention": Stance(
+        lambda s: _hanging("left", s, forward=0.0) | _hanging("right", s, forward=0.0) | _legs(out=-8.5),
+        ("left", "right"),
+    ),
     "hands on hips": Stance(lambda s: _hip_hand("left", s) | _hip_hand("right", s) | _legs(), ("left", "right")),
     "left hand on hip": Stance(
         lambda s: _hip_hand("left", s) | _hanging("right", s) | _leg("left", out=-2) | _leg("right", out=-7),

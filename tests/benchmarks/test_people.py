@@ -8,7 +8,7 @@ import igl
 import numpy as np
 import pytest
 
-from benchmarks.people import CAST, VARIANTS, access, captured, captured_names, person, variant
+from benchmarks.people import CAST, VARIANTS, access, captured, captured_names, people, person, variant
 from benchmarks.people.__main__ import body_outside
 from benchmarks.people.builds import BUILDS, betas_of, fitting_mannequin
 from benchmarks.people.making import make_person
@@ -74,8 +74,11 @@ def test_a_folder_remembers_people(monkeypatch, tmp_path, scan):
     for field in ("face_labels", "seen", "colors", "body_vertices", "joints"):
         np.testing.assert_array_equal(getattr(read, field), getattr(scan, field))
     np.testing.assert_array_equal(read.mesh.vertices, scan.mesh.vertices)
-    person(NAME, seed=1, cache=tmp_path)
+    assert person(NAME, seed=1, cache=tmp_path).name == f"{NAME} (1)"
     assert len(calls) == 2
+    everybody = [one.name for one in people(count=len(CAST) + 1, cache=tmp_path)]
+    assert calls[2:] == [name for name in CAST if name != NAME] + [next(iter(CAST))]
+    assert everybody[-1].endswith("(1)") and not everybody[-2].endswith("(1)")
 
 
 @pytest.mark.parametrize("name", VARIANTS)
