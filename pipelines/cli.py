@@ -33,6 +33,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Register",
         "the body fitted to all frames of a capture (keypoints, masks, label maps, scans), or to a scan",
     ),
+    "reconstruct": (
+        "pipelines.commands.reconstruct",
+        "ReconstructCommand",
+        "photographs, cameras and masks of a capture in; a closed, coloured surface of one frame or of all out",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",

@@ -73,3 +73,7 @@ REFINED_LOSS = Gate("x", 1.0, 1.2, higher_is_better=False)
 """Loss of the photographs with refined poses, as a share of that with the poses before."""
 ITERATIONS = Gate("", 1.0, 0.0)
 """Share of a training's iterations that were done."""
+UNSEEN_SURFACE = Gate("", 0.25, 0.6, higher_is_better=False)
+"""Share of a reconstructed surface that fewer than two cameras see: 0.05 to 0.1 of 12 to 24 cameras all around."""
+MASKS_LEFT_OUT = Gate("", 0.0, 0.34, higher_is_better=False)
+"""Share of the masks that the others contradict."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+RECONSTRUCT_STAGE = "02_reconstruct"
 REGISTER_STAGE = "05_register"
 CAPTURE_STAGE = "00_capture"
 POSE_BODY_STAGE = "10_body"
@@ -35,8 +36,9 @@ BUILD_STAGES = (REGISTER_STAGE, *TEMPLATE_STAGES)
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
-ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
+ALL_STAGES = (RECONSTRUCT_STAGE, *BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
 
+RECONSTRUCTION = f"{RECONSTRUCT_STAGE}/reconstruction.json"
 REGISTERED_PARAMS = f"{REGISTER_STAGE}/params.npz"
 REGISTRATION = f"{REGISTER_STAGE}/registration.json"
 SCAN = f"{CAPTURE_STAGE}/scan.npz"
@@ -70,5 +72,12 @@ LANDMARKS_FILE = "landmarks.json"
 """Landmarks that were placed by hand on the run's scan; no stage writes or removes it."""
 CORRECTIONS_FILE = "labels_corrections.json"
 """Labels that were corrected by hand on the run's scan; no stage writes or removes it."""
+RECONSTRUCT_FILE = "reconstruct.json"
+"""What a run's surfaces were reconstructed from."""
 METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
+
+
+def reconstructed_scan(frame: int) -> str:
+    """The file of a frame's reconstructed surface: what a build takes as its scan."""
+    return f"{RECONSTRUCT_STAGE}/scan_{frame:06d}.ply"

@@ -37,6 +37,8 @@ from smplxpp.core.files.json_values import jsonable
 
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3
+_STATE = ("*.safetensors", "*.npz")
+"""Files of a work folder in which hours may lie."""
 Decision = Literal["skip", "resume", "redo"]
 log = logging.getLogger(__name__)
 
@@ -149,7 +151,8 @@ def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
     found = standing(run / stage.name, stage)
     work = run / stage.work_name
     record = _record(work / STATE_RECORD) or {}
-    own, begun = record.get("key") == stage.key, any(work.rglob("*.safetensors"))
+    own = record.get("key") == stage.key
+    begun = any(any(work.rglob(pattern)) for pattern in _STATE)
     if own and begun and record.get("forced"):  # a training anew that was killed goes on, whatever it is to replace
         return "resume"
     if found is not None and found.finished:

@@ -1,0 +1,159 @@
+"""The soft visual hull: the zero set of the smallest depth within all silhouettes, on cells refined where it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import igl
+import manifold3d
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.topology import face_components
+from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
+from smplxpp.reconstruct.trust import Box
+
+Field = Callable[[Float32[np.ndarray, "N 3"]], Float32[np.ndarray, " N"]]
+"""Metres inside at (N, 3) points; it changes by at most a metre a metre."""
+_COARSE = 0.02
+_CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+# The cell beyond each face, and the face's corners.
+_FACES = [
+    (np.eye(3, dtype=np.int64)[axis] * (1 if side else -1), np.flatnonzero(_CORNERS[:, axis] == side))
+    for axis in range(3)
+    for side in (0, 1)
+]
+_SHIFT = 64
+# A second piece of this share of the largest one's volume is a body of its own.
+_ANOTHER = 0.2
+
+
+def soft_hull(silhouettes: Sequence[Silhouette], box: Box, *, cell: float, dissent: int = 0) -> TriangleMesh:
+    """The closed surface of what lies in all silhouettes, or in all but `dissent` of them at every point.
+
+    Args:
+        cell: metres between samples of the field; edges come out a little shorter.
+
+    Raises:
+        InputError: nothing lies in all silhouettes.
+    """
+
+    def field(points: np.ndarray) -> np.ndarray:
+        return smallest_depths(silhouettes, points, count=dissent + 1)[:, dissent]
+
+    return zero_surface(field, box, cell=cell)
+
+
+def zero_surface(field: Field, box: Box, *, cell: float) -> TriangleMesh:
+    """The closed, outward surface on which a field is zero, from coarse cells to fine ones (marching cubes).
+
+    A cell is refined when its middle is no farther from the surface than a corner of it can be.
+
+    Raises:
+        InputError: the field is positive nowhere.
+    """
+
+    def within(points: np.ndarray) -> np.ndarray:
+        """The field, closed at the box's sides."""
+        to_side = np.minimum(points - box.low.astype(np.float32), box.high.astype(np.float32) - points).min(axis=1)
+        return np.minimum(field(points), to_side)
+
+    halvings = max(0, round(float(np.log2(_COARSE / cell))))
+    size = cell * 2**halvings
+    # A layer of cells more on every side, so that the surface closes within.
+    counts = np.ceil((box.high - box.low) / size).astype(np.int64) + 2
+    origin = 0.5 * (box.low + box.high) - 0.5 * counts * size
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    for level in range(halvings + 1):
+        if level:
+            cells = (2 * cells[:, None] + _CORNERS).reshape(-1, 3)
+            size /= 2
+        middle = within((origin + (cells + 0.5) * size).astype(np.float32))
+        cells = cells[np.abs(middle) <= 0.5 * np.sqrt(3) * size * 1.05]
+    if not len(cells):
+        raise InputError(
+            "silhouettes",
+            expected="a body that lies in all of them",
+            received="none",
+            remedy="look at masks and cameras (`smplxpp capture check`)",
+        )
+    corners, index, values = _closed(cells, within, origin, size)
+    vertices, faces, _ = igl.marching_cubes(values, origin + corners * size, index, 0.0)
+    if not len(faces):
+        raise InputError("silhouettes", expected="a body that lies in all of them", received="none")
+    return TriangleMesh(vertices, faces)
+
+
+def _closed(
+    cells: Int64[np.ndarray, "N 3"], field: Field, origin: np.ndarray, size: float
+) -> tuple[Int64[np.ndarray, "C 3"], Int64[np.ndarray, "M 8"], Float64[np.ndarray, " C"]]:
+    """Corners, cells by their rows, and the corners' values, below zero inside; with the cells that close the surface.
+
+    Where a field jumps, at the edge of a view, its values do not tell of all cells that the surface runs through: it is
+    followed from cell to cell.
+    """
+    while True:
+        corners, index = _unique_corners(cells)
+        values = -field((origin + corners * size).astype(np.float32)).astype(np.float64)
+        # Marching cubes wants the inside below zero; a corner on the surface would give faces without area.
+        values = np.where(np.abs(values) < 1e-3 * size, -1e-3 * size, values)
+        inside = values[index] < 0
+        beyond = []
+        for direction, face in _FACES:
+            crossed = inside[:, face].any(axis=1) & ~inside[:, face].all(axis=1)
+            beyond.append(cells[crossed] + direction)
+        more = np.setdiff1d(_keys(np.concatenate(beyond)), _keys(cells))
+        if not len(more):
+            return corners, index, values
+        cells = np.concatenate([cells, _cells_of(more)])
+
+
+def _keys(cells: np.ndarray) -> np.ndarray:
+    """One number a cell; cells a few steps outside of the grid have one too."""
+    x, y, z = (cells + _SHIFT).T
+    return (x << 42) | (y << 21) | z
+
+
+def _cells_of(keys: np.ndarray) -> np.ndarray:
+    low = (1 << 21) - 1
+    return np.stack([keys >> 42, keys >> 21 & low, keys & low], axis=1) - _SHIFT
+
+
+def _unique_corners(cells: np.ndarray) -> tuple[Int64[np.ndarray, "C 3"], Int64[np.ndarray, "N 8"]]:
+    """The corners of cells, each once, and for every cell their rows."""
+    unique, index = np.unique(_keys((cells[:, None] + _CORNERS).reshape(-1, 3)), return_inverse=True)
+    return _cells_of(unique), index.reshape(-1, 8)
+
+
+def main_body(mesh: TriangleMesh) -> tuple[TriangleMesh, list[str]]:
+    """The largest of a closed surface's pieces, and words on others that are no crumbs.
+
+    Raises:
+        InputError: no piece encloses a volume.
+    """
+    piece = face_components(mesh.faces)
+    center = mesh.vertices.mean(axis=0)
+    volume = np.bincount(piece, np.einsum("ij,ij->i", mesh.face_centers - center, mesh.face_cross) / 6.0)
+    largest = int(volume.argmax())
+    if not volume[largest] > 0:
+        raise InputError("silhouettes", expected="a body that lies in all of them", received="no volume")
+    others = np.flatnonzero((volume > _ANOTHER * volume[largest]) & (np.arange(len(volume)) != largest))
+    said = [f"another body of {1e3 * volume[k]:.0f} litres beside that of {1e3 * volume[largest]:.0f}" for k in others]
+    return mesh.submesh(piece == largest)[0], said
+
+
+def solid_status(mesh: TriangleMesh) -> tuple[str, int]:
+    """What manifold3d says of a surface, "NoError" where it is closed and manifold; and its genus, holes through it."""
+    solid = manifold3d.Manifold(
+        manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64))  # it takes no read-only arrays
+    )
+    status = solid.status().name
+    return status, int(solid.genus()) if status == "NoError" else 0
+
+
+def pixel_footprint(silhouettes: Sequence[Silhouette], center: Float64[np.ndarray, " 3"]) -> float:
+    """Metres that a pixel takes at a point: the median over the views."""
+    z = [float((one.camera.cam_from_world[:3] @ np.append(center, 1.0))[2]) for one in silhouettes]
+    return float(np.median([one.pixel * depth for one, depth in zip(silhouettes, z, strict=True)]))

@@ -1,0 +1,129 @@
+"""What a reconstruction sees: photographs with masks and cameras of one moment, and whether they can show a body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import normalize_rows
+
+INSIDE = 127.5
+"""Opacity, of 255, from which a pixel counts as the person's."""
+LEAST_VIEWS = 4
+"""Fewer silhouettes leave more air than body."""
+_LEAST_APART = 100.0
+_WIDE_GAP = 150.0
+# An inverted mask fills most of the image and of its border.
+_MOST_AREA, _MOST_BORDER = 0.6, 0.7
+_LEAST_PIXELS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoView:
+    """One photograph.
+
+    Attributes:
+        name: for messages.
+        camera: of the image.
+        color: sRGB.
+        opacity: of the person, 255 inside.
+    """
+
+    name: str
+    camera: Camera
+    color: UInt8[np.ndarray, "H W 3"]
+    opacity: UInt8[np.ndarray, "H W"]
+
+
+def mask_fault(view: PhotoView) -> str:
+    """What a mask shows in the place of a person, in words; "" where it may be one."""
+    inside = view.opacity > INSIDE
+    share = float(inside.mean())
+    if inside.sum() < _LEAST_PIXELS:
+        return "empty"
+    if share == 1.0:
+        return "full: every pixel counts as the person"
+    border = np.concatenate([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]])
+    if share > _MOST_AREA and border.mean() > _MOST_BORDER:
+        return f"of the background: {100 * share:.0f} % of the image and {100 * border.mean():.0f} % of its border"
+    return ""
+
+
+def usable_views(views: Sequence[PhotoView]) -> tuple[list[PhotoView], dict[str, str]]:
+    """The views whose masks may show a person, and what is wrong with the others by name.
+
+    Raises:
+        InputError: fewer than four views, photographs and masks of other sizes than their cameras, as many masks of
+            nothing or of the background that four are not left.
+    """
+    if len(views) < LEAST_VIEWS:
+        raise InputError(
+            "views to reconstruct from",
+            expected=f"at least {LEAST_VIEWS} cameras with a photograph and a mask, from all around",
+            received=f"{len(views)}",
+            remedy="add cameras; from fewer a silhouette's cone stays open",
+        )
+    for view in views:
+        size = (view.camera.height, view.camera.width)
+        if view.opacity.shape != size or view.color.shape != (*size, 3):
+            raise InputError(
+                f"view {view.name}",
+                expected=f"photograph and mask of {size[1]} x {size[0]} pixels, as the camera",
+                received=f"{view.color.shape[1]} x {view.color.shape[0]} and {view.opacity.shape[1]} x "
+                f"{view.opacity.shape[0]}",
+            )
+    faults = {view.name: fault for view in views if (fault := mask_fault(view))}
+    good = [view for view in views if view.name not in faults]
+    if len(good) < LEAST_VIEWS:
+        turned = sum(fault.startswith("of the background") for fault in faults.values())
+        raise InputError(
+            "masks to reconstruct from",
+            expected=f"the person inside (255) in at least {LEAST_VIEWS} views",
+            received="; ".join(f"{name}: {fault}" for name, fault in list(faults.items())[:4])
+            + (f" and {len(faults) - 4} more" if len(faults) > 4 else ""),
+            remedy="invert the masks: black is the background" if 2 * turned > len(faults) else "make the masks anew",
+        )
+    return good, faults
+
+
+def view_directions_from(center: Float64[np.ndarray, " 3"], cameras: Sequence[Camera]) -> Float64[np.ndarray, "V 3"]:
+    """Unit directions from a point to the cameras."""
+    return normalize_rows(np.stack([camera.position for camera in cameras]) - center)
+
+
+def check_spread(center: Float64[np.ndarray, " 3"], cameras: Sequence[Camera]) -> str:
+    """Words on a side that no camera sees; "" where they stand all around.
+
+    Raises:
+        InputError: all cameras are on one side.
+    """
+    to = view_directions_from(center, cameras)
+    widest = float(np.degrees(np.arccos(np.clip((to @ to.T).min(), -1.0, 1.0))))
+    if widest < _LEAST_APART:
+        raise InputError(
+            "cameras to reconstruct from",
+            expected=f"views from all around: two directions at least {_LEAST_APART:.0f} degrees apart",
+            received=f"{len(cameras)} cameras within {widest:.0f} degrees",
+            remedy="add cameras behind the person, or hold fewer out (--hold-out)",
+        )
+    gap, toward = widest_gap(to)
+    if gap <= _WIDE_GAP:
+        return ""
+    return (
+        f"no camera stands within {gap / 2:.0f} degrees of the direction ({toward[0]:.2f}, 0, {toward[1]:.2f}): the "
+        "surface there is the silhouettes' alone"
+    )
+
+
+def widest_gap(directions: Float64[np.ndarray, "V 3"]) -> tuple[float, tuple[float, float]]:
+    """The widest angle about the vertical without a camera, degrees, and its middle (x, z)."""
+    angles = np.sort(np.arctan2(directions[:, 0], directions[:, 2]))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    k = int(gaps.argmax())
+    middle = angles[k] + gaps[k] / 2
+    return float(np.degrees(gaps[k])), (float(np.sin(middle)), float(np.cos(middle)))
