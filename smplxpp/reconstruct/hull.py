@@ -94,20 +94,26 @@ def _closed(
     Where a field jumps, at the edge of a view, its values do not tell of all cells that the surface runs through: it is
     followed from cell to cell.
     """
-    while True:
-        corners, index = _unique_corners(cells)
-        values = -field((origin + corners * size).astype(np.float32)).astype(np.float64)
+    known, front = np.unique(_keys(cells)), cells
+    keys, values = [], []
+    while len(front):
+        corner_keys, index = np.unique(_keys((front[:, None] + _CORNERS).reshape(-1, 3)), return_inverse=True)
+        found = -field((origin + _cells_of(corner_keys) * size).astype(np.float32)).astype(np.float64)
         # Marching cubes wants the inside below zero; a corner on the surface would give faces without area.
-        values = np.where(np.abs(values) < 1e-3 * size, -1e-3 * size, values)
-        inside = values[index] < 0
+        found = np.where(np.abs(found) < 1e-3 * size, -1e-3 * size, found)
+        keys.append(corner_keys)
+        values.append(found)
+        inside = found[index.reshape(-1, 8)] < 0
         beyond = []
         for direction, face in _FACES:
             crossed = inside[:, face].any(axis=1) & ~inside[:, face].all(axis=1)
-            beyond.append(cells[crossed] + direction)
-        more = np.setdiff1d(_keys(np.concatenate(beyond)), _keys(cells))
-        if not len(more):
-            return corners, index, values
-        cells = np.concatenate([cells, _cells_of(more)])
+            beyond.append(_keys(front[crossed] + direction))
+        more = np.setdiff1d(np.concatenate(beyond), known)
+        known, front = np.union1d(known, more), _cells_of(more)
+    corner_keys, first = np.unique(np.concatenate(keys), return_index=True)
+    found = np.concatenate(values)[first]
+    index = np.searchsorted(corner_keys, _keys((_cells_of(known)[:, None] + _CORNERS).reshape(-1, 3)))
+    return _cells_of(corner_keys), index.reshape(-1, 8), found
 
 
 def _keys(cells: np.ndarray) -> np.ndarray:
@@ -119,12 +125,6 @@ def _keys(cells: np.ndarray) -> np.ndarray:
 def _cells_of(keys: np.ndarray) -> np.ndarray:
     low = (1 << 21) - 1
     return np.stack([keys >> 42, keys >> 21 & low, keys & low], axis=1) - _SHIFT
-
-
-def _unique_corners(cells: np.ndarray) -> tuple[Int64[np.ndarray, "C 3"], Int64[np.ndarray, "N 8"]]:
-    """The corners of cells, each once, and for every cell their rows."""
-    unique, index = np.unique(_keys((cells[:, None] + _CORNERS).reshape(-1, 3)), return_inverse=True)
-    return _cells_of(unique), index.reshape(-1, 8)
 
 
 def main_body(mesh: TriangleMesh) -> tuple[TriangleMesh, list[str]]:

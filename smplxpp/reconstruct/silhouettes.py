@@ -79,16 +79,24 @@ class Silhouette:
 def signed_distance(opacity: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Pixels from pixel centres to the outline of an antialiased mask, positive inside.
 
-    The nearest pixel of the other side says by its opacity where in it the outline lies (Gustavson and Strand 2011).
+    A pixel that is covered in part says where in it the outline lies. Others add their way to the nearest one of the
+    other side or, where that makes them nearer to the outline, to the nearest covered in part of their own (after
+    Gustavson and Strand 2011).
     """
     inside = opacity > INSIDE
     out = np.empty(opacity.shape, np.float32)
-    for side in (True, False):
-        distance, nearest = ndimage.distance_transform_edt(inside == side, return_indices=True)
-        covered = opacity[tuple(nearest)].astype(np.float32) / _FULL
-        to_outline = distance - np.abs(0.5 - covered)
-        out = np.where(inside == side, to_outline if side else -to_outline, out)
+    for own, whole in ((inside, _FULL), (~inside, 0.0)):
+        own_at_outline = own & (opacity != whole) & ndimage.binary_dilation(~own)
+        sign = 1.0 if whole else -1.0
+        found = [_by_nearest(opacity, there, sign) for there in (~own, own_at_outline) if there.any()]
+        out = np.where(own, sign * np.min([sign * one for one in found], axis=0), out)
     return out.astype(np.float32)
+
+
+def _by_nearest(opacity: np.ndarray, there: np.ndarray, sign: float) -> np.ndarray:
+    """The signed distance that the nearest of the pixels `there` tells of."""
+    distance, nearest = ndimage.distance_transform_edt(~there, return_indices=True)
+    return sign * distance + (opacity[tuple(nearest)].astype(np.float32) / np.float32(_FULL) - 0.5)
 
 
 def least_shown(views: int) -> int:
@@ -101,6 +109,7 @@ def smallest_depths(
 ) -> Float32[np.ndarray, "N count"]:
     """The `count` smallest depths of each point among the views, ascending; far outside where too few show it."""
     out = np.empty((len(points), count), np.float32)
+    least = least_shown(len(silhouettes))
     for first in range(0, len(points), _CHUNK):
         part = points[first : first + _CHUNK]
         smallest = np.full((len(part), count), UNSEEN, np.float32)
@@ -113,5 +122,5 @@ def smallest_depths(
             else:
                 both = np.concatenate([smallest, depth[:, None]], axis=1)
                 smallest = np.sort(both, axis=1)[:, :count]
-        out[first : first + _CHUNK] = np.where((shown >= least_shown(len(silhouettes)))[:, None], smallest, -UNSEEN)
+        out[first : first + _CHUNK] = np.where((shown >= least)[:, None], smallest, -UNSEEN)
     return out

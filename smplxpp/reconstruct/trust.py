@@ -95,7 +95,8 @@ def find_consensus(silhouettes: Sequence[Silhouette]) -> Consensus:
         if not inside.any():
             _refuse(reasons, len(silhouettes))
         margin = 2.0 * cell
-        box = Box(points[inside].min(axis=0) - margin, points[inside].max(axis=0) + margin)
+        held = points[inside].astype(np.float64)
+        box = Box(held.min(axis=0) - margin, held.max(axis=0) + margin)
     return Consensus(trusted, reasons, explained, box)
 
 

@@ -89,6 +89,8 @@ struct Sweep {
         }
         // The floor is the noise of photographs: patches without texture agree with nothing.
         const float length = std::sqrt(squares[0] + squares[1] + squares[2] + noise * float(valid));
+        patch.counts = length > 0;
+        if (!patch.counts) return;
         for (Pixel& c : patch.colors) c /= length;
     }
 };
@@ -166,8 +168,9 @@ SMPLXPP_EXPORT int32_t smplxpp_patch_sweep(
                     if (!(at.z > 0)) continue;
                     const double apart = std::max(
                         length_in_image(at, camera.of_direction(a)), length_in_image(at, camera.of_direction(b)));
-                    const double wanted = std::round(std::log2(std::max(apart, 1e-6)));
-                    const int64_t l = std::clamp<int64_t>(int64_t(wanted), 0, levels - 1), row = which * levels + l;
+                    const double wanted = std::round(std::log2(apart));  // NaN and -inf are full resolution
+                    const int64_t l = wanted > 0 ? int64_t(std::min(wanted, double(levels - 1))) : 0;
+                    const int64_t row = which * levels + l;
                     level[size_t(count)] = {
                         pixels + starts[row], sizes[2 * row + 1], sizes[2 * row], 1.0f / float(int64_t(1) << l)};
                     view[size_t(count++)] = camera;
