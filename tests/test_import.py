@@ -16,7 +16,18 @@ from pipelines.cli import COMMANDS
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "data"}
-STAGES = {"capture", "segment", "clean", "transfer", "assemble", "metrics", "export", "register", "reconstruct", "detect"}
+STAGES = {
+    "capture",
+    "segment",
+    "clean",
+    "transfer",
+    "assemble",
+    "metrics",
+    "export",
+    "register",
+    "reconstruct",
+    "detect",
+}
 # Rooms from low to high: an import goes down, never up and never to a room of the same floor.
 FLOORS: dict[str, tuple[set[str], ...]] = {
     "avatar": (

@@ -125,9 +125,7 @@ def reconstruct(
         )
         mesh = taubin(mesh.with_vertices(swept.vertices), mean_of_neighbours(mesh), steps=1)
     progress("colours", 0.0)
-    return _finished(
-        mesh, hull, pyramids, config, consensus, problems, _numbers(usable, faults, consensus, pixel, cell)
-    )
+    return _finished(mesh, hull, pyramids, config, problems, _numbers(usable, faults, consensus, pixel, cell))
 
 
 def _finished(

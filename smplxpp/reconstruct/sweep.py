@@ -91,12 +91,14 @@ def sweep_scores(
 ) -> Float32[np.ndarray, "N K"]:
     """How well the photographs agree on a patch at each offset along the normal, at most 1.
 
-    It is -1 where fewer than two see it. A patch's samples are `level.coarseness` pixels apart, of the median of the views that see it.
+    It is -1 where fewer than two see it. A patch's samples are `level.coarseness` pixels apart, of the median of the
+    views that see it.
     """
     chosen = np.ascontiguousarray(seen.chosen(most_views, least_cosine=LEAST_COSINE))
-    none = (chosen < 0).all(axis=1)
+    looked = chosen >= 0
+    looked[~looked.any(axis=1)] = True
     taken = np.take_along_axis(seen.pixel, np.maximum(chosen, 0), axis=1)
-    pixel = np.where(none, 0.0, np.nanmedian(np.where((chosen < 0) & ~none[:, None], np.nan, taken), axis=1))
+    pixel = np.nanmedian(np.where(looked, taken, np.nan), axis=1)
     across = np.where(np.abs(normals[:, [2]]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangents = np.ascontiguousarray(normalize_rows(np.cross(across, normals)))
     scores = np.empty((len(points), len(offsets)), np.float32)

@@ -1,9 +1,9 @@
 """Which masks can be believed: silhouettes of one body agree with each other, and those that do not are named.
 
 A body's voxel lies within every true mask. With no bad mask, the hull's silhouette covers every mask; one mask that
-lacks an arm takes the arm from the hull, and all other views show arms that nothing explains. So the views are asked what they
-could explain if `k` masks were wrong at each voxel; while `k` must be above 0, the view goes whose word leaves most
-of the others' masks unexplained.
+lacks an arm takes the arm from the hull, and all other views show arms that nothing explains. So the views are asked
+what they could explain if `k` masks were wrong at each voxel; while `k` must be above 0, the view goes whose word
+leaves most of the others' masks unexplained.
 """
 
 from __future__ import annotations

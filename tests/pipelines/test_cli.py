@@ -87,7 +87,7 @@ def test_version(capsys):
 
 
 def test_unknown_commands_are_answered_with_the_known(capsys):
-    assert "known: build, register, inspect" in fails(capsys, "bild")
+    assert "known: build, register, reconstruct" in fails(capsys, "bild")
     assert "known: params convert" in fails(capsys, "params", "converd")
 
 

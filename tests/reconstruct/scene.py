@@ -62,9 +62,7 @@ def photograph(mesh: TriangleMesh, camera: Camera, name: str, *, plain: bool = F
     shape = (camera.height, fine, camera.width, fine)
     covered = maps.mask.reshape(shape).mean(axis=(1, 3))
     mean = color.reshape(*shape, 3).sum(axis=(1, 3)) / np.maximum(covered * fine**2, 1)[..., None]
-    return PhotoView(
-        name, camera, np.round(255 * mean).astype(np.uint8), np.round(255 * covered).astype(np.uint8)
-    )
+    return PhotoView(name, camera, np.round(255 * mean).astype(np.uint8), np.round(255 * covered).astype(np.uint8))
 
 
 @cache

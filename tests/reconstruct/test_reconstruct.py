@@ -62,7 +62,9 @@ def test_a_scene_of_another_size_and_place_gives_the_same_surface(found):
         views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
     moved = reconstruct(views, CONFIG)
     local = (moved.mesh.vertices - shift) @ rotation
-    assert np.abs(inside_dented(local)).mean() == pytest.approx(np.abs(inside_dented(found.mesh.vertices)).mean(), rel=0.2)
+    assert np.abs(inside_dented(local)).mean() == pytest.approx(
+        np.abs(inside_dented(found.mesh.vertices)).mean(), rel=0.2
+    )
 
 
 def test_bad_masks_are_left_out_with_a_warning():

@@ -67,9 +67,7 @@ def test_what_too_few_views_show_is_outside():
 
 
 def test_the_smallest_depths_come_in_order():
-    cameras = [
-        Camera(np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]), np.eye(4), SIZE, SIZE) for _ in range(3)
-    ]
+    cameras = [Camera(np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]), np.eye(4), SIZE, SIZE) for _ in range(3)]
     views = [Silhouette.of(view(disc(32, 32, r), c)) for r, c in zip((20, 10, 15), cameras, strict=True)]
     found = smallest_depths(views, np.array([[0, 0, 2.0]], np.float32), count=3)[0]
     assert found == pytest.approx([0.19, 0.29, 0.39], abs=0.02)
