@@ -1,0 +1,111 @@
+"""Where the search begins: poses, sizes and directions that lie near a surface as they stand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.body.standing_poses import standing_poses
+from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.register.kinematics import BodyState, Kinematics
+from smplxpp.core.surface_points import SurfacePoints, truncated_distance
+from smplxpp.register.locate.proxy import BodyProxy
+
+# Cost of a person half as high again as the mean one, metres.
+_STATURE_COST = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class StartPose:
+    """A body that was moved onto a surface.
+
+    Attributes:
+        name: of the pose. yaw: radians about +Y. state: one frame. cost: metres, lower is nearer.
+    """
+
+    name: str
+    yaw: float
+    state: BodyState
+    cost: float
+
+
+def rank_starts(
+    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, *, directions: int, keep: int
+) -> list[StartPose]:
+    """The best poses of every direction, best first.
+
+    Args:
+        directions: about the vertical axis, evenly. keep: how many starts, spread over the directions.
+    """
+    body = kinematics.body
+    low, high = _ends(surface.points[:, 1])
+    rise = _stature_direction(kinematics)
+    found: list[StartPose] = []
+    for name, vectors in standing_poses(body.joint_count):
+        rotations = matrix_from_rotvec(vectors)
+        state = _standing(kinematics, rotations)
+        points, normals = proxy.posed(kinematics, kinematics.posture(state, 0))
+        bottom, top = points[:, 1].min(), points[:, 1].max()
+        scale = (high - low) / (top - bottom)
+        middle = points.mean(axis=0)
+        points = (points - middle) * scale
+        points[:, 1] += low - points[:, 1].min()
+        for k in range(directions):
+            yaw = 2.0 * np.pi * k / directions
+            turn = matrix_from_rotvec(np.array([0.0, yaw, 0.0]))
+            there, facing = points @ turn.T, normals @ turn.T
+            there[:, [0, 2]] += surface.points[:, [0, 2]].mean(axis=0)
+            cost = truncated_distance(there, facing, surface) + _STATURE_COST * abs(np.log2(scale)) / np.log2(1.5)
+            found.append(StartPose(name, yaw, _placed(kinematics, rotations, yaw, scale, rise, there), cost))
+    return _spread(found, directions, keep)
+
+
+def _spread(found: list[StartPose], directions: int, keep: int) -> list[StartPose]:
+    """The best of each direction, in turns, so that no direction is left out by a lucky other."""
+    found = sorted(found, key=lambda start: start.cost)
+    by_yaw: dict[float, list[StartPose]] = {}
+    for start in found:
+        by_yaw.setdefault(start.yaw, []).append(start)
+    share = max(1, keep // (2 * directions))
+    chosen = [start for group in by_yaw.values() for start in group[:share]]
+    best = [start for start in found if start not in chosen][: max(0, keep - len(chosen))]
+    return sorted(chosen + best, key=lambda start: start.cost)
+
+
+def _standing(kinematics: Kinematics, rotations: np.ndarray) -> BodyState:
+    body = kinematics.body
+    return BodyState(
+        rotations[None].copy(), np.zeros((1, 3)), np.zeros(body.num_betas), np.zeros((1, body.num_expressions))
+    )
+
+
+def _placed(
+    kinematics: Kinematics, rotations: np.ndarray, yaw: float, scale: float, rise: np.ndarray, there: np.ndarray
+) -> BodyState:
+    """The same as a state: the size by the betas, the root turned, the middle where the points are."""
+    state = _standing(kinematics, rotations)
+    state.rotations[0, 0] = matrix_from_rotvec(np.array([0.0, yaw, 0.0])) @ rotations[0]
+    betas = np.clip((scale - 1.0) * rise, -3.0, 3.0)
+    return BodyState(state.rotations, there.mean(axis=0)[None], betas, state.expression)
+
+
+def centred(kinematics: Kinematics, proxy: BodyProxy, start: StartPose) -> BodyState:
+    """The state of a start with its points' middle at the place that the start says."""
+    points, _ = proxy.posed(kinematics, kinematics.posture(start.state, 0))
+    move = start.state.transl[0] - (points.mean(axis=0) - start.state.transl[0])
+    return BodyState(start.state.rotations, move[None], start.state.betas, start.state.expression)
+
+
+def _stature_direction(kinematics: Kinematics) -> Float64[np.ndarray, " B"]:
+    """The smallest betas that make the mean body twice as high."""
+    body = kinematics.body
+    top, bottom = np.argmax(body.v_template[:, 1]), np.argmin(body.v_template[:, 1])
+    slope = body.shapedirs[top, 1] - body.shapedirs[bottom, 1]
+    height = body.v_template[top, 1] - body.v_template[bottom, 1]
+    return height * slope / (slope @ slope)
+
+
+def _ends(heights: np.ndarray) -> tuple[float, float]:
+    return float(heights.min()), float(heights.max())
