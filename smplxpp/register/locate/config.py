@@ -1,0 +1,36 @@
+"""LocateConfig: every choice in the search for a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from smplxpp.core.validation import require_at_least
+
+
+@dataclass(frozen=True)
+class LocateConfig:
+    """How a body is searched for in a bare surface.
+
+    Attributes:
+        directions: that the person may face at first, evenly about the vertical axis.
+        starts: poses and directions that are followed; candidates: how many of them to the end, both facings among them.
+        coarse_points, fine_points: of the surface, drawn by area, for the search and for the fit.
+        dress_steps, finish_steps: Gauss-Newton steps of every candidate, and of the one that is chosen.
+        seed: of the drawn points.
+    """
+
+    directions: int = 12
+    starts: int = 24
+    candidates: int = 3
+    coarse_points: int = 600
+    fine_points: int = 6000
+    dress_steps: int = 8
+    finish_steps: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("directions", "starts", "candidates", "dress_steps", "finish_steps"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 1)
+        for name in ("coarse_points", "fine_points"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 100)
+        require_at_least("search for a body: seed", self.seed, 0)
