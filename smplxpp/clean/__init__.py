@@ -5,6 +5,7 @@ from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_part
 from smplxpp.clean.point_normals import estimate_normals
 from smplxpp.clean.poisson import PointSurface, PoissonConfig, surface_from_points
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
+from smplxpp.clean.scan_frame import ScanFrame, find_scan_frame
 from smplxpp.clean.simplify import Simplified, simplify
 from smplxpp.clean.smooth import ROUGH, Smoothed, roughness, smooth_if_rough
 from smplxpp.clean.units import METRES_PER_UNIT, check_human_scale, convert_points
@@ -20,6 +21,7 @@ __all__ = [
     "PointSurface",
     "PoissonConfig",
     "Sanitized",
+    "ScanFrame",
     "Simplified",
     "Smoothed",
     "WebConfig",
@@ -30,6 +32,7 @@ __all__ = [
     "drop_specks",
     "estimate_normals",
     "fill_pinholes",
+    "find_scan_frame",
     "find_webs",
     "loop_lengths",
     "roughness",

@@ -66,7 +66,6 @@ def joined(points: Float64[np.ndarray, "N 3"], normals: Float64[np.ndarray, "N 3
     return np.concatenate([points, TURN_M * normals], axis=1)
 
 
-
 def truncated_distance(
     points: Float64[np.ndarray, "N 3"], normals: Float64[np.ndarray, "N 3"], surface: SurfacePoints
 ) -> float:

@@ -13,7 +13,8 @@ class LocateConfig:
 
     Attributes:
         directions: that the person may face at first, evenly about the vertical axis.
-        starts: poses and directions that are followed; candidates: how many of them to the end, both facings among them.
+        starts: poses and directions that are followed. limbs_tried: of these, whose arms and legs are tried one by one.
+        candidates: of these, followed to the end.
         coarse_points, fine_points: of the surface, drawn by area, for the search and for the fit.
         dress_steps, finish_steps: Gauss-Newton steps of every candidate, and of the one that is chosen.
         seed: of the drawn points.
@@ -21,6 +22,7 @@ class LocateConfig:
 
     directions: int = 12
     starts: int = 24
+    limbs_tried: int = 8
     candidates: int = 3
     coarse_points: int = 600
     fine_points: int = 6000
@@ -29,7 +31,7 @@ class LocateConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("directions", "starts", "candidates", "dress_steps", "finish_steps"):
+        for name in ("directions", "starts", "limbs_tried", "candidates", "dress_steps", "finish_steps"):
             require_at_least(f"search for a body: {name}", getattr(self, name), 1)
         for name in ("coarse_points", "fine_points"):
             require_at_least(f"search for a body: {name}", getattr(self, name), 100)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from smplxpp.register.kinematics import BodyState, Kinematics, Posture
 from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.register.kinematics import BodyState, Kinematics, Posture
 from smplxpp.register.locate.proxy import BodyProxy
 from smplxpp.register.normal_equations import Columns, NormalEquations
 from smplxpp.register.priors import Priors
@@ -90,9 +90,7 @@ def _accumulate(
     count = len(jacobian)
     information = np.zeros((count, 3, 3))
     vector = np.zeros((count, 3))
-    matrix = weight[:, None, None] * (
-        _ALONG * np.eye(3) + (1.0 - _ALONG) * normal[:, :, None] * normal[:, None, :]
-    )
+    matrix = weight[:, None, None] * (_ALONG * np.eye(3) + (1.0 - _ALONG) * normal[:, :, None] * normal[:, None, :])
     pull = np.einsum("nxy,ny->nx", matrix, apart)
     for x in range(3):
         vector[:, x] = np.bincount(body, pull[:, x], minlength=count)

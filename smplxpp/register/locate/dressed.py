@@ -10,8 +10,8 @@ from jaxtyping import Float64, Int64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
-from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.locate.proxy import BodyProxy, Region, outer_vertices, regions
 from smplxpp.register.normal_equations import NormalEquations
 from smplxpp.register.robust import geman_mcclure

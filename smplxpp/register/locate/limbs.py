@@ -9,14 +9,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
+from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
 
 # Degrees: how far an arm is lowered from the T-pose, taken forwards, twisted, and bent at the elbow.
 _LOWERED, _FORWARDS, _TWISTED, _BENT = (-78, -48, -12, 30, 70), (0, -45, -85), (0, 65), (-8, -60, -110)
 # A leg: lifted forwards, and bent at the knee.
 _LIFTED, _KNEE = (15, 0, -25, -60, -90), (4, 40, 85)
+# Turns of the joints of a limb, one after the other.
+_Limb = tuple[list[Float64[np.ndarray, " 3"]], ...]
 _MIRROR = np.array([1.0, -1.0, -1.0])
 # A limb is exchanged for one that is nearer by this share of the whole distance.
 _BETTER = 0.005
@@ -53,8 +55,8 @@ def state_distance(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoi
     return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface)
 
 
-def _arms() -> list[tuple[list[Float64[np.ndarray, " 3"]], ...]]:
-    out = []
+def _arms() -> list[_Limb]:
+    out: list[_Limb] = []
     for lowered, forwards, twisted, bent in product(_LOWERED, _FORWARDS, _TWISTED, _BENT):
         if twisted and bent > -30:
             continue  # a straight arm looks the same
@@ -63,8 +65,5 @@ def _arms() -> list[tuple[list[Float64[np.ndarray, " 3"]], ...]]:
     return out
 
 
-def _legs() -> list[tuple[list[Float64[np.ndarray, " 3"]], ...]]:
-    return [
-        ([np.array([lifted, 0.0, -5.0])], [np.array([knee, 0.0, 0.0])])
-        for lifted, knee in product(_LIFTED, _KNEE)
-    ]
+def _legs() -> list[_Limb]:
+    return [([np.array([lifted, 0.0, -5.0])], [np.array([knee, 0.0, 0.0])]) for lifted, knee in product(_LIFTED, _KNEE)]

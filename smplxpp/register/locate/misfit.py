@@ -38,7 +38,9 @@ class Misfit:
         return 0.5 * (self.surface + self.bare)
 
 
-def misfit(kinematics: Kinematics, outer: OuterBody, proxy: BodyProxy, surface: SurfacePoints, posture: Posture) -> Misfit:
+def misfit(
+    kinematics: Kinematics, outer: OuterBody, proxy: BodyProxy, surface: SurfacePoints, posture: Posture
+) -> Misfit:
     """Measure a posture against a surface."""
     found = outer.match(outer.mesh(posture), surface)
     tight = np.isin(found.region, _BARE)

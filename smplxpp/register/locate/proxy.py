@@ -1,4 +1,4 @@
-"""What of a body is compared with a bare surface: some of its points, each with its normal and what usually covers it."""
+"""What of a body is compared with a bare surface: points, each with its normal and what usually covers it."""
 
 from __future__ import annotations
 

@@ -29,8 +29,6 @@ Progress = Callable[[str, float], None]
 # How far surface and body attract each other, metres, step by step.
 _FIRST, _AFTER_LIMBS = np.geomspace(0.3, 0.15, 6), np.geomspace(0.2, 0.08, 8)
 _NEARER, _DRESSING = np.geomspace(0.1, 0.04, 6), (0.04, 0.02)
-# Of all that was followed so many go on to have their limbs tried, half of them of each facing.
-_LIMBS_TRIED = 8
 # Millimetres that a squared deviation of the pose from the prior counts as.
 _POSE_COST = 0.05
 _LIMBS = ("wrist", "ankle", "elbow", "knee")
@@ -72,7 +70,12 @@ class Search:
     """
 
     def __init__(
-        self, kinematics: Kinematics, mesh: TriangleMesh, config: LocateConfig, pinned: Pinned | None, progress: Progress
+        self,
+        kinematics: Kinematics,
+        mesh: TriangleMesh,
+        config: LocateConfig,
+        pinned: Pinned | None,
+        progress: Progress,
     ) -> None:
         body = kinematics.body
         self.kinematics, self.config, self.pinned, self.progress = kinematics, config, pinned, progress
@@ -101,7 +104,7 @@ class Search:
             followed.append((self._distance(state), start.name, state))
             self.progress("poses", (k + 1) / len(starts))
         followed.sort(key=lambda one: one[0])
-        chosen, tried = _of_both_facings(followed, _LIMBS_TRIED), []
+        chosen, tried = _of_both_facings(followed, self.config.limbs_tried), []
         for k, (_, name, state) in enumerate(chosen):
             state = try_limbs(self.kinematics, self.few, self.coarse, state)
             state = self._drawn(state, self.few, self.coarse, _AFTER_LIMBS)

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 
 from smplxpp.body.standing_poses import standing_poses
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
+from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
 
 # Cost of a person half as high again as the mean one, metres.

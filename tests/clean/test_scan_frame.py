@@ -1,0 +1,65 @@
+"""Units and upward axis of a scan are found from its shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body
+from smplxpp.body.standing_poses import standing_poses
+from smplxpp.clean.scan_frame import find_scan_frame
+from smplxpp.clean.units import METRES_PER_UNIT, convert_points
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+
+
+@pytest.fixture(scope="module")
+def person() -> TriangleMesh:
+    """The mean body with lowered arms, its left foot before the other, facing 50 degrees to her left."""
+    body = load_body()
+    pose = dict(standing_poses(body.joint_count))["arms lowered, legs walking"].copy()
+    pose[0] = [0.0, np.radians(50.0), 0.0]
+    params = BodyParams.from_full_pose(
+        pose[None], betas=np.zeros((1, 1)), expression=np.zeros((1, 1)), transl=np.zeros((1, 3))
+    )
+    return body.mesh(body.forward(params).vertices[0])
+
+
+@pytest.mark.parametrize(("units", "up"), [("cm", "z"), ("mm", "-x")])
+def test_units_and_axis_are_found_back(person, units, up):
+    axes = convert_points(np.eye(3), up=up)
+    filed = person.vertices @ axes.T / METRES_PER_UNIT[units]
+    assert np.allclose(convert_points(filed, units=units, up=up), person.vertices)
+    found = find_scan_frame(filed, person.faces)
+    assert (found.units, found.up, found.sure) == (units, up, True)
+    assert units in found.said
+    assert up in found.said
+
+
+def test_what_is_stated_is_kept(person):
+    found = find_scan_frame(person.vertices, person.faces, units="cm", up="-z")
+    assert (found.units, found.up) == ("cm", "-z")
+    assert "stated units cm" in found.said
+
+
+def test_stray_points_and_faces_that_point_inward_change_nothing(person):
+    vertices = np.concatenate([person.vertices, [[1e6, 0, 0], [np.nan, 0, 0]]])
+    found = find_scan_frame(vertices, person.faces[:, ::-1], up="y")
+    assert (found.units, found.up) == ("m", "y")
+
+
+def test_a_size_that_is_nobodys_in_any_unit_is_refused(person):
+    with pytest.raises(InputError, match="person 0.9 to 2.5 m high"):
+        find_scan_frame(person.vertices * 7.0, person.faces, up="y")
+
+
+def test_no_surface_is_refused(person):
+    with pytest.raises(InputError, match="a surface with faces"):
+        find_scan_frame(person.vertices, person.faces[:0])
+
+
+def test_a_leaning_person_is_upright_enough(person):
+    lean = matrix_from_rotvec(np.radians([15.0, 0.0, 5.0]))
+    assert find_scan_frame(person.vertices @ lean.T, person.faces).up == "y"

@@ -1,0 +1,120 @@
+"""A body is found in a bare surface, wherever it stands and whichever way it faces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body, load_params
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.register.locate import LocateConfig, locate_body
+
+PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
+QUICK = LocateConfig(
+    directions=6,
+    starts=6,
+    limbs_tried=2,
+    candidates=2,
+    coarse_points=400,
+    fine_points=1200,
+    dress_steps=5,
+    finish_steps=5,
+)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def scan() -> TriangleMesh:
+    return read_mesh(PERSON / "scans" / "scan_000000.ply").mesh
+
+
+@pytest.fixture(scope="module")
+def truth(body) -> np.ndarray:
+    params = load_params(PERSON / "params" / "params.npz", body=body).frame(0)
+    return body.forward(params).vertices[0]
+
+
+@pytest.fixture(scope="module")
+def located(body, scan):
+    return locate_body(body, scan, config=QUICK)
+
+
+def _error(body, located, truth) -> float:
+    return float(np.linalg.norm(body.forward(located.params).vertices[0] - truth, axis=1).mean())
+
+
+def test_the_fixtures_person_is_found_under_her_clothes(body, located, truth):
+    assert _error(body, located, truth) < 0.015
+    assert located.confidence > 0.9
+    assert located.problems == ()
+
+
+def test_both_facings_were_followed_and_the_best_comes_first(located):
+    facings = np.radians([one.facing_degrees for one in located.candidates])
+    assert np.cos(facings - facings[0]).min() < -0.5
+    assert located.candidates[0].cost == min(one.cost for one in located.candidates)
+
+
+def test_she_is_found_as_well_after_she_has_turned_and_moved_and_her_faces_point_inward(body, scan, truth):
+    turn, move = matrix_from_rotvec(np.array([0.0, 2.4, 0.0])), np.array([3.0, 0.5, -2.0])
+    found = locate_body(body, TriangleMesh(scan.vertices @ turn.T + move, scan.faces[:, ::-1]), config=QUICK)
+    assert _error(body, found, truth @ turn.T + move) < 0.015
+
+
+def test_the_same_seed_finds_the_same_body(body, scan, located):
+    again = locate_body(body, scan, config=QUICK)
+    assert np.array_equal(again.params.full_pose, located.params.full_pose)
+    assert np.array_equal(again.params.betas, located.params.betas)
+
+
+def test_landmarks_overrule_the_surface(body, scan, truth):
+    """Somebody says that she faces backwards: that is believed."""
+    back = {"nose": [0.0, 1.45, -0.15], "left_wrist": [-0.5, 0.95, 0.0], "right_wrist": [0.5, 0.95, 0.0]}
+    found = locate_body(body, scan, landmarks={k: np.array(v) for k, v in back.items()}, config=QUICK)
+    assert abs(abs(found.candidates[0].facing_degrees) - 180.0) < 30.0
+
+
+def test_a_landmark_that_no_body_has_is_refused(body, scan):
+    with pytest.raises(InputError, match="third_elbow"):
+        locate_body(body, scan, landmarks={"third_elbow": np.zeros(3)}, config=QUICK)
+
+
+def test_labels_of_a_labeller_are_asked_for_once_the_body_stands(body, scan, truth):
+    labels = np.load(PERSON / "scans" / "scan_000000_labels.npz")["label"].astype(int) - 1
+    asked = []
+
+    def labeller(params):
+        asked.append(params)
+        corner = labels[scan.faces]
+        return np.where((corner == corner[:, :1]).all(axis=1), corner[:, 0], -1)
+
+    found = locate_body(body, scan, labeller=labeller, config=QUICK)
+    assert len(asked) == 1
+    assert _error(body, found, truth) < 0.010
+
+
+def test_a_box_is_nobody(body):
+    corners = np.array([[x, y, z] for x in (0, 0.6) for y in (0, 1.7) for z in (0, 0.4)], dtype=np.float64)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    with pytest.raises(InputError, match="one whole person"):
+        locate_body(body, TriangleMesh(corners, faces), config=QUICK)
+
+
+def test_a_person_in_centimetres_is_refused_with_the_options_named(body, scan):
+    with pytest.raises(InputError, match="--units"):
+        locate_body(body, scan.with_vertices(100 * scan.vertices), config=QUICK)
+
+
+def test_colours_of_another_mesh_are_refused(body, scan):
+    with pytest.raises(InputError, match="colours"):
+        locate_body(body, scan, colors=np.zeros((3, 3), dtype=np.uint8), config=QUICK)
