@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
+from pipelines.figures import contact_sheet
+from pipelines.figures.keypoints import draw_keypoints
 from smplxpp.capture import Capture
 from smplxpp.capture.images import read_alpha, read_color
 from smplxpp.capture.keypoint_files import read_keypoints
@@ -115,6 +118,29 @@ def problems_of(found: dict[str, DetectedCamera], held_out: Iterable[str] = ()) 
     if apart:
         out.append(f"held-out cameras {', '.join(apart)}: their keypoints are for measuring, training never reads them")
     return tuple(out)
+
+
+def detection_sheet(
+    capture: Capture, found: Mapping[str, DetectedCamera], *, height: int = 480, most: int = 16
+) -> UInt8[np.ndarray, "H W 3"]:
+    """One photograph a camera, with its points: the frame that the most cameras have, of at most `most` cameras."""
+    import PIL.Image
+
+    frames = np.concatenate([one.keypoints.frames for one in found.values()])
+    numbers, counts = np.unique(frames, return_counts=True)
+    frame = int(numbers[counts.argmax()])
+    pictures, captions = [], []
+    for name, one in found.items():
+        (rows,) = np.nonzero(one.keypoints.frames == frame)
+        if not len(rows) or len(pictures) == most:
+            continue
+        image = read_color(capture.required_file(name, frame))
+        scale = height / image.height
+        small = image.resize((max(round(scale * image.width), 1), height), PIL.Image.Resampling.LANCZOS)
+        points, sure = scale * one.keypoints.points[rows[0]], one.keypoints.confidence[rows[0]]
+        pictures.append(draw_keypoints(np.asarray(small), one.keypoints.names, points, sure))
+        captions.append(f"{name}, frame {frame}")
+    return contact_sheet(pictures, captions=captions)
 
 
 class _CameraWork:

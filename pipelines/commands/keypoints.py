@@ -86,16 +86,20 @@ class KeypointsDetect:
     """Frames to look at: numbers and ranges START:STOP:STEP with commas between; by default all."""
     masks: OptionalPath = None
     """Folder of mattes to take instead of the capture's own masks; the person is looked for in the mask's box."""
+    sheet: OptionalPath = None
+    """Picture to write (.png or .jpg): a photograph of each camera with its points."""
     json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> dict:
         """Detect; returns what was found of each camera."""
-        from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
+        from pipelines.captures.detect_keypoints import detect_keypoints, detection_sheet, problems_of
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import counted_progress
+        from pipelines.figures import encode_jpeg, encode_png
         from pipelines.runs.places import keep_out_of_capture, same_place
         from smplxpp.capture import open_capture
+        from smplxpp.core.files.atomic import atomic_write_bytes
         from smplxpp.detect import load_detector
 
         if not same_place(self.out, self.capture / "keypoints"):
@@ -103,6 +107,8 @@ class KeypointsDetect:
         capture = open_capture(self.capture, masks=self.masks, cache_bytes=0)
         names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
         frames = selected_frames(self.frames, capture)
+        if self.sheet is not None and self.sheet.suffix.lower() not in (".png", ".jpg"):
+            raise InputError("--sheet", expected="the name of a .png or .jpg", received=str(self.sheet))
         detector = load_detector(self.detector)
         with counted_progress("images", enabled=not self.json) as progress:
             found = detect_keypoints(
@@ -113,6 +119,9 @@ class KeypointsDetect:
                 frames=frames,
                 progress=progress,
             )
+        if self.sheet is not None:
+            encode = encode_png if self.sheet.suffix.lower() == ".png" else encode_jpeg
+            atomic_write_bytes(self.sheet, encode(detection_sheet(capture, found)))
         summary = {}
         for name, one in found.items():
             seen = float((one.people > 0).mean())

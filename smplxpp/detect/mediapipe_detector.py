@@ -28,8 +28,12 @@ _LEAST_SIDE = 16
 # What is added about a box, and about a person who is painted over to find the next, as a share of the longer side.
 _MARGIN, _COVER = 0.15, 0.08
 _WRISTS = {"left_hand": 15, "right_hand": 16}
-_NOSE = 0
+_NOSE, _EYES, _EARS, _MOUTH = 0, [2, 5], (7, 8), [9, 10]
+# Distance of the ears, in that of eyes and mouth, from which a head that shows its back is not one in profile.
+_BEHIND = 0.3
 _STDERR = 2
+# Raised when the same answer of MediaPipe is read otherwise, so that what was kept is detected anew.
+_RULES = 2
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class MediaPipeDetector:
                 min_tracking_confidence=self.config.least_confidence,
             )
             self._graph.process(np.zeros((_LEAST_SIDE, _LEAST_SIDE, 3), dtype=np.uint8))
-        self.identity = f"mediapipe {package.__version__} holistic full, {self.config}"
+        self.identity = f"mediapipe {package.__version__} holistic full, rules {_RULES}, {self.config}"
         named = (*MEDIAPIPE_POSE, *LEFT_HAND, *RIGHT_HAND, *FACE)
         self._kept = [k for k, name in enumerate(named) if name is not None]
         self.names = tuple(name for name in named if name is not None)
@@ -112,6 +116,8 @@ class MediaPipeDetector:
             hand = _rows(getattr(result, f"{name}_landmarks"))
             parts.append(np.zeros((count, 3)) if hand is None else _seen_as(hand, pose[_WRISTS[name], 2]))
         face = _rows(result.face_landmarks)
+        if face is not None and _from_behind(pose[:, :2] * (image.shape[1], image.shape[0])):
+            face = None  # it sees faces in hair
         if face is not None:
             face = _seen_as(np.stack([face[list(own)].mean(axis=0) for own in MEDIAPIPE_FACE]), pose[_NOSE, 2])
         parts.append(np.zeros((len(FACE), 3)) if face is None else face)
@@ -174,6 +180,13 @@ def _rows(landmarks: Any) -> Float64[np.ndarray, "N 3"] | None:
     if landmarks is None:
         return None
     return np.array([(one.x, one.y, one.visibility) for one in landmarks.landmark], dtype=np.float64)
+
+
+def _from_behind(pose: Float64[np.ndarray, "N 2"]) -> bool:
+    """Whether a head, in pixels, shows its back: with its eyes above its mouth the left ear is on the left."""
+    across = pose[_EARS[0]] - pose[_EARS[1]]
+    up = pose[_EYES].mean(axis=0) - pose[_MOUTH].mean(axis=0)
+    return bool(across[0] * up[1] - across[1] * up[0] > _BEHIND * (up @ up))
 
 
 def _seen_as(rows: Float64[np.ndarray, "N 3"], visibility: float) -> Float64[np.ndarray, "N 3"]:
