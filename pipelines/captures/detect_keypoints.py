@@ -129,7 +129,8 @@ def detection_sheet(
     frames = np.concatenate([one.keypoints.frames for one in found.values()])
     numbers, counts = np.unique(frames, return_counts=True)
     frame = int(numbers[counts.argmax()])
-    pictures, captions = [], []
+    pictures: list[np.ndarray] = []
+    captions: list[str] = []
     for name, one in found.items():
         (rows,) = np.nonzero(one.keypoints.frames == frame)
         if not len(rows) or len(pictures) == most:

@@ -32,13 +32,14 @@ class ScanViews:
     Attributes:
         count: pictures, on one turn about the scan's upright axis.
         height: of a picture, pixels.
-        relief: of light and shadow over a scan with colours; without colours it is all there is to see.
+        relief: of light and shadow over a scan with colours, low since noise of the surface shows in it; without colours
+            it is all there is to see.
         least_views: that have to agree on a point.
     """
 
     count: int = 12
     height: int = 720
-    relief: float = 0.6
+    relief: float = 0.3
     least_views: int = 3
 
     def __post_init__(self) -> None:
