@@ -32,8 +32,8 @@ class ScanViews:
     Attributes:
         count: pictures, on one turn about the scan's upright axis.
         height: of a picture, pixels.
-        relief: of light and shadow over a scan with colours, low since noise of the surface shows in it; without colours
-            it is all there is to see.
+        relief: of light and shadow over a scan with colours, low since noise of the surface shows in it; without
+            colours it is all there is to see.
         least_views: that have to agree on a point.
     """
 

@@ -103,6 +103,22 @@ def test_the_person_is_cut_out(detector):
     assert (matte & mask).sum() / (matte | mask).sum() > 0.9
 
 
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 180.0])
+@pytest.mark.parametrize(("turn", "behind"), [(0.0, False), (60.0, False), (85.0, False), (120.0, True), (180.0, True)])
+def test_a_head_from_behind_has_its_left_ear_on_the_left(turn, behind, degrees):
+    """A head is turned about its axis by `turn`; the camera is rolled by `degrees`."""
+    from smplxpp.detect.mediapipe_detector import _from_behind
+
+    head = np.zeros((33, 3))  # x to the image's right, y down, z towards the camera
+    head[7], head[8] = (75, 0, 0), (-75, 0, 0)
+    head[2], head[5] = (32, -20, 70), (-32, -20, 70)
+    head[9], head[10] = (25, 40, 70), (-25, 40, 70)
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    seen = (head @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T)[:, :2]
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    assert _from_behind(seen @ np.array([[c, -s], [s, c]]).T) == behind
+
+
 def test_what_is_missing_is_said_with_the_command_to_type(monkeypatch):
     from smplxpp.detect.mediapipe_detector import MediaPipeDetector
     from smplxpp.detect.person_mask import PersonSegmenter
