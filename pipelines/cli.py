@@ -38,6 +38,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "ReconstructCommand",
         "photographs, cameras and masks of a capture in; a closed, coloured surface of one frame or of all out",
     ),
+    "label": (
+        "pipelines.commands.label",
+        "Label",
+        "labels and landmarks of a run's scan, corrected by hand in the browser and kept",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",

@@ -50,6 +50,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"synth"},
         {"captures"},
         {"ablation"},
+        {"viewer"},
         {"commands"},
         {"cli"},
     ),
@@ -59,6 +60,7 @@ NARROW = {
     "avatar.evaluation": {"training", "baselines"},
     "pipelines.synth": {"runs", "stages", "report"},
     "pipelines.captures": {"stages", "synth"},
+    "pipelines.viewer": {"report", "synth", "captures", "ablation"},
 }
 
 

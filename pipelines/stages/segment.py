@@ -66,6 +66,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             with values_of(build.run / SCAN):
                 of_vertices = labels[source_vertex]
             result = segment_scan(scan, vertex_labels=of_vertices)
+    before = result
     result = _corrected(build.run, scan, result)
     assert result.corrected is not None
     np.savez(
@@ -74,6 +75,8 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         confidence=result.confidence,
         seen=result.seen,
         corrected=result.corrected,
+        labels_before_hand=before.face_labels,
+        confidence_before_hand=before.confidence,
     )
     write_ply(
         folder / "labels.ply",

@@ -92,9 +92,11 @@ def stroked_faces(
     line, seeds, under = line[there], seeds[there], under[there]
     if not len(line):
         return seeds
-    distance, nearest = cKDTree(line).query(surface.centers, distance_upper_bound=radius)
-    near = np.flatnonzero(np.isfinite(distance))
-    facing = np.einsum("nx,nx->n", surface.mesh.face_normals[near], under[nearest[near]])
+    around = (surface.centers >= line.min(axis=0) - radius) & (surface.centers <= line.max(axis=0) + radius)
+    near = np.flatnonzero(around.all(axis=1))
+    distance, nearest = cKDTree(line).query(surface.centers[near], distance_upper_bound=radius)
+    near, nearest = near[np.isfinite(distance)], nearest[np.isfinite(distance)]
+    facing = np.einsum("nx,nx->n", surface.mesh.face_normals[near], under[nearest])
     kept = np.union1d(near[facing > _FACING], seeds)
     inner, start = surface.steps[kept][:, kept], np.unique(np.searchsorted(kept, seeds))
     along = dijkstra(inner, directed=False, indices=start, limit=_DETOUR * radius, min_only=True)
