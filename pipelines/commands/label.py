@@ -31,6 +31,8 @@ class Label:
     """Address to listen at. 0.0.0.0 lets every machine of the network in, without a password."""
     no_browser: bool = False
     """Open no browser, print the address alone."""
+    json: bool = False
+    """Print what was written at the end as JSON; the address goes to the log."""
 
     def run(self) -> dict:
         """Serve the window until Ctrl-C, then write what was not saved."""
@@ -39,11 +41,11 @@ class Label:
 
         require_between("option port", self.port, 1, _LARGEST_PORT)
         window = open_window(open_session(self.run_folder), self.run_folder, host=self.host, port=self.port)
-        console = Console()
+        console = Console(stderr=self.json)
         console.print(f"{window.address}  (Ctrl-C ends it)", highlight=False)
         try:
             if not self.no_browser:
-                webbrowser.open(window.address)
+                webbrowser.open_new_tab(window.address)
             wait()
         except KeyboardInterrupt:
             pass
@@ -51,7 +53,7 @@ class Label:
             written = leave(window)
         if written:
             console.print(f"written, as it was not saved: {', '.join(written)}", highlight=False)
-        return {}
+        return {"run": str(self.run_folder), "written": written}
 
 
 def wait() -> None:

@@ -196,7 +196,7 @@ def test_the_command_serves_until_it_is_interrupted_and_keeps_what_was_not_saved
 
     monkeypatch.setattr("pipelines.viewer.window.open_window", keep)
     monkeypatch.setattr(label_command, "wait", interrupted)
-    monkeypatch.setattr("webbrowser.open", addresses.append)
+    monkeypatch.setattr("webbrowser.open_new_tab", addresses.append)
     port = free_port()
     assert main(["label", str(run), "--port", str(port)]) == 0
     printed = capsys.readouterr().out
