@@ -45,6 +45,9 @@ class ReconstructCommand:
     """Views that may say of a point that it is outside: 1 for masks with holes. The surface grows with it."""
     hull_only: bool = False
     """Take the silhouettes' surface and do not compare the photographs."""
+    mesh: OptionalPath = None
+    """Mesh of the frame by NeuS2, Instant-NGP or another program, which is taken in the place of ours; the masks tell
+    whether it lies in the cameras' world or in the trainer's unit cube."""
     force: bool = False
     """Reconstruct anew even if the stage stands."""
     no_report: bool = False
@@ -99,6 +102,8 @@ class ReconstructCommand:
             require_positive("option cell", self.cell)
         if self.masks is not None and not self.masks.is_dir():
             raise InputError("option masks", expected="an existing folder", received=str(self.masks))
+        if self.mesh is not None and not self.mesh.is_file():
+            raise InputError("option mesh", expected="an existing file", received=str(self.mesh))
         frames = None
         if self.frame.strip() != "all":
             frames = selected_frames(self.frame, open_capture(self.capture, protocol=self.protocol))
@@ -111,6 +116,7 @@ class ReconstructCommand:
             refine=not self.hull_only,
             cell_mm=self.cell,
             dissent=self.dissent,
+            mesh=self.mesh,
         )
 
     def _report(self, record: StageRecord) -> Path:

@@ -8,7 +8,9 @@ from pathlib import Path
 from pipelines.stages.reconstruct_config import ReconstructInputs
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_json
 from smplxpp.reconstruct import PhotoView
+from smplxpp.reconstruct.neus2 import UnitCube
 
 _NAMED = 6
 
@@ -133,3 +135,14 @@ def photograph_digests(capture: Capture, cameras: tuple[str, ...], frames: tuple
         "capture/cameras": rig.hexdigest(),
         "capture/names and sizes of images and masks": files.hexdigest(),
     }
+
+
+def unit_cube_of(root: Path) -> UnitCube | None:
+    """The unit cube that a capture's transform.json names for its trainer; None where it names none."""
+    for path in sorted(root.glob("transform*.json")):
+        content = as_object(read_json(path), subject=f"file {path}")
+        if "scale" in content and "offset" in content:
+            offset = as_numbers(content["offset"], (3,), subject=f"file {path}: offset")
+            scale = as_number(content["scale"], subject=f"file {path}: scale")
+            return UnitCube(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
+    return None

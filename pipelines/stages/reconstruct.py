@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.runs.checks import Check
+from pipelines.runs.digests import sha256_file
 from pipelines.runs.gates import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
@@ -21,21 +22,27 @@ from pipelines.stages.photographed import (
     open_photographs,
     photograph_digests,
     photographs,
+    unit_cube_of,
     usable_cameras,
     usable_frames,
 )
 from pipelines.stages.reconstruct_config import ReconstructInputs, save_reconstruct
 from smplxpp.capture import Capture
+from smplxpp.clean import sanitize
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.json_values import jsonable
-from smplxpp.core.mesh_files.mesh_io import write_ply
-from smplxpp.reconstruct import ReconstructConfig, Reconstruction, reconstruct
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
+from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct
 from smplxpp.reconstruct.agreement import silhouette_agreement
+from smplxpp.reconstruct.neus2 import mesh_in_world
+from smplxpp.reconstruct.views import usable_views
 
 Report = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
+Maker = Callable[..., Reconstruction]
+"""`make(views, progress=...)`: the surface of a moment."""
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
 
 
@@ -61,18 +68,22 @@ def reconstruct_capture(
     config = ReconstructConfig(
         cell=None if inputs.cell_mm is None else 1e-3 * inputs.cell_mm, dissent=inputs.dissent, refine=inputs.refine
     )
+    digests = photograph_digests(capture, cameras, frames)
+    if inputs.mesh is not None:
+        if len(frames) != 1:
+            raise InputError("--mesh", expected="one --frame, the mesh's", received=f"{len(frames)} frames")
+        digests["mesh"] = sha256_file(inputs.mesh)
     stage = Stage(
         name=RECONSTRUCT_STAGE,
         config={"reconstruct": config, "frames": frames, "cameras": cameras},
-        inputs=photograph_digests(capture, cameras, frames),
+        inputs=digests,
         code=(__name__,),
         resumable=True,
     )
     save_reconstruct(run, inputs)
     state = run / stage.work_name
-    work = partial(
-        _work, state=state, capture=capture, cameras=cameras, frames=frames, config=config, progress=progress
-    )
+    make = partial(_surface, config=config) if inputs.mesh is None else partial(_adopted, inputs=inputs)
+    work = partial(_work, state=state, capture=capture, cameras=cameras, frames=frames, make=make, progress=progress)
     return run_stage(run, stage, work, force=force)
 
 
@@ -83,7 +94,7 @@ def _work(
     capture: Capture,
     cameras: tuple[str, ...],
     frames: tuple[int, ...],
-    config: ReconstructConfig,
+    make: Maker,
     progress: Report,
 ) -> StageOutput:
     """Write `scan_FFFFFF.ply`, `scan_FFFFFF.npz` of every frame, and `reconstruction.json`."""
@@ -98,7 +109,7 @@ def _work(
         made = state / f"frame_{frame:06d}"
         if not made.is_dir():
             try:
-                _make_frame(made, capture, cameras, frame, config, told)
+                _make_frame(made, capture, cameras, frame, make, told)
             except InputError as error:
                 if len(frames) == 1:
                     raise
@@ -127,10 +138,10 @@ def _work(
 
 
 def _make_frame(
-    made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, config: ReconstructConfig, progress: Report
+    made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: Report
 ) -> None:
     views, problems = photographs(capture, cameras, frame)
-    result = reconstruct(views, config, progress=progress)
+    result = make(views, progress=progress)
     agreement = silhouette_agreement(result.mesh, [view for view in views if view.name in result.numbers["views"]])
     numbers = {
         **result.numbers,
@@ -140,6 +151,23 @@ def _make_frame(
     with atomic_folder(made) as temporary:
         save_surface(temporary / "scan", result)
         (temporary / "numbers.json").write_text(json.dumps(jsonable(numbers)) + "\n")
+
+
+def _surface(views: list[PhotoView], *, config: ReconstructConfig, progress: Report) -> Reconstruction:
+    return reconstruct(views, config, progress=progress)
+
+
+def _adopted(views: list[PhotoView], *, inputs: ReconstructInputs, progress: Report) -> Reconstruction:
+    """Another program's surface, in the cameras' world."""
+    assert inputs.mesh is not None
+    progress("masks", 0.0)
+    raw = read_raw_mesh(inputs.mesh)
+    usable, _ = usable_views(views)
+    mesh, space, shares = mesh_in_world(sanitize(raw.vertices, raw.faces).mesh, usable, unit_cube_of(inputs.capture))
+    progress("colours", 0.0)
+    result = adopt_surface(mesh, views)
+    result.numbers.update(space=space, agreement_by_space=shares)
+    return result
 
 
 def save_surface(path: Path, result: Reconstruction) -> None:

@@ -16,7 +16,7 @@ from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
 
 log = logging.getLogger(__name__)
-_PATHS = ("capture", "masks")
+_PATHS = ("capture", "masks", "mesh")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class ReconstructInputs:
         protocol: name of the capture's files that are read, None without one.
         refine: compare the photographs; False: the silhouettes alone.
         cell_mm: of the grid; None: by the photographs' resolution.
+        mesh: another program's surface of the one frame, which is taken in the place of ours.
         dissent: views that may say of a point that it is outside.
     """
 
@@ -42,6 +43,7 @@ class ReconstructInputs:
     refine: bool = True
     cell_mm: float | None = None
     dissent: int = 0
+    mesh: Path | None = None
 
 
 def save_reconstruct(run: Path, inputs: ReconstructInputs) -> None:

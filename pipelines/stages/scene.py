@@ -9,6 +9,7 @@ from pathlib import Path
 from avatar.data.views import read_views
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import (
+    RECONSTRUCT_STAGE,
     REFINE_STAGE,
     REFINED_CAMERAS,
     REFINED_PARAMS,
@@ -38,6 +39,7 @@ from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
 
 REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
+RECONSTRUCT_ANEW = "reconstruct without them (smplxpp reconstruct --hold-out, or the capture's split) and build anew"
 REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
 
 
@@ -176,6 +178,8 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
     frames = [number for number in capture.splits.train_frames if number in seen]
     built = load_build(run)
+    if built is not None and lies_in(built[0].scan, run / RECONSTRUCT_STAGE):
+        refuse_seen(run, (RECONSTRUCT_STAGE,), capture.splits, anew=RECONSTRUCT_ANEW)
     built_frame = built[0].frame if built is not None and built[0].frame in frames else None
     frame = frames[0] if built_frame is None else built_frame
     for name in capture.splits.train_cameras:

@@ -5,7 +5,7 @@
 """
 
 from smplxpp.reconstruct.config import ReconstructConfig, SweepLevel
-from smplxpp.reconstruct.reconstruct import Reconstruction, reconstruct
+from smplxpp.reconstruct.reconstruct import Reconstruction, adopt_surface, reconstruct
 from smplxpp.reconstruct.views import PhotoView
 
-__all__ = ["PhotoView", "ReconstructConfig", "Reconstruction", "SweepLevel", "reconstruct"]
+__all__ = ["PhotoView", "ReconstructConfig", "Reconstruction", "SweepLevel", "adopt_surface", "reconstruct"]

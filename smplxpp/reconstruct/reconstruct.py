@@ -124,8 +124,38 @@ def reconstruct(
             mesh, pyramids, level, inside, most_views=config.most_views, smoothness=config.smoothness
         )
         mesh = taubin(mesh.with_vertices(swept.vertices), mean_of_neighbours(mesh), steps=1)
+    status, _ = solid_status(mesh)
+    if status != "NoError":
+        raise InputError("reconstructed surface", expected="a closed manifold", received=f"manifold3d: {status}")
     progress("colours", 0.0)
     return _finished(mesh, hull, pyramids, config, problems, _numbers(usable, faults, consensus, pixel, cell))
+
+
+def adopt_surface(
+    mesh: TriangleMesh, views: Sequence[PhotoView], config: ReconstructConfig | None = None
+) -> Reconstruction:
+    """Take another program's surface in the cameras' world as the reconstruction: seen, confidence and colours.
+
+    It stays as it is; where manifold3d does not call it a closed manifold, `problems` says so.
+
+    Raises:
+        InputError: as `reconstruct`, but masks that disagree with each other are not asked about.
+    """
+    config = config or ReconstructConfig()
+    usable, faults = usable_views(views)
+    silhouettes = [Silhouette.of(view) for view in usable]
+    problems = [f"mask of {name} left out: {why}" for name, why in faults.items()]
+    status, _ = solid_status(mesh)
+    if status != "NoError":
+        problems.append(f"the mesh is no closed manifold (manifold3d: {status}); `smplxpp build` repairs what it needs")
+    numbers = {
+        "views": [view.name for view in usable],
+        "left_out": faults,
+        "explained": {},
+        "pixel_mm": 1e3 * pixel_footprint(silhouettes, mesh.vertices.mean(axis=0)),
+        "cell_mm": 0.0,
+    }
+    return _finished(mesh, mesh, Pyramids.of(usable), config, problems, numbers)
 
 
 def _finished(
@@ -136,14 +166,8 @@ def _finished(
     problems: list[str],
     numbers: dict[str, Any],
 ) -> Reconstruction:
-    """The surface with its colours and what is known of it.
-
-    Raises:
-        InputError: a surface that is not closed.
-    """
+    """The surface with its colours and what is known of it."""
     status, genus = solid_status(mesh)
-    if status != "NoError":
-        raise InputError("reconstructed surface", expected="a closed manifold", received=f"manifold3d: {status}")
     seen, confidence, colors, gains = look_at(mesh, pyramids, most_views=config.most_views)
     moved = np.linalg.norm(mesh.vertices - hull.vertices, axis=1)
     numbers |= {

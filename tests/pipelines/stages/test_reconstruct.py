@@ -11,14 +11,15 @@ from pipelines.commands.reconstruct import ReconstructCommand
 from pipelines.runs.layout import RECONSTRUCT_STAGE, reconstructed_scan
 from pipelines.stages import reconstruct as stage_module
 from pipelines.stages.held_out import seen_of
-from pipelines.stages.photographed import open_photographs, usable_cameras, usable_frames
+from pipelines.stages.photographed import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from pipelines.stages.reconstruct import reconstruct_capture
 from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct.hull import solid_status
+from smplxpp.reconstruct.neus2 import UnitCube
 from tests.conftest import ROOT
 
 FIXTURE = ROOT / "data" / "fixtures" / "person"
@@ -136,3 +137,26 @@ def test_a_frame_that_is_not_there_is_refused():
     capture = open_photographs(inputs)
     assert set(usable_frames(capture, None)) == set(capture.splits.train_frames)
     assert replace(inputs, frames=(3,)).frames == (3,)
+
+
+def test_another_programs_mesh_is_taken_and_put_into_the_cameras_world(run, tmp_path):
+    folder, _ = run
+    raw = read_raw_mesh(folder / reconstructed_scan(0))
+    mesh = TriangleMesh(0.5 * raw.vertices + 0.5, raw.faces)
+    write_ply(tmp_path / "neus2.ply", mesh)
+    with pytest.raises(InputError, match="--mesh"):
+        reconstruct_capture(tmp_path / "run", ReconstructInputs(FIXTURE, mesh=tmp_path / "neus2.ply"))
+    said = ReconstructCommand(
+        capture=FIXTURE, out=tmp_path / "run", mesh=tmp_path / "neus2.ply", json=True, no_report=True
+    ).run()
+    found = read_raw_mesh(tmp_path / "run" / reconstructed_scan(0))
+    assert found.vertices == pytest.approx(raw.vertices, abs=1e-5)
+    content = json.loads((tmp_path / "run" / RECONSTRUCT_STAGE / "reconstruction.json").read_text())
+    assert content["frames"]["0"]["space"] == "cube of scale 0.5"
+    assert said["unseen"] < 0.8
+
+
+def test_the_unit_cube_of_transform_json_is_read(tmp_path):
+    assert unit_cube_of(tmp_path) is None
+    (tmp_path / "transform.json").write_text(json.dumps({"from_na": True, "scale": 0.7, "offset": [0.1, 0.2, 0.3]}))
+    assert unit_cube_of(tmp_path) == UnitCube(0.7, (0.1, 0.2, 0.3))
