@@ -13,17 +13,26 @@ class SweepLevel:
 
     Attributes:
         inward, outward: metres searched on each side of the surface. step: metres between looks.
-        coarseness: distance of a patch's samples, in pixels; photographs are taken at that resolution.
         gain: of agreement from which a place is better than where the surface is.
+        coarseness: distances of a patch's samples, in pixels, the photographs taken at that resolution; each but the
+            first is asked where the one before convinces nobody: small patches follow a surface, large ones find
+            texture.
         half: a patch has 2 half + 1 samples a side.
     """
 
     inward: float
     outward: float
     step: float
-    coarseness: float
     gain: float
+    coarseness: tuple[float, ...] = (1.0,)
     half: int = 3
+
+
+LEVELS = (
+    SweepLevel(0.05, 0.004, 0.002, 0.06, (1.0, 2.0)),
+    SweepLevel(0.02, 0.006, 0.001, 0.04),
+    SweepLevel(0.004, 0.004, 0.0005, 0.03),
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class ReconstructConfig:
         cell: of the grid that the surface is taken from; None: two pixels, within 3 to 6 mm.
         dissent: views that may say of a point that it is outside, for masks with holes: the hull grows with it.
         refine: search along the normals; False: the hull alone.
-        levels: of the search, from coarse to fine; () for those that fit the photographs.
+        levels: of the search, from coarse to fine.
         smoothness: of displacements, against the views' agreement.
         most_views: that are asked for a point.
     """
@@ -42,7 +51,7 @@ class ReconstructConfig:
     cell: float | None = None
     dissent: int = 0
     refine: bool = True
-    levels: tuple[SweepLevel, ...] = ()
+    levels: tuple[SweepLevel, ...] = LEVELS
     smoothness: float = 0.3
     most_views: int = 6
 
@@ -52,17 +61,3 @@ class ReconstructConfig:
         require_at_least("reconstruction config dissent", self.dissent, 0)
         require_at_least("reconstruction config most_views", self.most_views, 2)
         require_positive("reconstruction config smoothness", self.smoothness)
-
-
-COARSE_LEVELS = (
-    SweepLevel(0.05, 0.004, 0.002, 1.0, 0.06),
-    SweepLevel(0.02, 0.006, 0.001, 1.0, 0.04),
-    SweepLevel(0.004, 0.004, 0.0005, 1.0, 0.03),
-)
-"""For photographs of 2.5 mm a pixel and more."""
-FINE_LEVELS = (
-    SweepLevel(0.05, 0.004, 0.002, 2.0, 0.06),
-    SweepLevel(0.02, 0.006, 0.001, 2.0, 0.04),
-    SweepLevel(0.008, 0.006, 0.0005, 1.0, 0.04, 4),
-    SweepLevel(0.004, 0.004, 0.0005, 1.0, 0.03),
-)

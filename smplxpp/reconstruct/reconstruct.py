@@ -13,11 +13,12 @@ from jaxtyping import Float32, Int64, UInt8
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.reconstruct.colors import blend_colors
-from smplxpp.reconstruct.config import COARSE_LEVELS, FINE_LEVELS, ReconstructConfig, SweepLevel
+from smplxpp.reconstruct.config import ReconstructConfig
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status
 from smplxpp.reconstruct.photographs import Pyramids, sight
 from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
 from smplxpp.reconstruct.sweep import (
+    PatchConfig,
     mean_of_neighbours,
     refine_surface,
     smooth_normals,
@@ -31,8 +32,6 @@ Progress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
 _CELLS = (3e-3, 6e-3)
 _CELL_PIXELS = 2.0
-# Photographs of more metres a pixel are looked at as they are from the start.
-_COARSE_PIXEL = 2.5e-3
 _LEAST_SEEN = 2
 # Agreement of the photographs: none, and what is as sure as it gets.
 _NO_AGREEMENT, _FULL_AGREEMENT = 0.1, 0.7
@@ -112,7 +111,7 @@ def reconstruct(
     problems += more
     hull = taubin(hull, mean_of_neighbours(hull), steps=3)
     pyramids = Pyramids.of(trusted)
-    levels = (config.levels or (COARSE_LEVELS if pixel > _COARSE_PIXEL else FINE_LEVELS)) if config.refine else ()
+    levels = config.levels if config.refine else ()
 
     def inside(points: np.ndarray) -> np.ndarray:
         return smallest_depths(silhouettes, points, count=config.dissent + 1)[:, config.dissent]
@@ -191,8 +190,9 @@ def look_at(
     normals = smooth_normals(mesh, mean)
     sights = sight(mesh, normals, pyramids.cameras)
     seen = sights.seen()
-    here = SweepLevel(0.0, 0.0, 1e-3, 1.0, 0.0)
-    scores = sweep_scores(mesh.vertices, normals, sights, pyramids, np.zeros(1), here, most_views=most_views)[:, 0]
+    scores = sweep_scores(mesh.vertices, normals, sights, pyramids, np.zeros(1), PatchConfig(most_views=most_views))[
+        :, 0
+    ]
     for _ in range(2):
         scores = 0.5 * scores + 0.5 * (mean @ scores)
     confidence = np.clip((scores - _NO_AGREEMENT) / (_FULL_AGREEMENT - _NO_AGREEMENT), 0.0, 1.0)

@@ -26,12 +26,28 @@ _NOISE = 0.006
 # Agreement at which a place counts for nothing.
 _WORTHLESS = 0.5
 _CLEAR = 0.2
+# Below it the next coarser patches are asked.
+_CONVINCING = 0.4
 # What a centimetre of displacement costs in agreement.
 _COST = 0.02
 # What a view without a better place holds the surface with; what nobody sees holds it by.
 _ANCHOR, _LOOSE = 0.5, 0.02
 _AT_END = 0.05
 _OUTSIDE = 0.004
+
+
+@dataclass(frozen=True)
+class PatchConfig:
+    """The patches that views are compared by.
+
+    Attributes:
+        coarseness: pixels between samples, of the median of the views that see the point.
+        half: 2 half + 1 samples a side. most_views: that are asked for a point.
+    """
+
+    coarseness: float = 1.0
+    half: int = 3
+    most_views: int = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +83,26 @@ def refine_surface(
     normals = smooth_normals(mesh, mean)
     seen = sight(mesh, normals, pyramids.cameras)
     offsets = np.arange(-level.inward, level.outward + 1e-9, level.step)
-    scores = sweep_scores(mesh.vertices, normals, seen, pyramids, offsets, level, most_views=most_views)
     watched = (seen.cosine > LEAST_COSINE).sum(axis=1) >= 2
-    scores[~watched] = 0.0
+    outside = np.zeros((mesh.vertex_count, len(offsets)), dtype=bool)
     for k in np.flatnonzero(offsets > 0):
-        scores[inside((mesh.vertices + offsets[k] * normals).astype(np.float32)) < -_OUTSIDE, k] = -1.0
-    for _ in range(2):
-        scores = 0.5 * scores + 0.5 * (mean @ scores)
-    displacement, confidence, best = _best_places(scores, offsets, watched, level)
+        outside[:, k] = inside((mesh.vertices + offsets[k] * normals).astype(np.float32)) < -_OUTSIDE
+    displacement, confidence, agreement = (np.zeros(mesh.vertex_count) for _ in range(3))
+    open_ = np.ones(mesh.vertex_count, dtype=bool)
+    for coarseness in level.coarseness:
+        patches = PatchConfig(coarseness, level.half, most_views)
+        scores = sweep_scores(mesh.vertices, normals, seen, pyramids, offsets, patches)
+        scores[~watched] = 0.0
+        scores[outside] = -1.0
+        for _ in range(2):
+            scores = 0.5 * scores + 0.5 * (mean @ scores)
+        found = _best_places(scores, offsets, watched, level)
+        for kept, new in zip((displacement, confidence, agreement), found, strict=True):
+            kept[open_] = new[open_]
+        open_ &= agreement < _CONVINCING
     moved = _smoothed(mesh, displacement, confidence, smoothness, level.step)
-    return Swept(mesh.vertices + moved[:, None] * normals, np.where(watched, best, -1.0).astype(np.float32), moved)
+    said = np.where(watched, agreement, -1.0).astype(np.float32)
+    return Swept(mesh.vertices + moved[:, None] * normals, said, moved)
 
 
 def sweep_scores(
@@ -85,16 +111,13 @@ def sweep_scores(
     seen: Sight,
     pyramids: Pyramids,
     offsets: Float64[np.ndarray, " K"],
-    level: SweepLevel,
-    *,
-    most_views: int,
+    patches: PatchConfig,
 ) -> Float32[np.ndarray, "N K"]:
     """How well the photographs agree on a patch at each offset along the normal, at most 1.
 
-    It is -1 where fewer than two see it. A patch's samples are `level.coarseness` pixels apart, of the median of the
-    views that see it.
+    It is -1 where fewer than two see it.
     """
-    chosen = np.ascontiguousarray(seen.chosen(most_views, least_cosine=LEAST_COSINE))
+    chosen = np.ascontiguousarray(seen.chosen(patches.most_views, least_cosine=LEAST_COSINE))
     looked = chosen >= 0
     looked[~looked.any(axis=1)] = True
     taken = np.take_along_axis(seen.pixel, np.maximum(chosen, 0), axis=1)
@@ -113,14 +136,14 @@ def sweep_scores(
         address(np.ascontiguousarray(points), "float64"),
         address(np.ascontiguousarray(normals), "float64"),
         address(tangents, "float64"),
-        address(np.ascontiguousarray(level.coarseness * pixel, dtype=np.float64), "float64"),
+        address(np.ascontiguousarray(patches.coarseness * pixel, dtype=np.float64), "float64"),
         address(chosen, "int32"),
         ctypes.c_int64(len(points)),
         ctypes.c_int64(chosen.shape[1]),
         address(np.ascontiguousarray(offsets), "float64"),
         ctypes.c_int64(len(offsets)),
-        level.half,
-        ctypes.c_double(3 * _NOISE**2 / level.coarseness**2),
+        patches.half,
+        ctypes.c_double(3 * _NOISE**2 / patches.coarseness**2),
         ctypes.c_double(LEAST_OPACITY),
         address(scores),
         thread_count(),

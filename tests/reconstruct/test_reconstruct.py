@@ -10,7 +10,7 @@ from smplxpp.reconstruct.agreement import silhouette_agreement
 from smplxpp.reconstruct.hull import solid_status
 from tests.reconstruct.scene import dented_views, inside_dented
 
-CONFIG = ReconstructConfig(cell=0.025, levels=(SweepLevel(0.1, 0.01, 0.005, 1.0, 0.06),))
+CONFIG = ReconstructConfig(cell=0.025, levels=(SweepLevel(0.1, 0.01, 0.005, 0.06),))
 
 
 @pytest.fixture(scope="module")

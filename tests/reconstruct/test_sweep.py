@@ -6,6 +6,7 @@ from smplxpp.reconstruct.config import SweepLevel
 from smplxpp.reconstruct.hull import zero_surface
 from smplxpp.reconstruct.photographs import Pyramids, sight
 from smplxpp.reconstruct.sweep import (
+    PatchConfig,
     mean_of_neighbours,
     refine_surface,
     smooth_normals,
@@ -15,7 +16,7 @@ from smplxpp.reconstruct.sweep import (
 )
 from tests.reconstruct.scene import BOX, inside_ball, inside_dented, photograph, ring
 
-LEVEL = SweepLevel(0.1, 0.01, 0.005, 1.0, 0.06)
+LEVEL = SweepLevel(0.1, 0.01, 0.005, 0.06)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def test_the_agreement_is_best_where_the_surface_is(ball, photographs):
     normals = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
     seen = sight(ball, normals, photographs.cameras)
     offsets = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
-    scores = sweep_scores(ball.vertices, normals, seen, photographs, offsets, LEVEL, most_views=6)
+    scores = sweep_scores(ball.vertices, normals, seen, photographs, offsets, PatchConfig())
     watched = (seen.cosine > 0.3).sum(axis=1) >= 2
     assert watched.mean() > 0.9
     assert (scores[watched].argmax(axis=1) == 2).mean() > 0.95
@@ -53,7 +54,7 @@ def test_an_exposure_changes_no_agreement(ball, photographs):
     seen = sight(ball, normals, photographs.cameras)
     dim = photographs.values.reshape(-1, 4) * np.array([0.5, 0.5, 0.5, 1], np.float32)
     found = [
-        sweep_scores(ball.vertices, normals, seen, one, np.zeros(1), LEVEL, most_views=6)
+        sweep_scores(ball.vertices, normals, seen, one, np.zeros(1), PatchConfig())
         for one in (photographs, replace(photographs, values=dim.ravel()))
     ]
     assert found[1] == pytest.approx(found[0], abs=0.02)
@@ -79,7 +80,7 @@ def test_without_texture_the_surface_stays(ball):
 
 def test_the_surface_does_not_leave_the_silhouettes(ball, photographs):
     small = TriangleMesh(0.95 * ball.vertices, ball.faces)
-    level = SweepLevel(0.01, 0.04, 0.005, 1.0, 0.06)
+    level = SweepLevel(0.01, 0.04, 0.005, 0.06)
     free = refine_surface(small, photographs, level, everywhere, most_views=6, smoothness=0.3)
     held = refine_surface(
         small, photographs, level, lambda p: 0.95 * 0.5 - np.linalg.norm(p, axis=1), most_views=6, smoothness=0.3
