@@ -3,8 +3,8 @@
     python -m benchmarks.reconstruction --capture DIR [--name NAME]
 
 A capture with true vertices in `geometry/`. The truth is looked at in measuring alone; the cameras are those that are
-trained on unless a row says otherwise. P2S: from points spread over the reconstruction to the true outer surface, all of
-it and what two cameras see. Completeness: from points of the true surface that two of the cameras see to the
+trained on unless a row says otherwise. P2S: from points spread over the reconstruction to the true outer surface, all
+of it and what two cameras see. Completeness: from points of the true surface that two of the cameras see to the
 reconstruction. `estimated masks`: every other mask grown, the rest shrunk by 2 pixels, one of the background, one 12 %
 of the image off.
 """

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
+from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText, require_avatar
 from pipelines.report.model import CheckRow
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_object, read_json
@@ -18,6 +18,7 @@ from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord
+    from pipelines.stages.reconstruct import Method
     from pipelines.stages.reconstruct_config import ReconstructInputs
 
 _SHOWN = 8
@@ -48,6 +49,13 @@ class ReconstructCommand:
     mesh: OptionalPath = None
     """Mesh of the frame by NeuS2, Instant-NGP or another program, which is taken in the place of ours; the masks tell
     whether it lies in the cameras' world or in the trainer's unit cube."""
+    method: Literal["sweep", "sdf"] = "sweep"
+    """sweep: photographs compared along the normals. sdf: a neural signed distance over the hull, which needs the extra
+    avatar and a CUDA device."""
+    device: Literal["cuda", "cpu"] = "cuda"
+    """Device of --method sdf; cpu takes hours."""
+    iterations: int = 15_000
+    """Of --method sdf."""
     force: bool = False
     """Reconstruct anew even if the stage stands."""
     no_report: bool = False
@@ -64,10 +72,10 @@ class ReconstructCommand:
         from pipelines.stages.reconstruct import reconstruct_capture
 
         keep_out_of_capture(self.out, self.capture)
-        inputs = self.inputs()
+        inputs, method = self.inputs(), self._method()
         own = own_run_folder(self.out, (RECONSTRUCT_STAGE, "reconstruct"))
         with own, shared_progress(enabled=not self.json) as progress:
-            record = reconstruct_capture(self.out, inputs, force=self.force, progress=progress)
+            record = reconstruct_capture(self.out, inputs, method=method, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
         path = record.folder / "reconstruction.json"
         content = as_object(read_json(path, subject="reconstruction"), subject=f"reconstruction {path}")
@@ -118,6 +126,25 @@ class ReconstructCommand:
             dissent=self.dissent,
             mesh=self.mesh,
         )
+
+    def _method(self) -> Method | None:
+        """What makes the surfaces of --method sdf.
+
+        Raises:
+            MissingExtraError: the extra avatar is not installed.
+            InputError: no CUDA device, options that exclude each other.
+        """
+        if self.method != "sdf":
+            return None
+        require_avatar("--method sdf")
+        if self.mesh is not None or self.hull_only:
+            raise InputError("--method sdf", expected="neither --mesh nor --hull-only with it", received="one of them")
+        from avatar.reconstruct import SurfaceConfig
+        from pipelines.stages.neural_surface import neural_method
+        from smplxpp.reconstruct import ReconstructConfig
+
+        config = ReconstructConfig(cell=None if self.cell is None else 1e-3 * self.cell, dissent=self.dissent)
+        return neural_method(config, SurfaceConfig(iterations=self.iterations), self.device)
 
     def _report(self, record: StageRecord) -> Path:
         """Write the reconstruction's own page, unless it is newer than the reconstruction."""

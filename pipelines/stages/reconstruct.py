@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,21 @@ Report = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
 Maker = Callable[..., Reconstruction]
 """`make(views, progress=...)`: the surface of a moment."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """Another way to a surface than the sweep.
+
+    Attributes:
+        make: see `Maker`. code: modules that do its work. choices: what it depends on.
+    """
+
+    make: Maker
+    code: tuple[str, ...]
+    choices: Mapping[str, Any]
+
+
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
 
 
@@ -51,12 +67,20 @@ def _silent(what: str, share: float) -> None:
 
 
 def reconstruct_capture(
-    run: Path, inputs: ReconstructInputs, *, force: bool = False, progress: Report = _silent
+    run: Path,
+    inputs: ReconstructInputs,
+    *,
+    method: Method | None = None,
+    force: bool = False,
+    progress: Report = _silent,
 ) -> StageRecord:
     """Reconstruct the frames, unless the stage stands, and keep it in a run that the caller owns.
 
     Frames that were finished before a kill are not made again. Of several frames, one that cannot be reconstructed is
     named among the problems.
+
+    Args:
+        method: makes the surfaces in the place of the sweep.
 
     Raises:
         InputError: unusable inputs, or not a single frame that could be reconstructed.
@@ -75,14 +99,21 @@ def reconstruct_capture(
         digests["mesh"] = sha256_file(inputs.mesh)
     stage = Stage(
         name=RECONSTRUCT_STAGE,
-        config={"reconstruct": config, "frames": frames, "cameras": cameras},
+        config={
+            "reconstruct": config,
+            "method": None if method is None else method.choices,
+            "frames": frames,
+            "cameras": cameras,
+        },
         inputs=digests,
-        code=(__name__,),
+        code=(__name__,) if method is None else (__name__, *method.code),
         resumable=True,
     )
     save_reconstruct(run, inputs)
     state = run / stage.work_name
-    make = partial(_surface, config=config) if inputs.mesh is None else partial(_adopted, inputs=inputs)
+    make: Maker = partial(_surface, config=config) if inputs.mesh is None else partial(_adopted, inputs=inputs)
+    if method is not None:
+        make = method.make
     work = partial(_work, state=state, capture=capture, cameras=cameras, frames=frames, make=make, progress=progress)
     return run_stage(run, stage, work, force=force)
 

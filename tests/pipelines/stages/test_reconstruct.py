@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avatar.reconstruct import SurfaceConfig
 from pipelines.commands.reconstruct import ReconstructCommand
 from pipelines.runs.layout import RECONSTRUCT_STAGE, reconstructed_scan
 from pipelines.stages import reconstruct as stage_module
 from pipelines.stages.held_out import seen_of
+from pipelines.stages.neural_surface import neural_method
 from pipelines.stages.photographed import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from pipelines.stages.reconstruct import reconstruct_capture
 from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
@@ -18,6 +20,7 @@ from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
+from smplxpp.reconstruct import ReconstructConfig
 from smplxpp.reconstruct.hull import solid_status
 from smplxpp.reconstruct.neus2 import UnitCube
 from tests.conftest import ROOT
@@ -160,3 +163,31 @@ def test_the_unit_cube_of_transform_json_is_read(tmp_path):
     assert unit_cube_of(tmp_path) is None
     (tmp_path / "transform.json").write_text(json.dumps({"from_na": True, "scale": 0.7, "offset": [0.1, 0.2, 0.3]}))
     assert unit_cube_of(tmp_path) == UnitCube(0.7, (0.1, 0.2, 0.3))
+
+
+def test_a_neural_surface_needs_a_gpu_or_the_word(tmp_path, monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="sdf") as caught:
+        ReconstructCommand(capture=FIXTURE, out=tmp_path / "run", method="sdf").run()
+    assert "--device cpu" in caught.value.remedy
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="neither --mesh nor --hull-only"):
+        ReconstructCommand(capture=FIXTURE, out=tmp_path / "run", method="sdf", hull_only=True).run()
+
+
+def test_a_neural_surface_on_the_cpu_is_a_stage_like_others(tmp_path):
+    surface = SurfaceConfig(
+        **{"iterations": 2, "rays": 32, "samples": 8, "levels": 2, "finest": 16, "log2_entries": 8},
+        **{"hull_cell": 0.06, "cell": 0.04},
+    )
+    config = ReconstructConfig(cell=0.04)
+    method = neural_method(config, surface, "cpu")
+    record = reconstruct_capture(tmp_path, ReconstructInputs(FIXTURE, (0,), cell_mm=40.0), method=method)
+    assert record.manifest["config"]["method"]["name"] == "sdf"
+    assert "avatar.reconstruct.hash_grid" in record.manifest["code"]
+    raw = read_raw_mesh(tmp_path / reconstructed_scan(0))
+    assert solid_status(TriangleMesh(raw.vertices, raw.faces))[0] == "NoError"
+    again = reconstruct_capture(tmp_path, ReconstructInputs(FIXTURE, (0,), cell_mm=40.0), method=method)
+    assert not again.ran

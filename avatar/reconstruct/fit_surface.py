@@ -1,0 +1,188 @@
+"""The neural surface fitted to photographs: colour, mask and eikonal terms over rays that enter the hull."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from avatar.reconstruct.hash_grid import HashGrid
+from avatar.reconstruct.neural_surface import NeuralSurface
+from avatar.reconstruct.rays import Rays, rays_of
+from avatar.reconstruct.volume import opacities, weights_of
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.reconstruct.hull import main_body, zero_surface
+from smplxpp.reconstruct.trust import Box
+from smplxpp.reconstruct.views import PhotoView
+
+_CHUNK = 1 << 17
+_FAR = 0.05
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """How a neural surface is fitted; lengths in metres.
+
+    Attributes:
+        iterations: steps. rays, samples: of a step, and of a ray.
+        before, behind: of the hull's surface, between which a ray is sampled.
+        levels, finest, log2_entries: of the hash grid.
+        rate: of Adam.
+        eikonal, mask, residual: weights beside the colours': of a gradient of length 1, of the ray's opacity, of
+            staying at the hull.
+        hull_cell: of the grid that holds the hull's distance.
+        cell: of the grid that the surface is taken from.
+        seed: of what is drawn.
+    """
+
+    iterations: int = 15_000
+    rays: int = 4096
+    samples: int = 64
+    before: float = 0.01
+    behind: float = 0.12
+    levels: int = 14
+    finest: int = 1024
+    log2_entries: int = 19
+    rate: float = 5e-3
+    eikonal: float = 0.1
+    mask: float = 0.1
+    residual: float = 0.05
+    hull_cell: float = 0.01
+    cell: float = 0.003
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "rays", "samples", "levels", "finest"):
+            require_at_least(f"surface config {name}", getattr(self, name), 1)
+        for name in ("behind", "rate", "hull_cell", "cell"):
+            require_positive(f"surface config {name}", getattr(self, name))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFit:
+    """A fitted surface.
+
+    Attributes:
+        mesh: closed. model: on its device.
+        losses: of every iteration.
+    """
+
+    mesh: TriangleMesh
+    model: NeuralSurface
+    losses: Float32[np.ndarray, " I"]
+
+
+def fit_surface(
+    views: Sequence[PhotoView],
+    hull: TriangleMesh,
+    config: SurfaceConfig | None = None,
+    *,
+    device: torch.device | str = "cuda",
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> SurfaceFit:
+    """Fit a signed distance, a residual over the hull's, to photographs, and take its surface.
+
+    Args:
+        views: of one moment, whose masks agree. hull: closed, around the person.
+        device: a CUDA device; "cpu" takes hours at the default size.
+
+    Raises:
+        InputError: the hull is in no photograph, or the fit lost its surface.
+    """
+    config = config or SurfaceConfig()
+    torch.manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    margin = config.before + 2 * config.hull_cell
+    box = Box(hull.vertices.min(axis=0) - margin, hull.vertices.max(axis=0) + margin)
+    grid = HashGrid(
+        levels=config.levels,
+        coarsest=min(16, config.finest),
+        finest=config.finest,
+        log2_entries=config.log2_entries,
+    )
+    low, high = (torch.from_numpy(side.astype(np.float32)) for side in (box.low, box.high))
+    model = NeuralSurface(hull_grid(hull, box, config.hull_cell), low, high, grid).to(device)
+    rays = rays_of(views, hull, device)
+    optimizer = torch.optim.Adam(model.parameters(), lr=config.rate, betas=(0.9, 0.99), eps=1e-15)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.iterations, eta_min=0.05 * config.rate)
+    losses = np.zeros(config.iterations, np.float32)
+    for k in range(config.iterations):
+        if k % 50 == 0:
+            progress("surface", k / config.iterations)
+        rows = torch.randint(len(rays), (config.rays,), generator=generator).to(device)
+        # Gradients are taken over cells that become smaller: coarse form first.
+        share = k / max(config.iterations - 1, 1)
+        step = float(np.exp((1 - share) * np.log(0.02) + share * np.log(2 * config.cell)))
+        loss = surface_loss(model, rays.select(rows), config, generator, step=step)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        losses[k] = float(loss.detach())
+    if not np.isfinite(losses).all():
+        raise InputError("neural surface", expected="a loss that stays finite", received="NaN", remedy="lower the rate")
+    mesh, _ = main_body(extract(model, box, config.cell))
+    return SurfaceFit(mesh, model, losses)
+
+
+def surface_loss(
+    model: NeuralSurface, rays: Rays, config: SurfaceConfig, generator: torch.Generator, *, step: float
+) -> Float[Tensor, ""]:
+    """Colours of rays where they are the person's, their opacity against the mask, eikonal and residual terms."""
+    count, samples = len(rays), config.samples
+    jitter = torch.rand((count, samples + 1), generator=generator).to(rays.enter.device)
+    along = (torch.arange(samples + 1, device=jitter.device) + jitter) / (samples + 1)
+    depth = rays.enter[:, None] - config.before + (config.before + config.behind) * along
+    points = rays.origin[:, None] + depth[..., None] * rays.direction[:, None]
+    distance = model.distance(points.reshape(-1, 3)).reshape(count, samples + 1)
+    weights = weights_of(opacities(distance, model.sharpness))
+    middle = 0.5 * (points[:, :-1] + points[:, 1:]).reshape(-1, 3)
+    gradient = model.gradient(middle, step=step)
+    normals = torch.nn.functional.normalize(gradient, dim=1)
+    directions = rays.direction[:, None].expand(-1, samples, -1).reshape(-1, 3)
+    colors = model.look(middle, normals, directions).reshape(count, samples, 3)
+    opacity = weights.sum(dim=1)
+    seen = (weights[..., None] * colors).sum(dim=1)
+    person = (rays.opacity > 0.99).float()
+    color = (person[:, None] * (seen - rays.color).abs()).sum() / (3 * person.sum()).clamp(min=1)
+    mask = torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), rays.opacity)
+    eikonal = ((gradient.norm(dim=1) - 1) ** 2).mean()
+    residual = (distance - model.hull_distance(points.reshape(-1, 3)).reshape(distance.shape)).abs().mean()
+    return color + config.mask * mask + config.eikonal * eikonal + config.residual * residual
+
+
+def hull_grid(hull: TriangleMesh, box: Box, cell: float) -> Float[Tensor, "X Y Z"]:
+    """The hull's signed distance on a grid over the box, negative inside."""
+    counts = np.maximum(np.ceil((box.high - box.low) / cell).astype(int) + 1, 2)
+    axes = [np.linspace(low, high, count) for low, high, count in zip(box.low, box.high, counts, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    field, found = SignedDistanceField(hull, solid=True), np.empty(len(points), np.float32)
+    for first in range(0, len(points), _CHUNK):
+        found[first : first + _CHUNK] = field.query(points[first : first + _CHUNK]).distance
+    return torch.from_numpy(found.reshape(counts))
+
+
+@torch.no_grad()
+def extract(model: NeuralSurface, box: Box, cell: float) -> TriangleMesh:
+    """The closed surface on which the distance is zero.
+
+    Raises:
+        InputError: there is none.
+    """
+    device = model.low.device
+
+    def inside(points: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+        found = np.empty(len(points), np.float32)
+        for first in range(0, len(points), _CHUNK):
+            part = torch.from_numpy(points[first : first + _CHUNK]).to(device)
+            found[first : first + _CHUNK] = -model.distance(part).float().cpu().numpy()
+        return np.clip(found, -_FAR, _FAR)
+
+    return zero_surface(inside, box, cell=cell)

@@ -1,0 +1,94 @@
+"""A signed distance that starts as the visual hull's and learns what is left of it, and the colour of its points."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avatar.reconstruct.hash_grid import HashGrid
+
+_HIDDEN = 64
+_SHARED = 15
+"""Numbers that the distance's network hands to the colours'."""
+_SHARPNESS = 200.0
+"""1/metre, before training: the surface is a few centimetres thick."""
+
+
+class NeuralSurface(nn.Module):
+    """f(x) = hull(x) + residual(x) in metres, negative inside; colours by place, normal and direction of view.
+
+    The residual starts at zero: before it learns, the surface is the hull.
+
+    Args:
+        hull: (X, Y, Z) signed distance on a grid, negative inside.
+        low, high: corners of the grid in the world.
+        grid: features of both networks.
+    """
+
+    hull: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, hull: Float[Tensor, "X Y Z"], low: Float[Tensor, " 3"], high: Float[Tensor, " 3"], grid: HashGrid
+    ) -> None:
+        super().__init__()
+        self.register_buffer("hull", hull)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+        self.grid = grid
+        self.residual = nn.Sequential(
+            nn.Linear(grid.width + 3, _HIDDEN), nn.Softplus(beta=100), nn.Linear(_HIDDEN, 1 + _SHARED)
+        )
+        for parameter in self.residual[2].parameters():
+            nn.init.zeros_(parameter)
+        self.color = nn.Sequential(
+            nn.Linear(grid.width + 15 + 6, _HIDDEN),
+            nn.ReLU(),
+            nn.Linear(_HIDDEN, _HIDDEN),
+            nn.ReLU(),
+            nn.Linear(_HIDDEN, 3),
+        )
+        self.log_sharpness = nn.Parameter(torch.tensor(math.log(_SHARPNESS)))
+
+    @property
+    def sharpness(self) -> Float[Tensor, ""]:
+        """How steep the density is at the surface, 1/metre."""
+        return torch.exp(self.log_sharpness)
+
+    def hull_distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """The hull's signed distance, metres; beyond the grid that of its nearest side."""
+        place = 2 * (points - self.low) / (self.high - self.low) - 1
+        sampled = nn.functional.grid_sample(
+            self.hull[None, None],
+            place.flip(-1)[None, :, None, None],
+            align_corners=True,
+            padding_mode="border",
+        )
+        return sampled.reshape(-1)
+
+    def distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Signed distance of points in the world, metres."""
+        return self.hull_distance(points) + self._learned(points)[0][:, 0]
+
+    def _learned(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 16"], Float[Tensor, "N W"]]:
+        """The residual and its features, and the grid's."""
+        unit = (points - self.low) / (self.high - self.low).max()
+        features = self.grid(unit)
+        return self.residual(torch.cat([features, 2 * unit - 1], dim=1)), features
+
+    def gradient(self, points: Float[Tensor, "N 3"], *, step: float) -> Float[Tensor, "N 3"]:
+        """The distance's gradient by central differences, which spread over neighbouring cells (Li et al. 2023)."""
+        ways = step * torch.eye(3, dtype=points.dtype, device=points.device)
+        ends = [self.distance(points + way) - self.distance(points - way) for way in ways]
+        return torch.stack(ends, dim=1) / (2 * step)
+
+    def look(
+        self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Colours of points, sRGB in [0, 1]."""
+        learned, features = self._learned(points)
+        return torch.sigmoid(self.color(torch.cat([features, learned[:, 1:], normals, directions], dim=1)))

@@ -1,0 +1,66 @@
+"""Rays through pixels that the hull covers, with the depth at which they enter it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh
+from smplxpp.reconstruct.views import PhotoView
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """N rays.
+
+    Attributes:
+        origin, direction: in the world, directions of unit length.
+        enter: metres to the hull.
+        color: of the pixel, sRGB in [0, 1]. opacity: of the person.
+    """
+
+    origin: Float[Tensor, "N 3"]
+    direction: Float[Tensor, "N 3"]
+    enter: Float[Tensor, " N"]
+    color: Float[Tensor, "N 3"]
+    opacity: Float[Tensor, " N"]
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    def select(self, rows: Tensor) -> Rays:
+        """Some of the rays."""
+        return Rays(self.origin[rows], self.direction[rows], self.enter[rows], self.color[rows], self.opacity[rows])
+
+
+def rays_of(views: Sequence[PhotoView], hull: TriangleMesh, device: torch.device | str) -> Rays:
+    """The rays of all pixels that the hull covers; others say what the masks have said already.
+
+    Raises:
+        InputError: the hull is in no photograph.
+    """
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("origin", "direction", "enter", "color", "opacity")}
+    for view in views:
+        depth = rasterize_mesh(hull, view.camera).depth
+        row, column = np.nonzero(np.isfinite(depth))
+        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
+        in_camera = pixels @ np.linalg.inv(view.camera.K).T
+        length = np.linalg.norm(in_camera, axis=1)
+        parts["direction"].append(in_camera / length[:, None] @ view.camera.cam_from_world[:3, :3])
+        parts["origin"].append(np.broadcast_to(view.camera.position, (len(row), 3)))
+        parts["enter"].append(depth[row, column] * length)
+        parts["color"].append(view.color[row, column] / 255.0)
+        parts["opacity"].append(view.opacity[row, column] / 255.0)
+    if not sum(map(len, parts["enter"])):
+        raise InputError("photographs", expected="some that show the hull", received="none")
+    tensors = {
+        name: torch.from_numpy(np.concatenate(values).astype(np.float32)).to(device) for name, values in parts.items()
+    }
+    return Rays(**tensors)

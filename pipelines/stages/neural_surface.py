@@ -1,0 +1,60 @@
+"""Surfaces by a neural signed distance over the hull, for machines with a CUDA device."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from avatar.reconstruct import SurfaceConfig, fit_surface
+from avatar.training.engine.device import choose_device
+from pipelines.stages.reconstruct import Method
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct
+
+Report = Callable[[str, float], None]
+
+
+def neural_method(config: ReconstructConfig, surface: SurfaceConfig, device: str) -> Method:
+    """The method for `reconstruct_capture`.
+
+    Raises:
+        InputError: no CUDA device, and the CPU was not asked for.
+    """
+    try:
+        choose_device(device)
+    except InputError as error:
+        raise InputError(
+            "--method sdf",
+            expected=error.expected,
+            received=error.received,
+            remedy="leave --method at sweep, which needs none, or force --device cpu (hours at the default size)",
+        ) from None
+    make = partial(_neural_surface, config=config, surface=surface, device=device)
+    return Method(make, (__name__,), {"name": "sdf", "surface": surface, "device": device})
+
+
+def _neural_surface(
+    views: list[PhotoView],
+    *,
+    config: ReconstructConfig,
+    surface: SurfaceConfig,
+    device: str,
+    progress: Report,
+) -> Reconstruction:
+    """The hull, then the neural surface within it; colours and confidence as of the sweep's surface."""
+    start = reconstruct(views, replace(config, refine=False), progress=progress)
+    kept = [view for view in views if view.name in start.numbers["views"]]
+    fit = fit_surface(kept, start.hull, surface, device=device, progress=progress)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # the hull's masks were warned of
+        found = adopt_surface(fit.mesh, kept, config)
+    numbers = {
+        **start.numbers,
+        **{name: found.numbers[name] for name in ("status", "genus", "vertices", "faces", "unseen", "unsure", "gains")},
+        "loss": float(np.mean(fit.losses[-100:])),
+    }
+    return replace(found, hull=start.hull, numbers=numbers, problems=start.problems)
