@@ -193,10 +193,31 @@ _REGISTRATION = (
     "pixels, scans of training frames where the capture has them. Errors of the naked body against the exact "
     "parameters; `one scan, symmetric` attracts all of the scan and the body to each other. "
 )
+_DETECTION = (
+    "Keypoints by MediaPipe 0.10.21 in the photographs of the training cameras (synthetic people on black), within the "
+    "boxes of the true masks; points with a confidence of 0.5. Errors include what MediaPipe and the body call by one "
+    "name and mean differently (hips, ears, toes: one to three centimetres). `registered`: the body fitted to these "
+    "keypoints, with the true masks and without, from nothing else: no scan, no label map, no fit to start from. "
+)
+_MASKS = (
+    "Intersection over union with the true mask. The people are put before made rooms with noise, a shadow on the floor "
+    "and an exposure 4 % below the plates'; three plates a camera, or one. No real photographs. "
+)
 PARTS = (
     Part("registration_woman_casual", "Registration of a woman in a wide skirt", _REGISTRATION, registration_lines),
     Part("registration_man_casual", "Registration of a man", _REGISTRATION + "One frame.", registration_lines),
     Part("registration_person", "Registration of the embedded person", _REGISTRATION, registration_lines),
+    Part("detection_woman_casual", "Detected keypoints of a woman in a wide skirt", _DETECTION),
+    Part("detection_person", "Detected keypoints of the embedded person", _DETECTION),
+    Part(
+        "detection_scans",
+        "Landmarks of bare scans",
+        "Scans of three captures, as they are and after what `benchmarks.people.VARIANTS` does to them, and of "
+        "procedural people; drawn from twelve sides, detected by MediaPipe, triangulated. Medians of a person's points "
+        "in mm, against the true body's; how far the facing is off, in degrees. Seconds on a busy machine.",
+    ),
+    Part("detection_masks_woman_casual", "Masks of a woman in a wide skirt", _MASKS),
+    Part("detection_masks_person", "Masks of the embedded person", _MASKS),
     Part(
         "ablation_woman_casual_every_frame",
         "Full against trained skinning on a synthetic woman",
