@@ -200,8 +200,8 @@ _DETECTION = (
     "keypoints, with the true masks and without, from nothing else: no scan, no label map, no fit to start from. "
 )
 _MASKS = (
-    "Intersection over union with the true mask. The people are put before made rooms with noise, a shadow on the floor "
-    "and an exposure 4 % below the plates'; three plates a camera, or one. No real photographs. "
+    "Intersection over union with the true mask. The people are put before made rooms with noise, a shadow on the "
+    "floor and an exposure 4 % below the plates'; three plates a camera, or one. No real photographs. "
 )
 PARTS = (
     Part("registration_woman_casual", "Registration of a woman in a wide skirt", _REGISTRATION, registration_lines),

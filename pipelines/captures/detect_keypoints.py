@@ -1,7 +1,7 @@
 """Keypoints of a capture by a detector: a file a camera, and nothing detected twice.
 
-A file remembers of which image (by its content and the mask's box) and by which detector each frame's points are; what
-still holds is kept when the command runs again.
+A file remembers of which image and mask, by their content, and by which detector each frame's points are; what still
+holds is kept when the command runs again.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ Progress = Callable[[int, int], None]
 # A kill loses at most this many seconds of detecting.
 _SAVE_EVERY_S = 20.0
 _NAMED = 8
+# The grey that takes a background's place; opacity below which a pixel is background; how far, of 255, the background
+# may be from its declared colour.
+_GREY, _OUTSIDE, _SAME_COLOR = 150.0, 8, 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,14 +159,19 @@ class _CameraWork:
         """Detect in one frame, unless that stands."""
         image_file = self.capture.required_file(self.camera, frame)
         mask_file = self.capture.file(self.camera, frame, "mask")
-        box = None if mask_file is None else mask_box(np.asarray(read_alpha(mask_file)))
-        digest = hashlib.sha256(read_bytes(image_file))
-        digest.update(repr(box).encode())
-        key = digest.hexdigest()
+        mask = None if mask_file is None else np.asarray(read_alpha(mask_file))
+        files = [path for path in (image_file, mask_file) if path is not None]
+        key = hashlib.sha256(b"".join(hashlib.sha256(read_bytes(path)).digest() for path in files)).hexdigest()
         if frame in self.rows and self.rows[frame].key == key:
             return
-        people = self.detector(np.asarray(read_color(image_file)), box)
-        self.rows[frame] = _Row(key, _chosen(people, box), len(people))
+        image = np.asarray(read_color(image_file))
+        alone = None if mask is None else _on_grey(image, mask, self.capture.recording.background)
+        image = image if alone is None else alone
+        box = None if mask is None else mask_box(mask)
+        people = self.detector(image, box)
+        if not people and box is not None:
+            people = self.detector(image)
+        self.rows[frame] = _Row(key, _chosen(people, box), len(people) if alone is None else min(len(people), 1))
         self.detected += 1
         if time.monotonic() - self.saved_at > _SAVE_EVERY_S:
             self._save()
@@ -233,6 +241,23 @@ def standing_rows(path: Path, detector: Detector) -> dict[int, _Row]:
         frame: _Row(str(key), DetectedPerson(points, confidence) if count else None, int(count))
         for frame, key, count, points, confidence in rows
     }
+
+
+def _on_grey(
+    image: UInt8[np.ndarray, "H W 3"], mask: UInt8[np.ndarray, "H W"], background: Sequence[float] | None
+) -> UInt8[np.ndarray, "H W 3"] | None:
+    """The person alone on grey, of an image that a capture declares as put on a colour.
+
+    Dark hair is not found on black. None where nothing is declared, or the image is not on that colour.
+    """
+    outside = mask < _OUTSIDE if background is not None and mask.shape == image.shape[:2] else np.zeros(1, dtype=bool)
+    if background is None or not outside.any():
+        return None
+    color = 255.0 * np.asarray(background, dtype=np.float32)
+    if np.median(np.abs(image[outside] - color)) > _SAME_COLOR:
+        return None
+    moved = image + (1.0 - mask[..., None] / np.float32(255.0)) * (_GREY - color)
+    return np.clip(np.round(moved), 0, 255).astype(np.uint8)
 
 
 def _chosen(people: Sequence[DetectedPerson], box: Box | None) -> DetectedPerson | None:

@@ -10,7 +10,7 @@ import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -31,9 +31,11 @@ _WRISTS = {"left_hand": 15, "right_hand": 16}
 _NOSE, _EYES, _EARS, _MOUTH = 0, [2, 5], (7, 8), [9, 10]
 # Distance of the ears, in that of eyes and mouth, from which a head that shows its back is not one in profile.
 _BEHIND = 0.3
+# Share of somebody's points that may lie where somebody else was painted over.
+_IMAGINED = 0.5
 _STDERR = 2
 # Raised when the same answer of MediaPipe is read otherwise, so that what was kept is detected anew.
-_RULES = 2
+_RULES = 3
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,15 @@ class MediaPipeDetector:
             return []
         seen = np.ascontiguousarray(image[y0:y1, x0:x1])
         people: list[DetectedPerson] = []
+        covered: list[Box] = []
         while len(people) < self.config.most_people:
             found = self._one(seen)
-            if found is None or found.confidence.max() < SURE:
+            if found is None or found.confidence.max() < SURE or _imagined(found, covered):
                 break
             people.append(found)
             if len(people) < self.config.most_people:
-                seen = _without(seen, found)
+                covered.append(grown(found.box, _COVER, (seen.shape[1], seen.shape[0])))
+                seen = _without(seen, covered[-1])
         shift = np.array([x0, y0], dtype=np.float64)
         return surest_first(
             [DetectedPerson(np.where(p.confidence[:, None] > 0, p.points + shift, 0.0), p.confidence) for p in people]
@@ -194,10 +198,15 @@ def _seen_as(rows: Float64[np.ndarray, "N 3"], visibility: float) -> Float64[np.
     return np.column_stack([rows[:, :2], np.full(len(rows), visibility)])
 
 
-def _without(image: UInt8[np.ndarray, "H W 3"], person: DetectedPerson) -> UInt8[np.ndarray, "H W 3"]:
-    """The image with a person painted over, so that the next one is found."""
-    height, width = image.shape[:2]
-    x0, y0, x1, y1 = (round(edge) for edge in grown(person.box, _COVER, (width, height)))
+def _imagined(person: DetectedPerson, covered: Sequence[Box]) -> bool:
+    """Whether half of somebody's sure points lie where others were painted over: there is nothing to see there."""
+    points = person.points[person.confidence >= SURE]
+    return any(((points >= box[:2]) & (points <= box[2:])).all(axis=1).mean() > _IMAGINED for box in covered)
+
+
+def _without(image: UInt8[np.ndarray, "H W 3"], box: Box) -> UInt8[np.ndarray, "H W 3"]:
+    """The image with a person's box painted over, so that the next one is found."""
+    x0, y0, x1, y1 = (round(edge) for edge in box)
     out = image.copy()
     out[y0:y1, x0:x1] = np.median(image.reshape(-1, 3), axis=0)
     return out

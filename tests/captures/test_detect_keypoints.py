@@ -128,13 +128,53 @@ def test_two_people_are_told_and_the_one_in_the_mask_is_taken(rig, tmp_path):
     np.testing.assert_allclose(found["A"].keypoints.points[0, 0], [300, 300])
 
 
+def test_images_on_black_are_looked_at_on_grey(tmp_path):
+    """Their masks tell where the black is; the one who is left is nobody else."""
+
+    class Looker(Finder):
+        def __call__(self, image, box=None):
+            self.corner = image[0, 0]
+            return super().__call__(image, box)
+
+    scene = make_scene()
+    rig = write_simple(scene, tmp_path / "rig")
+    description = {"background": [0, 0, 0]}
+    for (camera, frame), mask in scene.masks.items():
+        (path,) = (rig / "rgbs" / camera).glob(f"*{frame:06d}.*")
+        Image.fromarray(scene.on_black(camera, frame)).save(path)
+        assert mask[0, 0] == 0
+    (rig / "capture.json").write_text(json.dumps(description))
+    capture, looker = open_capture(rig), Looker(people=2)
+    assert capture.recording.background == (0.0, 0.0, 0.0)
+    found = detect_keypoints(capture, looker, tmp_path / "k")
+    np.testing.assert_allclose(looker.corner, 150, atol=2)
+    assert problems_of(found) == ()
+    # A capture that declares what is not so keeps its photographs as they are.
+    for (camera, frame), photograph in scene.photographs.items():
+        (path,) = (rig / "rgbs" / camera).glob(f"*{frame:06d}.*")
+        Image.fromarray(photograph).save(path)
+    detect_keypoints(capture, looker, tmp_path / "k")
+    np.testing.assert_allclose(looker.corner, scene.photographs["C", 1][0, 0], atol=12)
+
+
+def test_who_is_not_found_in_the_masks_box_is_looked_for_in_the_whole_image(rig, tmp_path):
+    class Whole(Finder):
+        def __call__(self, image, box=None):
+            found = super().__call__(image, box)
+            return found if box is None else []
+
+    finder = Whole()
+    found = detect_keypoints(open_capture(rig), finder, tmp_path / "k")
+    assert len(finder.seen) == 12 and all((one.people == 1).all() for one in found.values())
+
+
 def test_nobody_anywhere_is_refused_and_nobody_somewhere_is_told(rig, tmp_path):
     with pytest.raises(InputError, match="nobody in any of 6"):
         detect_keypoints(open_capture(rig), Finder(people=0), tmp_path / "k")
 
     class Sometimes(Finder):
         def __call__(self, image, box=None):
-            return super().__call__(image, box) if len(self.seen) else (self.seen.append(None), [])[1]
+            return super().__call__(image, box) if len(self.seen) > 1 else (self.seen.append(None), [])[1]
 
     found = detect_keypoints(open_capture(rig), Sometimes(), tmp_path / "other")
     assert problems_of(found) == ("camera A: nobody was found in frame 0",)
