@@ -211,7 +211,7 @@ class _Registration:
         if bare is not None:
             self.bare = bare
         elif not self.bare.any():
-            self.bare = hands_of(self.body)
+            self.bare = hands_of(self.body) if self.observed.bare is None else self.observed.bare
         terms = replace(terms, silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         if terms.surfaces():
             state, equations = self._step("surfaces", state, terms, config.surface_steps, solve_shape, None)
@@ -265,6 +265,9 @@ class _Registration:
 
     def _believed(self, given: BodyState, rows: np.ndarray) -> Start | None:
         """A given fit as a measurement: as good as it is smooth; beside keypoints what these do not tell, as twists."""
+        stated = self.observed.initial_noise
+        if stated is not None:
+            return Start(given.select(rows), stated.pose, stated.transl, stated.shape)
         pose, transl = white_noise(given, self.frames) or _START_NOISE[:2]
         pose, transl = max(pose, _LEAST_NOISE[0]), max(transl, _LEAST_NOISE[1])
         if self.seen is not None:

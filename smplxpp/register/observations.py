@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Bool, Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
 from smplxpp.core.camera import Camera
@@ -33,6 +33,19 @@ class ScanObservation:
     labels: Integer[np.ndarray, " V"] | None = None
 
 
+@dataclass(frozen=True)
+class StartNoise:
+    """Standard deviations of a fit to start from.
+
+    Attributes:
+        pose: of each joint's turn, radians. transl: metres. shape: betas.
+    """
+
+    pose: float
+    transl: float
+    shape: float
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """Everything that a registration may use; held-out cameras are never in it.
@@ -45,10 +58,11 @@ class Observations:
             in the cameras' pixels; None: nothing of the kind.
         scans: by frame.
         landmarks: points in the world, metres, by frame and name (`smplxpp.core.keypoints`), as placed by hand.
-        initial: a fit to start from, a row a frame.
+        initial: a fit to start from, a row a frame. initial_noise: how wrong it is; None: as its own jitter tells.
         shape_frames: those that the shape, and whatever else all frames share, is solved on; None: all. Frames held out
             are none of them: they get their poses alone.
         fps: frames a second, None where not known.
+        bare: vertices of the body that are known to be skin, beside those that label maps and labelled scans show.
     """
 
     frames: tuple[int, ...]
@@ -59,8 +73,10 @@ class Observations:
     scans: Mapping[int, ScanObservation] = field(default_factory=dict)
     landmarks: Mapping[int, Mapping[str, Float[np.ndarray, " 3"]]] = field(default_factory=dict)
     initial: BodyParams | None = None
+    initial_noise: StartNoise | None = None
     shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
+    bare: Bool[np.ndarray, " V"] | None = None
 
 
 def check_observations(body: BodyModel, observed: Observations) -> None:
