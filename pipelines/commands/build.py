@@ -41,7 +41,7 @@ StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
 @dataclass(frozen=True)
 class Build:
-    """Options of `smplxpp build`. Give --capture, or --scan with --params (and --labels unless the scan holds them)."""
+    """Options of `smplxpp build`. Give --capture, or --scan: alone, or with what is known of it (--params, --labels)."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; stages that stand in it are not run again."""
@@ -50,21 +50,24 @@ class Build:
     scan: OptionalPath = None
     """Clothed scan of the reference frame (PLY, OBJ, GLB, STL, OFF, npz)."""
     params: OptionalPath = None
-    """Body parameters of that frame, any layout that `smplxpp params convert` reads."""
+    """Body parameters of that frame, any layout that `smplxpp params convert` reads. Without them the body is found in
+    the scan."""
     labels: OptionalPath = None
-    """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh."""
+    """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh. Where neither they, nor the
+    scan, nor label maps of its views say what is what, the body in the scan and its colours do."""
     landmarks: OptionalPath = None
-    """Landmarks of the scan, a JSON object of points by name: with --scan they stand in for --params. Kept in the run
-    as landmarks.json, which is read whenever it lies there."""
+    """Landmarks of the scan, a JSON object of points by name: they tell where the body is that is not given. Kept in the
+    run as landmarks.json, which is read whenever it lies there."""
     corrections: OptionalPath = None
     """Labels corrected by hand, as `smplxpp label` writes them. Kept in the run as labels_corrections.json, which is
     read whenever it lies there."""
     label_set: str = "auto"
     """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
     auto: `capture` with --capture, else 4ddress."""
-    label_source: Literal["auto", "scan", "views"] = "auto"
-    """With --capture: labels that come with the scan, or votes of its views' label maps. auto: the views' where there
-    are any. Labels of a scan are what nobody has of a person that was photographed."""
+    label_source: Literal["auto", "scan", "views", "body"] = "auto"
+    """Labels that come with the scan, votes of its views' label maps, or what the body in the scan and its colours say.
+    auto: the first of views, scan and body that there is. Labels of a scan are what nobody has of a person that was
+    photographed."""
     protocol: OptionalText = None
     """With --capture: the protocol whose parameters and labels are used; later commands on the run keep to it."""
     frame: int = 0
@@ -75,10 +78,10 @@ class Build:
     """Register the body to the capture (or to the scan) before anything else, starting from the parameters if there are
     any. auto: where the capture says that its parameters are tracked, where it has keypoints and no parameters, and
     where `smplxpp register` has written into this run."""
-    units: Literal["m", "cm", "mm", "inch"] = "m"
-    """Units of the scan file."""
-    up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
-    """Upward axis of the scan file."""
+    units: Literal["auto", "m", "cm", "mm", "inch"] = "auto"
+    """Units of the scan file. auto: found where the scan comes alone, else those of the parameters, metres."""
+    up: Literal["auto", "y", "z", "x", "-y", "-z", "-x"] = "auto"
+    """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
     keep_webs: bool = False
     """Keep the scan's surface where it bridges two limbs, as under the arms; it tears when the pose opens them."""
     method: Literal["ours", "paper"] = "ours"
@@ -158,7 +161,7 @@ class Build:
         if (self.capture is None) == (self.scan is None):
             raise InputError(
                 "input",
-                expected="either --capture, or --scan with --params",
+                expected="either --capture or --scan",
                 received="both" if self.capture else "neither",
             )
         label_set = self.label_set
@@ -168,34 +171,39 @@ class Build:
                 self.capture, frame=self.frame, params=self.params, protocol=self.protocol, fitted=not registered
             )
             labels = self.labels or self._scan_labels(found)
+            by_body = self.label_source == "body"
             return BuildInputs(
                 subject=found.subject,
                 scan=found.scan,
                 params=None if registered else found.params,
+                registers=registered,
                 frame=found.frame,
                 params_row=found.params_frame,
                 labels=labels,
-                label_maps={} if labels else found.label_maps,
+                label_maps={} if labels or by_body else found.label_maps,
                 photographs=dict(spread(list(found.photographs.items()), MOST_PHOTOGRAPHS)),
                 cameras=found.cameras_file if found.photographs or not labels else None,
                 label_set="capture" if label_set == "auto" else label_set,
+                label_source="body" if by_body else "auto",
                 motion=None if registered else found.motion,
                 body=self.body,
                 protocol=self.protocol,
             )
         if self.protocol is not None:
             raise InputError("option protocol", expected="with --capture", received="with --scan")
-        placed = self.landmarks is not None or (self.out / LANDMARKS_FILE).exists()
-        if self.scan is None or (self.params is None and not placed):
-            raise InputError("input", expected="--params with --scan, or --landmarks", received="neither")
+        assert self.scan is not None
+        registers = self.params is not None and self.register == "on"
         return BuildInputs(
             subject=self.scan.stem,
             scan=self.scan,
-            params=None if self.register == "on" else self.params,
+            params=None if registers else self.params,
+            registers=registers,
+            locates=self.params is None,
             frame=self.frame,
             params_row=self.frame,
             labels=self.labels,
             label_set="4ddress" if label_set == "auto" else label_set,
+            label_source="body" if self.label_source == "body" else "auto",
             body=self.body,
         )
 
@@ -235,7 +243,7 @@ class Build:
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
         """What the body is registered to, None where the parameters are given."""
-        if inputs.params is not None:
+        if not inputs.registers:
             return None
         return self._standing_registration() or RegisterInputs(
             capture=self.capture,
@@ -246,29 +254,27 @@ class Build:
             frame=self.frame,
             labels=inputs.labels,
             label_set=inputs.label_set,
-            units=self.units,
-            up=self.up,
+            units="m" if self.units == "auto" else self.units,
+            up="y" if self.up == "auto" else self.up,
         )
 
     def _scan_labels(self, found: ReferenceFrame) -> Path | None:
-        """The labels that come with the scan, if they are used; None where the views' label maps are.
+        """The labels that come with the scan, if they are used; None where the views' label maps are, or the body's.
 
         Raises:
             InputError: the labels that are asked for are not there.
         """
-        if found.label_maps and self.label_source != "scan":
-            return None
-        if found.scan_labels is None or self.label_source == "views":
-            expected = {"scan": "labels of the scan", "views": "label maps of its views"}.get(
-                self.label_source, "label maps of its views or labels of the scan"
-            )
+        views, scan = bool(found.label_maps), found.scan_labels is not None
+        if self.label_source in ("views", "scan") and not {"views": views, "scan": scan}[self.label_source]:
             barred = f", by protocol {self.protocol}" if self.protocol else ""
             raise InputError(
                 f"capture {found.subject}",
-                expected=expected,
+                expected={"scan": "labels of the scan", "views": "label maps of its views"}[self.label_source],
                 received=f"none for frame {found.frame}{barred}",
                 remedy="name a file with --labels",
             )
+        if self.label_source == "body" or (views and self.label_source != "scan") or not scan:
+            return None
         if self.label_source == "auto":
             log.warning(
                 "no label maps of frame %d: the labels that come with the scan are used, which are no estimate",
@@ -301,6 +307,12 @@ class Build:
                 raise InputError(
                     f"option {name}", expected=f"a finite number, at least {least:g}{limit}", received=f"{value:g}"
                 )
-        names = {f.name for f in dataclasses.fields(BuildConfig)} - {"budgets", "webs"}
-        webs = replace(default.webs, rounds=0) if self.keep_webs else default.webs
-        return BuildConfig(**{n: getattr(self, n) for n in names}, budgets=default.budgets | self.budgets, webs=webs)
+        alone = self.scan is not None and self.params is None
+        changed = {
+            "units": self.units if alone or self.units != "auto" else "m",
+            "up": self.up if alone or self.up != "auto" else "y",
+            "budgets": default.budgets | self.budgets,
+            "webs": replace(default.webs, rounds=0) if self.keep_webs else default.webs,
+        }
+        names = {f.name for f in dataclasses.fields(BuildConfig)} - set(changed)
+        return BuildConfig(**{n: getattr(self, n) for n in names}, **changed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 RECONSTRUCT_STAGE = "02_reconstruct"
+LOCATE_STAGE = "03_locate"
 REGISTER_STAGE = "05_register"
 CAPTURE_STAGE = "00_capture"
 POSE_BODY_STAGE = "10_body"
@@ -31,14 +32,16 @@ TEMPLATE_STAGES = (
     VALIDATE_STAGE,
 )
 """The stages of every build."""
-BUILD_STAGES = (REGISTER_STAGE, *TEMPLATE_STAGES)
-"""The stages of `smplxpp build` in their order: a registration, where there is one, gives the parameters."""
+BUILD_STAGES = (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE, *TEMPLATE_STAGES)
+"""The stages of `smplxpp build` in their order. Parameters that are not given come from a registration, or from the body
+found in a scan that comes alone, which a registration may start from."""
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
-ALL_STAGES = (RECONSTRUCT_STAGE, *BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
+ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
 
 RECONSTRUCTION = f"{RECONSTRUCT_STAGE}/reconstruction.json"
+LOCATED_PARAMS = f"{LOCATE_STAGE}/params.npz"
 REGISTERED_PARAMS = f"{REGISTER_STAGE}/params.npz"
 REGISTRATION = f"{REGISTER_STAGE}/registration.json"
 SCAN = f"{CAPTURE_STAGE}/scan.npz"

@@ -18,6 +18,8 @@ from pipelines.runs.layout import (
     CAPTURE_STAGE,
     CLEAN_STAGE,
     CORRECTIONS_FILE,
+    LANDMARKS_FILE,
+    LOCATE_STAGE,
     METRICS_FILE,
     POSE_BODY_STAGE,
     REGISTER_STAGE,
@@ -28,7 +30,7 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
-from pipelines.stages import assemble, capture, clean, pose_body, segment, transfer, unpose, validate
+from pipelines.stages import assemble, capture, clean, locate, pose_body, segment, transfer, unpose, validate
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
 from pipelines.stages.register_capture import register_capture
 from pipelines.stages.register_config import RegisterInputs
@@ -61,15 +63,19 @@ class _Part:
 
 
 PARTS: dict[str, _Part] = {
+    LOCATE_STAGE: _Part(locate, settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)),
     CAPTURE_STAGE: _Part(
-        capture, (REGISTER_STAGE,), settings=("units", "up", "frame", "params_row"), files=("scan", "params", "body")
+        capture,
+        (LOCATE_STAGE, REGISTER_STAGE),
+        settings=("units", "up", "frame", "params_row"),
+        files=("scan", "params", "body"),
     ),
     POSE_BODY_STAGE: _Part(pose_body, (CAPTURE_STAGE,), files=("body",)),
     SEGMENT_STAGE: _Part(
         segment,
         (CAPTURE_STAGE,),
-        settings=("label_set",),
-        files=("labels", "label_maps", "cameras", "scan"),
+        settings=("label_set", "label_source"),
+        files=("labels", "label_maps", "cameras", "scan", "body"),
         by_hand=(CORRECTIONS_FILE,),
     ),
     CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
@@ -121,9 +127,7 @@ def build(
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
-    assert (inputs.params is None) == (registration is not None), (
-        "a registration gives the parameters that are not given"
-    )
+    assert (REGISTER_STAGE in inputs.stages) == (registration is not None), "a registration is of what it registers to"
     _check_inputs(inputs)
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)

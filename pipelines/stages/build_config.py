@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE_STAGES
+from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
 from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from pipelines.runs.reading import values_of
@@ -35,11 +35,14 @@ class BuildInputs:
     Attributes:
         subject: name used in the report.
         scan: clothed scan of the reference frame.
-        params: body parameters; None: those that the run's registration gives. params_row: the frame's row in a file
-            that stacks several.
+        params: body parameters; None: those that the run's registration gives, or what is found in the scan.
+            params_row: the frame's row in a file that stacks several.
+        registers: whether parameters that are not given come from a registration. locates: whether the body has to be
+            found in the scan first.
         frame: number of the frame in its capture: what trainings take its photographs by.
-        labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them or
-            views do.
+        labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them,
+            views do, or the fitted body is to tell them. label_source: "auto" takes what there is, in this order;
+            "body" looks at no labels.
         label_maps: label image by camera name, with `cameras` their camera file.
         photographs: image of the frame by camera name, of the same cameras: what a mirrored scan is told by.
         label_set: name of the label set that labels and label maps use, or a JSON mapping file.
@@ -58,14 +61,18 @@ class BuildInputs:
     photographs: dict[str, Path] = field(default_factory=dict)
     cameras: Path | None = None
     label_set: str = "4ddress"
+    label_source: str = "auto"
+    registers: bool = False
+    locates: bool = False
     motion: Path | None = None
     body: Path | None = None
     protocol: str | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The stages of the build, in order: with a registration where the parameters are to come from one."""
-        return BUILD_STAGES if self.params is None else TEMPLATE_STAGES
+        """The stages of the build, in order: those that make parameters where they are to be made."""
+        makers = ((LOCATE_STAGE, self.locates), (REGISTER_STAGE, self.registers))
+        return (*(name for name, needed in makers if needed), *TEMPLATE_STAGES)
 
 
 @dataclass(frozen=True)
@@ -149,8 +156,9 @@ def _config(values: Mapping[str, Any]) -> BuildConfig:
 
 
 def _inputs(written: Mapping[str, Any]) -> BuildInputs:
-    # Builds of earlier versions had no protocols and looked at no photographs.
-    values = {"protocol": None, "photographs": {}, **written}
+    # Builds of earlier versions had no protocols, looked at no photographs, and registered what they were not given.
+    values = {"protocol": None, "photographs": {}, "label_source": "auto", "locates": False, **written}
+    values = {"registers": values.get("params") is None, **values}
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
     found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
     found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}

@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import load_stacked_params
 from pipelines.runs.gates import ROUGHNESS
-from pipelines.runs.layout import REGISTERED_PARAMS
+from pipelines.runs.layout import LOCATED_PARAMS, REGISTERED_PARAMS
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from pipelines.stages.scan_files import read_scan
@@ -42,6 +42,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     )
     _params_of_frame(build).save(folder / "params.npz")
     numbers = {"vertices": clean.mesh.vertex_count, "faces": clean.mesh.face_count, "repairs": str(clean.report)}
+    numbers |= {"units": scan.units, "up": scan.up, "said": list(scan.said)}
     numbers |= {"smoothing_steps": smoothed.steps, "smoothing_moved_mm": smoothed.moved * MM}
     explanation = "how far vertices stand off their neighbours, as a share of the median edge"
     if smoothed.steps:
@@ -50,7 +51,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def _params_of_frame(build: BuildContext) -> BodyParams:
-    """The reference frame's parameters: given ones, or those of the run's registration.
+    """The reference frame's parameters: given ones, those of the run's registration, or of the body that was found.
 
     Raises:
         InputError: the frame could not be registered.
@@ -59,6 +60,8 @@ def _params_of_frame(build: BuildContext) -> BodyParams:
     if inputs.params is not None:
         params = load_params(inputs.params, body=load_body(inputs.body))
         return params.frame(inputs.params_row if len(params) > 1 else 0)
+    if not inputs.registers:
+        return load_params(build.run / LOCATED_PARAMS)
     frames, fitted = load_stacked_params(build.run / REGISTERED_PARAMS)
     if inputs.frame not in frames:
         raise InputError(

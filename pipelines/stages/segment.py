@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.runs.artefacts import (
+    load_params_of_run,
     load_scan,
     load_source_faces,
 )
@@ -14,7 +15,8 @@ from pipelines.runs.checks import Check
 from pipelines.runs.layout import CORRECTIONS_FILE, SCAN
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
-from pipelines.stages.build_config import BuildContext
+from pipelines.stages.build_config import BuildContext, BuildInputs
+from smplxpp.body import load_body
 from smplxpp.capture import read_cameras
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, display_colors
@@ -23,49 +25,30 @@ from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.segment import (
     Corrections,
     SegmentedScan,
+    holds_labels,
+    label_by_body,
     read_label_map,
     read_labels,
     segment_scan,
     vote_on_faces,
 )
 
+DOUBTFUL = 0.5
+"""Confidence of a face below which its label should be looked at."""
+
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write a label, a confidence and a seen flag for every face."""
-    scan, _, source_vertex = load_scan(build.run)
-    if build.inputs.labels is None and build.inputs.label_maps:
-        file = build.inputs.cameras
-        assert file is not None  # the build has checked it
-        cameras = {camera.name: camera for camera in read_cameras(file)}
-        missing = sorted(set(build.inputs.label_maps) - set(cameras))
-        if missing:
-            raise InputError(
-                f"camera file {file.name}",
-                expected=f"cameras {', '.join(missing)}",
-                received=f"cameras {', '.join(sorted(cameras))}",
-            )
-        views = [
-            (cameras[name], read_label_map(path, label_set=build.inputs.label_set))
-            for name, path in build.inputs.label_maps.items()
-        ]
-        result = segment_scan(scan, votes=vote_on_faces(scan, views))
+    scan, colors, source_vertex = load_scan(build.run)
+    source = label_source(build.inputs)
+    if source == "views":
+        result = _by_views(scan, build.inputs)
+    elif source == "body":
+        body, params = load_body(build.inputs.body), load_params_of_run(build.run)
+        # A scan without colours is stored in one.
+        result = label_by_body(scan, body, params, colors=colors if colors.std() else None)
     else:
-        raw = read_raw_mesh(build.inputs.scan, clouds=True)
-        labels = read_labels(
-            build.inputs.labels or build.inputs.scan,
-            vertex_count=len(raw.vertices),
-            face_count=len(raw.faces),
-            label_set=build.inputs.label_set,
-            source_faces=raw.source_faces,
-        )
-        if len(labels) == len(raw.faces):
-            with values_of(build.run / SCAN):
-                of_faces = labels[load_source_faces(build.run)]
-            result = segment_scan(scan, face_labels=of_faces)
-        else:
-            with values_of(build.run / SCAN):
-                of_vertices = labels[source_vertex]
-            result = segment_scan(scan, vertex_labels=of_vertices)
+        result = _by_file(scan, source_vertex, build)
     before = result
     result = _corrected(build.run, scan, result)
     assert result.corrected is not None
@@ -89,30 +72,86 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         },
     )
     areas = scan.face_areas / scan.face_areas.sum()
-    checks = [
-        Check(
-            "label confidence, mean",
-            float(areas @ result.confidence),
-            "",
-            0.8,
-            0.5,
-            higher_is_better=True,
-            explanation="area-weighted; how clearly the labels speak for the answer",
-        ),
-        Check(
-            "share of the surface no label saw",
-            float(areas @ ~result.seen),
-            "",
-            0.25,
-            0.6,
-            explanation="labelled from its neighbours alone",
-        ),
-    ]
+    unseen = Check(
+        "share of the surface no label saw",
+        float(areas @ ~result.seen),
+        "",
+        0.25,
+        0.6,
+        explanation="labelled from its neighbours alone",
+    )
+    doubt = Check(
+        "share of the surface with a doubtful label",
+        float(areas @ (result.confidence < DOUBTFUL)),
+        "",
+        0.15,
+        0.4,
+        explanation=f"told by the body and colours with a confidence below {DOUBTFUL:g}; look at it, and correct it "
+        "with `smplxpp label`",
+    )
+    confidence = Check(
+        "label confidence, mean",
+        float(areas @ result.confidence),
+        "",
+        0.8,
+        0.5,
+        higher_is_better=True,
+        explanation="area-weighted; how clearly the labels speak for the answer",
+    )
     numbers = {
-        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
+        "labels_from": source,
         "corrected_by_hand": float(areas @ result.corrected),
+        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
     }
-    return StageOutput(checks, numbers)
+    return StageOutput([confidence, doubt if source == "body" else unseen], numbers)
+
+
+def label_source(inputs: BuildInputs) -> str:
+    """Who says what is what: "file" of labels, or the scan's own, "views" and their label maps, or else the "body"."""
+    if inputs.label_source == "body":
+        return "body"
+    if inputs.labels is None and inputs.label_maps:
+        return "views"
+    return "file" if inputs.labels is not None or holds_labels(inputs.scan) else "body"
+
+
+def _by_views(scan: TriangleMesh, inputs: BuildInputs) -> SegmentedScan:
+    """Votes of label maps.
+
+    Raises:
+        InputError: maps of cameras that the camera file does not have.
+    """
+    file = inputs.cameras
+    assert file is not None  # the build has checked it
+    cameras = {camera.name: camera for camera in read_cameras(file)}
+    missing = sorted(set(inputs.label_maps) - set(cameras))
+    if missing:
+        raise InputError(
+            f"camera file {file.name}",
+            expected=f"cameras {', '.join(missing)}",
+            received=f"cameras {', '.join(sorted(cameras))}",
+        )
+    views = [
+        (cameras[name], read_label_map(path, label_set=inputs.label_set)) for name, path in inputs.label_maps.items()
+    ]
+    return segment_scan(scan, votes=vote_on_faces(scan, views))
+
+
+def _by_file(scan: TriangleMesh, source_vertex: np.ndarray, build: BuildContext) -> SegmentedScan:
+    """Labels of the vertices or faces of the scan's file."""
+    inputs = build.inputs
+    raw = read_raw_mesh(inputs.scan, clouds=True)
+    labels = read_labels(
+        inputs.labels or inputs.scan,
+        vertex_count=len(raw.vertices),
+        face_count=len(raw.faces),
+        label_set=inputs.label_set,
+        source_faces=raw.source_faces,
+    )
+    with values_of(build.run / SCAN):
+        if len(labels) == len(raw.faces):
+            return segment_scan(scan, face_labels=labels[load_source_faces(build.run)])
+        return segment_scan(scan, vertex_labels=labels[source_vertex])
 
 
 def _corrected(run: Path, scan: TriangleMesh, result: SegmentedScan) -> SegmentedScan:

@@ -2,7 +2,7 @@
 
 from smplxpp.segment.by_body import ByBodyConfig, label_by_body
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
-from smplxpp.segment.label_files import labels_from_colors, read_label_map, read_labels
+from smplxpp.segment.label_files import holds_labels, labels_from_colors, read_label_map, read_labels
 from smplxpp.segment.labels import LABEL_SETS, LabelSet, find_label_set, map_labels
 from smplxpp.segment.segment import SegmentConfig, SegmentedScan, segment_scan
 from smplxpp.segment.votes import vote_on_faces
@@ -18,6 +18,7 @@ __all__ = [
     "SegmentedScan",
     "StrokeCorrection",
     "find_label_set",
+    "holds_labels",
     "label_by_body",
     "labels_from_colors",
     "map_labels",

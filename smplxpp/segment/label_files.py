@@ -153,6 +153,23 @@ def _as_array(values: Any, path: Path) -> np.ndarray:
     return as_numbers(values, subject=f"label file {path}")
 
 
+def holds_labels(path: str | Path) -> bool:
+    """Whether a mesh file says what its surface is: a property with a name of labels, or the table's display colours.
+
+    Raises:
+        InputError: it is no mesh file.
+    """
+    raw = read_raw_mesh(path, clouds=True)
+    if any(key in properties for properties in (raw.vertex_properties, raw.face_properties) for key in _KEYS):
+        return True
+    return raw.vertex_colors is not None and _of_the_table(labels_from_colors(raw.vertex_colors))
+
+
+def _of_the_table(labels: np.ndarray) -> bool:
+    """Whether colours are display colours of labels: most of them are in the table."""
+    return bool((labels == BACKGROUND).mean() <= 0.5)
+
+
 def _read_from_mesh(
     path: Path, vertex_count: int, face_count: int, label_set: str | Path | LabelSet, color_tolerance: float
 ) -> np.ndarray:
@@ -175,7 +192,7 @@ def _read_from_mesh(
             received="neither",
         )
     labels = labels_from_colors(file.vertex_colors, tolerance=color_tolerance)
-    if (labels == BACKGROUND).mean() > 0.5:
+    if not _of_the_table(labels):
         raise InputError(
             f"label file {path}",
             expected="vertex colours from the table of labels",
