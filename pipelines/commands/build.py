@@ -23,10 +23,12 @@ from pipelines.runs.layout import (
     REFINE_STAGE,
     REGISTER_STAGE,
     TRAIN_STAGES,
+    reconstructed_scan,
 )
 from pipelines.runs.places import keep_out_of_capture, same_place
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildConfig, BuildInputs
+from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
@@ -46,7 +48,8 @@ class Build:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; stages that stand in it are not run again."""
     capture: OptionalPath = None
-    """Folder of a capture: scans/scan_FFFFFF.ply, params/, labels."""
+    """Folder of a capture: photographs, cameras and masks; scans/scan_FFFFFF.ply, params/, labels as far as there are
+    any. A scan that there is not is reconstructed, and the body is found."""
     scan: OptionalPath = None
     """Clothed scan of the reference frame (PLY, OBJ, GLB, STL, OFF, npz)."""
     params: OptionalPath = None
@@ -55,6 +58,10 @@ class Build:
     labels: OptionalPath = None
     """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh. Where neither they, nor the
     scan, nor label maps of its views say what is what, the body in the scan and its colours do."""
+    keypoints: OptionalPath = None
+    """With --capture: folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of its own."""
+    masks: OptionalPath = None
+    """With --capture: folder of masks, in the place of its own."""
     landmarks: OptionalPath = None
     """Landmarks of the scan, a JSON object of points by name: they tell where the body is that is not given. Kept in the
     run as landmarks.json, which is read whenever it lies there."""
@@ -128,6 +135,7 @@ class Build:
                 inputs,
                 config,
                 registration=self.registration(inputs),
+                reconstruction=self.reconstruction(inputs),
                 first=self.from_stage,
                 last=self.until_stage,
                 progress=step,
@@ -168,14 +176,21 @@ class Build:
         if self.capture is not None:
             registered = self._registers()
             found = find_reference(
-                self.capture, frame=self.frame, params=self.params, protocol=self.protocol, fitted=not registered
+                self.capture,
+                frame=self.frame,
+                params=self.params,
+                protocol=self.protocol,
+                fitted=not registered,
+                scanned=False,
             )
             labels = self.labels or self._scan_labels(found)
             by_body = self.label_source == "body"
             return BuildInputs(
                 subject=found.subject,
-                scan=found.scan,
+                scan=found.scan or self.out / reconstructed_scan(found.frame),
                 params=None if registered else found.params,
+                reconstructs=found.scan is None,
+                locates=registered and not self._starts(found),
                 registers=registered,
                 frame=found.frame,
                 params_row=found.params_frame,
@@ -189,8 +204,9 @@ class Build:
                 body=self.body,
                 protocol=self.protocol,
             )
-        if self.protocol is not None:
-            raise InputError("option protocol", expected="with --capture", received="with --scan")
+        for name in ("protocol", "keypoints", "masks"):
+            if getattr(self, name) is not None:
+                raise InputError(f"option {name}", expected="with --capture", received="with --scan")
         assert self.scan is not None
         registers = self.params is not None and self.register == "on"
         return BuildInputs(
@@ -218,10 +234,15 @@ class Build:
             return False
         said = SaidOfInputs.of_folder(self.capture, self.protocol)
         params = said.own_parameters() if self.params is None else named_params(self.capture, self.params)
-        if params is None:
-            files = choose_protocol(self.capture, read_description(self.capture), self.protocol)
-            return files.keypoints is not None and (self.capture / files.keypoints).is_dir()
-        return said.given_parameters(params) == TRACKED
+        return params is None or said.given_parameters(params) == TRACKED
+
+    def _starts(self, found: ReferenceFrame) -> bool:
+        """Whether a registration has something to start from: a fit, keypoints, or that it stands."""
+        assert self.capture is not None
+        if found.params is not None or self.keypoints is not None or self._standing_registration() is not None:
+            return True
+        files = choose_protocol(self.capture, read_description(self.capture), self.protocol)
+        return files.keypoints is not None and (self.capture / files.keypoints).is_dir()
 
     def _standing_registration(self) -> RegisterInputs | None:
         """What `smplxpp register` has made in this run of this capture, from these parameters if any are named."""
@@ -250,13 +271,26 @@ class Build:
             params=named_params(self.capture, self.params),
             protocol=self.protocol,
             body=self.body,
-            scan=self.scan,
+            scan=inputs.scan if inputs.reconstructs else self.scan,
             frame=self.frame,
             labels=inputs.labels,
             label_set=inputs.label_set,
+            keypoints=self.keypoints,
+            masks=self.masks,
             units="m" if self.units == "auto" else self.units,
             up="y" if self.up == "auto" else self.up,
         )
+
+    def reconstruction(self, inputs: BuildInputs) -> ReconstructInputs | None:
+        """The photographs that the scan is made of, None where there is one; what `smplxpp reconstruct` has made of
+        this frame stands."""
+        if not inputs.reconstructs:
+            return None
+        assert self.capture is not None
+        found = load_reconstruct(self.out)
+        if found is not None and inputs.scan.is_file() and same_place(found.capture, self.capture):
+            return found
+        return ReconstructInputs(self.capture, frames=(self.frame,), masks=self.masks, protocol=self.protocol)
 
     def _scan_labels(self, found: ReferenceFrame) -> Path | None:
         """The labels that come with the scan, if they are used; None where the views' label maps are, or the body's.

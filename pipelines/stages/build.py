@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
@@ -22,6 +22,7 @@ from pipelines.runs.layout import (
     LOCATE_STAGE,
     METRICS_FILE,
     POSE_BODY_STAGE,
+    RECONSTRUCT_STAGE,
     REGISTER_STAGE,
     SEGMENT_STAGE,
     TRANSFER_STAGE,
@@ -32,6 +33,8 @@ from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
 from pipelines.stages import assemble, capture, clean, locate, pose_body, segment, transfer, unpose, validate
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
+from pipelines.stages.reconstruct import reconstruct_capture
+from pipelines.stages.reconstruct_config import ReconstructInputs
 from pipelines.stages.register_capture import register_capture
 from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import load_body, load_params
@@ -63,7 +66,7 @@ class _Part:
 
 
 PARTS: dict[str, _Part] = {
-    LOCATE_STAGE: _Part(locate, settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)),
+    LOCATE_STAGE: _Part(locate, (RECONSTRUCT_STAGE,), settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)),
     CAPTURE_STAGE: _Part(
         capture,
         (LOCATE_STAGE, REGISTER_STAGE),
@@ -104,6 +107,7 @@ def build(
     config: BuildConfig,
     *,
     registration: RegisterInputs | None = None,
+    reconstruction: ReconstructInputs | None = None,
     first: str = BUILD_STAGES[0],
     last: str = BUILD_STAGES[-1],
     progress: Callable[[str, bool], None] = lambda name, done: None,
@@ -114,7 +118,8 @@ def build(
     code and libraries have not changed is not run again.
 
     Args:
-        registration: what the body is registered to, where the inputs have no parameters.
+        registration: what the body is registered to, where the inputs say that it is. reconstruction: what the scan is
+            made of, where they say that.
         progress: called with a stage's name before (False) and after (True) it.
 
     Returns:
@@ -127,22 +132,29 @@ def build(
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
-    assert (REGISTER_STAGE in inputs.stages) == (registration is not None), "a registration is of what it registers to"
+    assert (REGISTER_STAGE in inputs.stages) == (registration is not None), "what to register to"
+    assert inputs.reconstructs == (reconstruction is not None), "what to reconstruct from"
     _check_inputs(inputs)
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)
-        records = _run_stages(BuildContext(run, inputs, config), registration, first, last, progress)
+        makers = {}
+        if reconstruction is not None:
+            makers[RECONSTRUCT_STAGE] = partial(reconstruct_capture, run, reconstruction)
+        if registration is not None:
+            makers[REGISTER_STAGE] = partial(register_capture, run, registration)
+        records = _run_stages(BuildContext(run, inputs, config), makers, first, last, progress)
         write_metrics(run, inputs, records)
     return records
 
 
 def _run_stages(
     context: BuildContext,
-    registration: RegisterInputs | None,
+    makers: Mapping[str, Callable[[], StageRecord]],
     first: str,
     last: str,
     progress: Callable[[str, bool], None],
 ) -> dict[str, StageRecord]:
+    """Run stages one after the other; those of `makers` have commands of their own."""
     records: dict[str, StageRecord] = {}
     for name in BUILD_STAGES[: BUILD_STAGES.index(last) + 1]:
         if name not in context.inputs.stages:
@@ -151,9 +163,8 @@ def _run_stages(
             records[name] = require_stage(context.run, name)
             continue
         progress(name, False)
-        if name == REGISTER_STAGE:
-            assert registration is not None  # the build has checked it
-            records[name] = register_capture(context.run, registration)
+        if name in makers:
+            records[name] = makers[name]()
         else:
             stage, module = _stage(name, context, records), PARTS[name].module
             records[name] = run_stage(context.run, stage, partial(module.run, build=context))
@@ -197,7 +208,7 @@ def write_metrics(run: Path, inputs: BuildInputs, records: dict[str, StageRecord
 def _check_inputs(inputs: BuildInputs) -> None:
     """What can be known before the first stage starts: files that are missing, and those only the last stages read."""
     for name in ("scan", "params", "labels", "cameras", "motion", "body"):
-        path = getattr(inputs, name)
+        path = None if name == "scan" and inputs.reconstructs else getattr(inputs, name)
         if path is not None and not Path(path).exists():
             raise InputError(f"option {name}", expected="an existing file", received=str(path))
     if inputs.label_maps and inputs.cameras is None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
+from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
 from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from pipelines.runs.reading import values_of
@@ -37,8 +37,8 @@ class BuildInputs:
         scan: clothed scan of the reference frame.
         params: body parameters; None: those that the run's registration gives, or what is found in the scan.
             params_row: the frame's row in a file that stacks several.
-        registers: whether parameters that are not given come from a registration. locates: whether the body has to be
-            found in the scan first.
+        reconstructs: whether the scan is one that the run makes of photographs. locates: whether the body has to be
+            found in the scan. registers: whether the parameters come from a registration.
         frame: number of the frame in its capture: what trainings take its photographs by.
         labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them,
             views do, or the fitted body is to tell them. label_source: "auto" takes what there is, in this order;
@@ -62,8 +62,9 @@ class BuildInputs:
     cameras: Path | None = None
     label_set: str = "4ddress"
     label_source: str = "auto"
-    registers: bool = False
+    reconstructs: bool = False
     locates: bool = False
+    registers: bool = False
     motion: Path | None = None
     body: Path | None = None
     protocol: str | None = None
@@ -71,7 +72,11 @@ class BuildInputs:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages of the build, in order: those that make parameters where they are to be made."""
-        makers = ((LOCATE_STAGE, self.locates), (REGISTER_STAGE, self.registers))
+        makers = (
+            (RECONSTRUCT_STAGE, self.reconstructs),
+            (LOCATE_STAGE, self.locates),
+            (REGISTER_STAGE, self.registers),
+        )
         return (*(name for name, needed in makers if needed), *TEMPLATE_STAGES)
 
 
@@ -157,7 +162,8 @@ def _config(values: Mapping[str, Any]) -> BuildConfig:
 
 def _inputs(written: Mapping[str, Any]) -> BuildInputs:
     # Builds of earlier versions had no protocols, looked at no photographs, and registered what they were not given.
-    values = {"protocol": None, "photographs": {}, "label_source": "auto", "locates": False, **written}
+    added = {"protocol": None, "photographs": {}, "label_source": "auto", "reconstructs": False, "locates": False}
+    values = {**added, **written}
     values = {"registers": values.get("params") is None, **values}
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
     found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}

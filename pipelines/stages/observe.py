@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from pipelines.runs.digests import sha256_file
+from pipelines.stages.located import LOCATED_FILES, read_located
 from pipelines.stages.observed_scans import observed_scans
 from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import BodyModel, load_params
@@ -66,6 +67,7 @@ class Observed:
 
     Attributes:
         digests: SHA-256 by name of everything that a registration reads.
+        found: the body that was found in the reference frame's scan, one row, where nothing else tells where it is.
         problems: what was left out on opening, in words. maps: that say more when they are read.
     """
 
@@ -74,17 +76,21 @@ class Observed:
     digests: dict[str, str]
     problems: tuple[str, ...]
     maps: tuple[ViewMaps, ...] = ()
+    found: BodyParams | None = None
 
     def all_problems(self) -> tuple[str, ...]:
         """Everything that was wrong with the inputs, as far as they were read."""
         return (*self.problems, *(words for one in self.maps for words in one.problems.values()))
 
 
-def observe(inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None = None) -> Observed:
+def observe(
+    inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None = None, located: Path | None = None
+) -> Observed:
     """Collect what a registration of these inputs sees.
 
     Args:
         landmarks: file of those that were placed by hand on the reference frame's scan.
+        located: folder of the stage that found the body in that scan (`pipelines.stages.locate`).
 
     Raises:
         InputError: neither cameras nor scans, keypoints without cameras, nothing to start from, parameters of another
@@ -103,16 +109,20 @@ def observe(inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None =
     if not cameras and not files:
         _refuse_nothing(capture)
     masks, labels = (_maps(capture, cameras, kind) for kind in ("mask", "label"))
-    scans, problems = observed_scans(files, inputs, capture, labels)
+    scans, problems = observed_scans(files, inputs, capture, labels, located)
     problems = [*unread, *problems]
     initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
     placed = _placed(landmarks, inputs.frame, body) if landmarks is not None and inputs.frame in frames else {}
-    if initial is None and not keypoints and not placed:
+    found, bare = None, None
+    if initial is None and located is not None and inputs.frame in frames:
+        found, bare = read_located(located, body)
+    if initial is None and not keypoints and not placed and found is None:
         raise InputError(
             f"capture {capture.name}",
             expected="keypoints of its training cameras, or a fit to start from",
             received="neither",
-            remedy="detect keypoints (smplxpp keypoints detect, then --keypoints), or name a fit with --params",
+            remedy="detect keypoints (smplxpp keypoints detect, then --keypoints), name a fit with --params, or let "
+            "`smplxpp build` find the body in the reference frame",
         )
     shape = tuple(frame for frame in frames if frame not in held_out)
     if not shape:
@@ -130,10 +140,13 @@ def observe(inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None =
         initial=initial,
         fps=capture.fps,
         shape_frames=shape,
+        bare=bare,
     )
     maps = tuple(one for one in (masks, labels) if one is not None)
     digests = _digests(observations, capture, files, inputs, landmarks if placed else None)
-    return Observed(capture, observations, digests, (*problems, *more), maps)
+    if found is not None and located is not None:
+        digests |= {f"{located.name}/{file}": sha256_file(located / file) for file in LOCATED_FILES}
+    return Observed(capture, observations, digests, (*problems, *more), maps, found)
 
 
 def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | None) -> Observed:
@@ -155,7 +168,7 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Non
         _check_body(initial, body, str(given))
     placed = {} if landmarks is None else _placed(landmarks, inputs.frame, body)
     files = {inputs.frame: inputs.scan}
-    scans, _ = observed_scans(files, inputs, None, None)
+    scans, _ = observed_scans(files, inputs, None, None, None)
     observations = Observations(
         (inputs.frame,), scans=scans, landmarks=placed, initial=initial, shape_frames=(inputs.frame,)
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
+from pipelines.stages.located import read_located_labels
 from pipelines.stages.register_config import RegisterInputs
 from pipelines.stages.scan_files import ScanFile, read_scan
 from smplxpp.capture import Capture
@@ -23,16 +24,22 @@ CLEAR_MAJORITY = 0.6
 
 
 def observed_scans(
-    files: Mapping[int, Path], inputs: RegisterInputs, capture: Capture | None, maps: ViewMap | None
+    files: Mapping[int, Path],
+    inputs: RegisterInputs,
+    capture: Capture | None,
+    maps: ViewMap | None,
+    located: Path | None,
 ) -> tuple[dict[int, ScanObservation], list[str]]:
     """Read scans; those that cannot be read are left out, unless it is the one that the user named.
 
     Labels of the reference frame's scan are those that the inputs name. Every other scan has the votes of its frame's
-    label maps, where there are any: a file of labels beside a scan is a truth that no tracker has.
+    label maps, where there are any: a file of labels beside a scan is a truth that no tracker has. Where nobody has
+    labelled the reference frame, the body that was found in its scan says what is sure.
 
     Args:
         files: by frame.
         maps: label maps of the cameras that may be used, ids of `smplxpp.core.labels`, 255 elsewhere.
+        located: folder of the stage that found the body in the reference frame's scan, None where there is none.
 
     Returns:
         The scans, and what was wrong with the others, in words.
@@ -58,6 +65,8 @@ def observed_scans(
             labels = _given_labels(inputs.labels, scan, inputs.label_set)
         else:
             labels = _voted_labels(mesh, frame, capture, maps)
+            if labels is None and frame == inputs.frame and located is not None:
+                labels = read_located_labels(located, mesh.vertex_count)
         scans[frame] = ScanObservation(mesh, labels)
     return scans, problems
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.runs.digests import sha256_file
-from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE
+from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, REGISTER_STAGE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.observe import Observed, observe
 from pipelines.stages.register_config import RegisterInputs, save_register
@@ -21,6 +22,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.fit import register
+from smplxpp.register.follow import follow, lost_frames
 
 Report = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
@@ -46,8 +48,13 @@ def register_capture(
     """
     config = RegisterConfig(seed=inputs.seed)
     body = load_body(inputs.body)
-    placed = run / LANDMARKS_FILE
-    observed = observe(inputs, body, landmarks=placed if placed.exists() else None)
+    placed, located = run / LANDMARKS_FILE, run / LOCATE_STAGE
+    observed = observe(
+        inputs,
+        body,
+        landmarks=placed if placed.exists() else None,
+        located=located if (located / "manifest.json").exists() else None,
+    )
     digests = dict(observed.digests)
     if inputs.body is not None:
         digests["body"] = sha256_file(inputs.body)
@@ -62,15 +69,25 @@ def register_capture(
     }
     stage = Stage(name=REGISTER_STAGE, config=choices, inputs=digests, code=(__name__,))
     save_register(run, inputs)
-    work = partial(_work, observed=observed, body=body, config=config, progress=progress)
+    work = partial(_work, observed=observed, inputs=inputs, body=body, config=config, progress=progress)
     return run_stage(run, stage, work, force=force)
 
 
 def _work(
-    folder: Path, *, observed: Observed, body: BodyModel, config: RegisterConfig, progress: Report
+    folder: Path,
+    *,
+    observed: Observed,
+    inputs: RegisterInputs,
+    body: BodyModel,
+    config: RegisterConfig,
+    progress: Report,
 ) -> StageOutput:
     """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
-    observations = observed.observations
+    observations, lost = observed.observations, ()
+    if observed.found is not None and not observations.keypoints:
+        initial = follow(body, observations, observed.found, at=inputs.frame, config=config, progress=progress)
+        lost = lost_frames(body, observations, initial, at=inputs.frame)
+        observations = replace(observations, initial=initial)
     fit = register(body, observations, config, progress=progress)
     if not fit.frames:
         raise InputError(
@@ -88,7 +105,7 @@ def _work(
         joint_names=np.array(body.joint_names),
         confidence=fit.confidence,
     )
-    problems = (*observed.all_problems(), *fit.problems)
+    problems = (*observed.all_problems(), *fit.problems, *lost)
     content = summary(body, observations, fit, problems)
     (folder / "registration.json").write_text(json.dumps(jsonable(content), indent=1) + "\n")
     medians = {

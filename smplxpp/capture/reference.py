@@ -21,8 +21,8 @@ class ReferenceFrame:
     Attributes:
         subject: name of the capture's folder.
         frame: number of the frame.
-        scan, params: files; no parameters where there need be none. `params_frame` is the row of `params` that belongs
-            to the frame.
+        scan, params: files; None where there are none and none are needed. `params_frame` is the row of `params` that
+            belongs to the frame.
         motion: parameters of the capture's frames from the same source as `params`, or None.
         scan_labels: labels of the scan's vertices, or None.
         label_maps: label image of each camera by name, without those that the capture holds out; with `cameras_file`
@@ -32,7 +32,7 @@ class ReferenceFrame:
 
     subject: str
     frame: int
-    scan: Path
+    scan: Path | None
     params: Path | None
     params_frame: int
     motion: Path | None = None
@@ -49,6 +49,7 @@ def find_reference(
     params: str | Path | None = None,
     protocol: str | None = None,
     fitted: bool = True,
+    scanned: bool = True,
 ) -> ReferenceFrame:
     """Find frame `frame` in a capture folder of our simple layout.
 
@@ -56,7 +57,8 @@ def find_reference(
     `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `rgbs/CAM/CAM_rgbFFFFFF.jpg`, `cameras.json` or
     `calibration.csv`. `params` names another stacked parameter file (for instance a tracker's), whose rows are the
     motion then; `protocol` names the protocol whose parameters and labels are taken, the scan's own labels only if it
-    allows them. Without `fitted` there need be no parameters: a registration is to make them.
+    allows them. Without `fitted` there need be no parameters: a registration is to make them; without `scanned` there
+    need be no scan: it is to be reconstructed.
 
     Raises:
         InputError: no such folder, no such protocol, or scan or parameters missing.
@@ -68,7 +70,7 @@ def find_reference(
     files = choose_protocol(root, description, protocol)
     number = f"{frame:06d}"
     scan = _first(root / "scans", [f"scan_{number}{suffix}" for suffix in (".ply", ".obj", ".glb")])
-    if scan is None:
+    if scan is None and scanned:
         have = sorted(p.name for p in (root / "scans").glob("scan_*") if not p.name.endswith("_labels.npz"))
         raise InputError(
             f"capture {root.name}",

@@ -10,6 +10,7 @@ from smplxpp.body import BodyModel
 from smplxpp.core.camera import Camera
 from smplxpp.core.labels import SKIN
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
@@ -47,11 +48,23 @@ def bare_vertices(
                 labels = observed.labels(name, frames[row])
                 if labels is not None:
                     votes += _votes_of_map(mesh, camera, labels)
+    return _bare(body, votes) if votes.any() else None
+
+
+def _bare(body: BodyModel, votes: Float64[np.ndarray, "V 2"]) -> Bool[np.ndarray, " V"]:
+    """Vertices whose votes are for skin, inside of what is."""
     total = votes.sum(axis=1)
-    if not total.any():
-        return None
-    bare = (total >= _LEAST) & (votes[:, 0] > _SHARE * np.maximum(total, 1e-9))
-    return _eroded(body, bare)
+    return _eroded(body, (total >= _LEAST) & (votes[:, 0] > _SHARE * np.maximum(total, 1e-9)))
+
+
+def bare_of_scan(body: BodyModel, params: BodyParams, scan: ScanObservation) -> Bool[np.ndarray, " V"]:
+    """Vertices of a body that a labelled scan shows to be skin, and so is all around them.
+
+    Args:
+        params: one row, the body in the scan.
+    """
+    votes = _votes_of_scan(body.mesh(body.forward(params).vertices[0]), scan)
+    return _bare(body, votes)
 
 
 def hands_of(body: BodyModel) -> Bool[np.ndarray, " V"]:

@@ -21,6 +21,8 @@ PREDICTED = StartNoise(pose=np.radians(8.0), transl=0.05, shape=1e-3)
 """How wrong the last two frames' motion, going on, is about the next; the shape is known."""
 # Shares of the last turn and move that may go on: limbs swing, and limbs stop.
 _MOMENTA = (0.8, 0.3)
+# Disagreement that is no longer that of clothes which move: as a factor of the first frame's, and beyond it.
+_LOST, _LOST_LEAST = 1.25, 0.03
 # Height of the pictures in which two answers are compared.
 _COMPARED_HEIGHT = 240
 
@@ -98,6 +100,24 @@ def _one(body: BodyModel, observed: Observations, frame: int, start: BodyParams,
     )
     fit = register(body, one, config)
     return fit.params if fit.frames else start
+
+
+def lost_frames(body: BodyModel, observed: Observations, params: BodyParams, *, at: int) -> tuple[str, ...]:
+    """Words about frames whose masks a body that was followed explains much worse than those of the frame it began at.
+
+    Args:
+        params: a row a frame, as `follow` gives them.
+    """
+    frames = observed.frames
+    wrong = [disagreement(body, observed, frame, params.frame(row)) for row, frame in enumerate(frames)]
+    bound = _LOST * wrong[frames.index(at)] + _LOST_LEAST
+    lost = [frame for frame, share in zip(frames, wrong, strict=True) if share > bound]
+    if not lost:
+        return ()
+    return (
+        f"the body was probably lost in {len(lost)} of {len(frames)} frames, first in frame {lost[0]}: masks alone do "
+        "not tell where fast limbs went; detect keypoints (`smplxpp keypoints detect`) and give them with --keypoints",
+    )
 
 
 def disagreement(body: BodyModel, observed: Observations, frame: int, params: BodyParams) -> float:
