@@ -13,6 +13,7 @@ from pipelines.runs.places import lies_in, same_place
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.register_config import load_register
+from pipelines.stages.segment import label_source
 from smplxpp.capture import Capture
 from smplxpp.capture.params import ParamFiles, StackedParams
 from smplxpp.capture.protocols import ProtocolFiles, description_file, read_description, read_protocols
@@ -109,8 +110,10 @@ class SaidOfInputs:
         return MIXED if word == EXACT else word
 
     def labels(self, build: BuildInputs) -> str:
-        """The word for the labels that a template was built with."""
+        """The word for the labels that a template was built with; what the body told is an estimate."""
         sources = list(build.label_maps.values()) or [build.labels or build.scan]
+        if (build.reconstructs or all(path.exists() for path in sources)) and label_source(build) == "body":
+            return WORDS[TRACKED]
         if not all(path.exists() and lies_in(path, self.root) for path in sources):
             return NOT_KNOWN
         if build.label_maps:

@@ -112,7 +112,9 @@ def label_source(inputs: BuildInputs) -> str:
         return "body"
     if inputs.labels is None and inputs.label_maps:
         return "views"
-    return "file" if inputs.labels is not None or holds_labels(inputs.scan) else "body"
+    if inputs.labels is not None:
+        return "file"
+    return "body" if inputs.reconstructs or not holds_labels(inputs.scan) else "file"
 
 
 def _by_views(scan: TriangleMesh, inputs: BuildInputs) -> SegmentedScan:
