@@ -66,7 +66,9 @@ class _Part:
 
 
 PARTS: dict[str, _Part] = {
-    LOCATE_STAGE: _Part(locate, (RECONSTRUCT_STAGE,), settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)),
+    LOCATE_STAGE: _Part(
+        locate, (RECONSTRUCT_STAGE,), settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)
+    ),
     CAPTURE_STAGE: _Part(
         capture,
         (LOCATE_STAGE, REGISTER_STAGE),

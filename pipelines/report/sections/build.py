@@ -18,7 +18,9 @@ from pipelines.report.sections.evaluation import (
     standing_evaluation,
 )
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
+from pipelines.report.sections.locate import locate_section
 from pipelines.report.sections.readable import readable, readable_numbers
+from pipelines.report.sections.reconstruct import reconstruct_section
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
 from pipelines.report.sections.template import (
@@ -37,6 +39,8 @@ from pipelines.runs.layout import (
     BIND_STAGE,
     BUILD_STAGES,
     EVALUATE_STAGE,
+    LOCATE_STAGE,
+    RECONSTRUCT_STAGE,
     REFINE_STAGE,
     REGISTER_STAGE,
     SEGMENT_STAGE,
@@ -46,6 +50,7 @@ from pipelines.runs.layout import (
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
+from smplxpp.body import load_body
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.template.template import Template
@@ -73,7 +78,14 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     early = tuple(c for c in checks if c.stage in ("00_capture", "10_body", "20_segment"))
     registration = records.get(REGISTER_STAGE)
     kept, moved, checked = (records[name] for name in ("30_clean", "40_transfer", VALIDATE_STAGE))
+    found = records.get(LOCATE_STAGE)
     sections = (
+        *_optional(records.get(RECONSTRUCT_STAGE), "Reconstruction", lambda record: reconstruct_section(run, record)),
+        *_optional(
+            found,
+            "Body found in the scan",
+            lambda record: locate_section(record, load_body(inputs.body), scan),
+        ),
         *_optional(registration, "Registration", lambda record: register_section(run, record)),
         readable(records[SEGMENT_STAGE], "Scan and labels", lambda: scan_section(run, scan, colors, cameras, early)),
         readable(kept, "Parts", lambda: parts_section(run, kept, cameras, by_stage["30_clean"])),

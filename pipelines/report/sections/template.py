@@ -67,7 +67,7 @@ def scan_section(
         title="Scan and labels",
         text=(
             "The scan in metres, +Y up, as it enters. Every face takes the label that a graph cut finds cheapest: "
-            "labels given or votes of views, smoothed so that seams settle in folds.",
+            f"{_SOURCES[str(source)]}, smoothed so that seams settle in folds.",
         ),
         pictures=(
             Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
