@@ -87,7 +87,11 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
             lambda record: locate_section(record, load_body(inputs.body), scan),
         ),
         *_optional(registration, "Registration", lambda record: register_section(run, record)),
-        readable(records[SEGMENT_STAGE], "Scan and labels", lambda: scan_section(run, scan, colors, cameras, early)),
+        readable(
+            records[SEGMENT_STAGE],
+            "Scan and labels",
+            lambda: scan_section(run, records[SEGMENT_STAGE], scan, colors, cameras, early),
+        ),
         readable(kept, "Parts", lambda: parts_section(run, kept, cameras, by_stage["30_clean"])),
         readable(moved, "Skin weights", lambda: weights_section(run, moved, cameras, by_stage["40_transfer"])),
         template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),

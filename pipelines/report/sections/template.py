@@ -20,14 +20,14 @@ from pipelines.figures import (
 from pipelines.report import CheckRow, Comparison, Histogram, Picture, Section, Table
 from pipelines.runs.arrays import load_arrays, read_named
 from pipelines.runs.artefacts import load_cleaned_parts, load_parts, load_weights
-from pipelines.runs.layout import (
-    SCAN_LABELS,
-)
+from pipelines.runs.layout import SCAN_LABELS
+from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.motion import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
+from smplxpp.core.files.json_file import as_list, as_text
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
@@ -53,10 +53,29 @@ def _sheet(
     return encode_jpeg(row(pictures))
 
 
+_SOURCES = {
+    "file": "labels given",
+    "views": "votes of views",
+    "body": "what the body in the scan, its colours and its folds say, for nobody has labelled it",
+}
+
+
 def scan_section(
-    run: Path, scan: TriangleMesh, colors: UInt8[np.ndarray, "N 3"], cameras: list[Camera], checks: tuple[CheckRow, ...]
+    run: Path,
+    record: StageRecord,
+    scan: TriangleMesh,
+    colors: UInt8[np.ndarray, "N 3"],
+    cameras: list[Camera],
+    checks: tuple[CheckRow, ...],
 ) -> Section:
-    """Show the scan, its colours and its labels."""
+    """Show the scan, its colours and its labels, and in which of these there is doubt.
+
+    Args:
+        record: of the stage that labelled it.
+    """
+    with values_of(record):
+        source = as_text(record.manifest["numbers"].get("labels_from", "file"), subject="labels_from")
+        doubts = as_list(record.manifest["numbers"].get("doubts", []), subject="doubts")
     labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
@@ -67,13 +86,14 @@ def scan_section(
         title="Scan and labels",
         text=(
             "The scan in metres, +Y up, as it enters. Every face takes the label that a graph cut finds cheapest: "
-            f"{_SOURCES[str(source)]}, smoothed so that seams settle in folds.",
+            f"{_SOURCES.get(source, source)}, smoothed so that seams settle in folds.",
         ),
         pictures=(
             Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
             Picture("labels", _sheet(scan, cameras, face_colors=display_colors(labels))),
             Picture("confidence of the labels", encode_jpeg(row(heat))),
         ),
+        tables=(Table(("doubtful labels",), tuple((str(words),) for words in doubts)),) if doubts else (),
         legend=tuple((label.name, label.display_rgb) for label in present),
         checks=checks,
     )
