@@ -42,7 +42,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     )
     _params_of_frame(build).save(folder / "params.npz")
     numbers = {"vertices": clean.mesh.vertex_count, "faces": clean.mesh.face_count, "repairs": str(clean.report)}
-    numbers |= {"units": scan.units, "up": scan.up, "said": list(scan.said)}
+    numbers |= {"units": scan.units, "up": scan.up, "said": scan.said}
     numbers |= {"smoothing_steps": smoothed.steps, "smoothing_moved_mm": smoothed.moved * MM}
     explanation = "how far vertices stand off their neighbours, as a share of the median edge"
     if smoothed.steps:

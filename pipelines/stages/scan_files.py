@@ -14,11 +14,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from smplxpp.clean import PointSurface, check_human_scale, convert_points, sanitize, surface_from_points
+from smplxpp.clean import (
+    AUTO,
+    PointSurface,
+    check_human_scale,
+    convert_points,
+    find_scan_frame,
+    sanitize,
+    surface_from_points,
+)
 from smplxpp.clean.repair import Sanitized
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
+
+_ORDINARY_HEIGHT = 1.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +39,14 @@ class ScanFile:
         raw: in the file's units and axes; without faces where it is a cloud of points.
         clean: metres, +Y up, with the places of its elements in the file; faces of a cloud's surface come from none
             (-1).
+        units, up: in which the file is written, as given or as found. said: how they were found, in words.
     """
 
     raw: RawMesh
     clean: Sanitized
+    units: str = "m"
+    up: str = "y"
+    said: str = ""
 
     @cached_property
     def colors(self) -> UInt8[np.ndarray, "n 3"] | None:
@@ -43,11 +57,19 @@ class ScanFile:
 def read_scan(path: Path, *, units: str = "m", up: str = "y") -> ScanFile:
     """Read a scan: a mesh, or a cloud of points, whose surface is reconstructed.
 
+    Args:
+        units, up: as `convert_points` takes them; "auto": found from the shape of the person.
+
     Raises:
         InputError: a file without a surface, or no person that stands upright in metres; the file is named.
         MissingExtraError: a cloud of points without the package that reconstructs its surface.
     """
     raw = read_raw_mesh(path, clouds=True)
+    said = ""
+    if AUTO in (units, up):
+        vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
+        frame = find_scan_frame(vertices, faces, units=units, up=up)
+        units, up, said = frame.units, frame.up, frame.said
     vertices = convert_points(raw.vertices, units=units, up=up)
     try:
         clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
@@ -59,7 +81,7 @@ def read_scan(path: Path, *, units: str = "m", up: str = "y") -> ScanFile:
             remedy=error.remedy,
         ) from None
     check_human_scale(clean.mesh.vertices, subject=f"scan {path.name}")
-    return ScanFile(raw, clean)
+    return ScanFile(raw, clean, units, up, said)
 
 
 def _of_cloud(path: Path, raw: RawMesh, units: str, up: str) -> Sanitized:
@@ -77,6 +99,15 @@ def _of_cloud(path: Path, raw: RawMesh, units: str, up: str) -> Sanitized:
         clean.report,
         np.arange(len(raw.vertices)),
     )
+
+
+def _rough_surface(raw: RawMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The surface of a cloud whose units are not known yet, in them: made as that of a person of ordinary height."""
+    scale = _ORDINARY_HEIGHT / max(float(np.ptp(raw.vertices, axis=0).max()), 1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # said when the surface is made in metres
+        mesh = surface_from_points(scale * raw.vertices, raw.vertex_normals).mesh
+    return mesh.vertices / scale, mesh.faces
 
 
 @dataclass(frozen=True)
