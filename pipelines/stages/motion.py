@@ -15,4 +15,4 @@ def motion_of_build(run: Path, inputs: BuildInputs) -> BodyParams | None:
     """Read the capture's motion: the file that the build names, or the frames that its run has registered."""
     if inputs.motion is not None:
         return load_params(inputs.motion, body=load_body(inputs.body))
-    return load_stacked_params(run / REGISTERED_PARAMS)[1] if inputs.params is None else None
+    return load_stacked_params(run / REGISTERED_PARAMS)[1] if inputs.registers else None
