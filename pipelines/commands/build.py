@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pipelines.commands.build_inputs import chosen_inputs, chosen_reconstruction, chosen_registration
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
 from pipelines.runs.by_hand import take_file
@@ -21,29 +21,21 @@ from pipelines.runs.layout import (
     EVALUATE_STAGE,
     LANDMARKS_FILE,
     REFINE_STAGE,
-    REGISTER_STAGE,
     TRAIN_STAGES,
-    reconstructed_scan,
 )
-from pipelines.runs.places import keep_out_of_capture, same_place
-from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildConfig, BuildInputs
-from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
-from pipelines.stages.register_config import RegisterInputs, load_register, named_params
-from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
-from smplxpp.capture import ReferenceFrame, find_reference
-from smplxpp.capture.protocols import choose_protocol, read_description
+from pipelines.runs.places import keep_out_of_capture
+from pipelines.runs.stage import StageRecord
+from pipelines.stages.build_config import BuildConfig, BuildInputs
+from pipelines.stages.register_config import RegisterInputs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import read_json
-from smplxpp.core.spread import spread
 
-log = logging.getLogger(__name__)
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
 
 @dataclass(frozen=True)
 class Build:
-    """Options of `smplxpp build`. Give --capture, or --scan: alone, or with what is known of it (--params, --labels)."""
+    """Options of `smplxpp build`. Give --capture, or --scan: alone, or with what is known of it."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; stages that stand in it are not run again."""
@@ -56,15 +48,16 @@ class Build:
     """Body parameters of that frame, any layout that `smplxpp params convert` reads. Without them the body is found in
     the scan."""
     labels: OptionalPath = None
-    """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh. Where neither they, nor the
-    scan, nor label maps of its views say what is what, the body in the scan and its colours do."""
+    """Labels of the scan's vertices or faces: npz, npy, 4D-Dress pickle, or a coloured mesh. Where neither they, nor
+    the scan, nor label maps of its views say what is what, the body in the scan and its colours do."""
     keypoints: OptionalPath = None
-    """With --capture: folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of its own."""
+    """With --capture: folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of its
+    own."""
     masks: OptionalPath = None
     """With --capture: folder of masks, in the place of its own."""
     landmarks: OptionalPath = None
-    """Landmarks of the scan, a JSON object of points by name: they tell where the body is that is not given. Kept in the
-    run as landmarks.json, which is read whenever it lies there."""
+    """Landmarks of the scan, a JSON object of points by name: they tell where the body is that is not given. Kept in
+    the run as landmarks.json, which is read whenever it lies there."""
     corrections: OptionalPath = None
     """Labels corrected by hand, as `smplxpp label` writes them. Kept in the run as labels_corrections.json, which is
     read whenever it lies there."""
@@ -135,7 +128,7 @@ class Build:
                 inputs,
                 config,
                 registration=self.registration(inputs),
-                reconstruction=self.reconstruction(inputs),
+                reconstruction=chosen_reconstruction(self, inputs),
                 first=self.from_stage,
                 last=self.until_stage,
                 progress=step,
@@ -166,155 +159,11 @@ class Build:
         Raises:
             InputError: neither or both ways of naming the input, or files that a capture lacks.
         """
-        if (self.capture is None) == (self.scan is None):
-            raise InputError(
-                "input",
-                expected="either --capture or --scan",
-                received="both" if self.capture else "neither",
-            )
-        label_set = self.label_set
-        if self.capture is not None:
-            registered = self._registers()
-            found = find_reference(
-                self.capture,
-                frame=self.frame,
-                params=self.params,
-                protocol=self.protocol,
-                fitted=not registered,
-                scanned=False,
-            )
-            labels = self.labels or self._scan_labels(found)
-            by_body = self.label_source == "body"
-            return BuildInputs(
-                subject=found.subject,
-                scan=found.scan or self.out / reconstructed_scan(found.frame),
-                params=None if registered else found.params,
-                reconstructs=found.scan is None,
-                locates=registered and not self._starts(found),
-                registers=registered,
-                frame=found.frame,
-                params_row=found.params_frame,
-                labels=labels,
-                label_maps={} if labels or by_body else found.label_maps,
-                photographs=dict(spread(list(found.photographs.items()), MOST_PHOTOGRAPHS)),
-                cameras=found.cameras_file if found.photographs or not labels else None,
-                label_set="capture" if label_set == "auto" else label_set,
-                label_source="body" if by_body else "auto",
-                motion=None if registered else found.motion,
-                body=self.body,
-                protocol=self.protocol,
-            )
-        for name in ("protocol", "keypoints", "masks"):
-            if getattr(self, name) is not None:
-                raise InputError(f"option {name}", expected="with --capture", received="with --scan")
-        assert self.scan is not None
-        registers = self.params is not None and self.register == "on"
-        return BuildInputs(
-            subject=self.scan.stem,
-            scan=self.scan,
-            params=None if registers else self.params,
-            registers=registers,
-            locates=self.params is None,
-            frame=self.frame,
-            params_row=self.frame,
-            labels=self.labels,
-            label_set="4ddress" if label_set == "auto" else label_set,
-            label_source="body" if self.label_source == "body" else "auto",
-            body=self.body,
-        )
-
-    def _registers(self) -> bool:
-        """Whether the parameters come from a registration of the capture."""
-        assert self.capture is not None
-        if self.register != "auto":
-            return self.register == "on"
-        if self._standing_registration() is not None:
-            return True
-        if not self.capture.is_dir():
-            return False
-        said = SaidOfInputs.of_folder(self.capture, self.protocol)
-        params = said.own_parameters() if self.params is None else named_params(self.capture, self.params)
-        return params is None or said.given_parameters(params) == TRACKED
-
-    def _starts(self, found: ReferenceFrame) -> bool:
-        """Whether a registration has something to start from: a fit, keypoints, or that it stands."""
-        assert self.capture is not None
-        if found.params is not None or self.keypoints is not None or self._standing_registration() is not None:
-            return True
-        files = choose_protocol(self.capture, read_description(self.capture), self.protocol)
-        return files.keypoints is not None and (self.capture / files.keypoints).is_dir()
-
-    def _standing_registration(self) -> RegisterInputs | None:
-        """What `smplxpp register` has made in this run of this capture, from these parameters if any are named."""
-        found = load_register(self.out)
-        if (
-            found is None
-            or found.capture is None
-            or self.capture is None
-            or read_manifest(self.out / REGISTER_STAGE) is None
-        ):
-            return None
-        params = named_params(self.capture, self.params)
-        same = same_place(found.capture, self.capture) and found.protocol == self.protocol
-        return (
-            found
-            if same and (params is None or (found.params is not None and same_place(params, found.params)))
-            else None
-        )
+        return chosen_inputs(self)
 
     def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
-        """What the body is registered to, None where the parameters are given."""
-        if not inputs.registers:
-            return None
-        return self._standing_registration() or RegisterInputs(
-            capture=self.capture,
-            params=named_params(self.capture, self.params),
-            protocol=self.protocol,
-            body=self.body,
-            scan=inputs.scan if inputs.reconstructs else self.scan,
-            frame=self.frame,
-            labels=inputs.labels,
-            label_set=inputs.label_set,
-            keypoints=self.keypoints,
-            masks=self.masks,
-            units="m" if self.units == "auto" else self.units,
-            up="y" if self.up == "auto" else self.up,
-        )
-
-    def reconstruction(self, inputs: BuildInputs) -> ReconstructInputs | None:
-        """The photographs that the scan is made of, None where there is one; what `smplxpp reconstruct` has made of
-        this frame stands."""
-        if not inputs.reconstructs:
-            return None
-        assert self.capture is not None
-        found = load_reconstruct(self.out)
-        if found is not None and inputs.scan.is_file() and same_place(found.capture, self.capture):
-            return found
-        return ReconstructInputs(self.capture, frames=(self.frame,), masks=self.masks, protocol=self.protocol)
-
-    def _scan_labels(self, found: ReferenceFrame) -> Path | None:
-        """The labels that come with the scan, if they are used; None where the views' label maps are, or the body's.
-
-        Raises:
-            InputError: the labels that are asked for are not there.
-        """
-        views, scan = bool(found.label_maps), found.scan_labels is not None
-        if self.label_source in ("views", "scan") and not {"views": views, "scan": scan}[self.label_source]:
-            barred = f", by protocol {self.protocol}" if self.protocol else ""
-            raise InputError(
-                f"capture {found.subject}",
-                expected={"scan": "labels of the scan", "views": "label maps of its views"}[self.label_source],
-                received=f"none for frame {found.frame}{barred}",
-                remedy="name a file with --labels",
-            )
-        if self.label_source == "body" or (views and self.label_source != "scan") or not scan:
-            return None
-        if self.label_source == "auto":
-            log.warning(
-                "no label maps of frame %d: the labels that come with the scan are used, which are no estimate",
-                found.frame,
-            )
-        return found.scan_labels
+        """What the body is registered to, None where it is not."""
+        return chosen_registration(self, inputs)
 
     def config(self) -> BuildConfig:
         """The choices of this build.

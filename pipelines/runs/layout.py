@@ -33,8 +33,8 @@ TEMPLATE_STAGES = (
 )
 """The stages of every build."""
 BUILD_STAGES = (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE, *TEMPLATE_STAGES)
-"""The stages of `smplxpp build` in their order. Parameters that are not given come from a registration, or from the body
-found in a scan that comes alone, which a registration may start from."""
+"""The stages of `smplxpp build` in their order. Parameters that are not given come from a registration, or from the
+body found in a scan that comes alone, which a registration may start from."""
 TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from pipelines.figures import body_cameras, encode_jpeg, render_overlay, render_shaded, row
