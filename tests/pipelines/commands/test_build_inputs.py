@@ -1,0 +1,94 @@
+"""Which files a build takes, and which stages make what it has not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.commands.build import Build
+from pipelines.commands.build_inputs import chosen_inputs, chosen_reconstruction, chosen_registration
+from pipelines.runs.layout import LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES, reconstructed_scan
+from pipelines.stages.reconstruct_config import ReconstructInputs, save_reconstruct
+from smplxpp.core.errors import InputError
+
+PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
+
+
+def capture_of(root: Path, *names: str) -> Path:
+    """A capture that has only some of the fixture's files."""
+    root.mkdir()
+    for name in ("cameras.json", "rgbs", "masks", *names):
+        (root / name).symlink_to(PERSON / name)
+    return root
+
+
+def stages_before(inputs):
+    """The stages of a build that come before those of every build."""
+    return tuple(name for name in inputs.stages if name not in TEMPLATE_STAGES)
+
+
+def test_a_scan_alone(tmp_path):
+    asked = Build(out=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply")
+    inputs = chosen_inputs(asked)
+    assert stages_before(inputs) == (LOCATE_STAGE,) and inputs.params is None and inputs.labels is None
+    assert chosen_registration(asked, inputs) is None and chosen_reconstruction(asked, inputs) is None
+    assert (asked.config().units, asked.config().up) == ("auto", "auto")
+
+
+def test_a_scan_with_parameters_says_its_units(tmp_path):
+    params = PERSON / "params" / "params.npz"
+    asked = Build(out=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply", params=params)
+    assert stages_before(chosen_inputs(asked)) == () and (asked.config().units, asked.config().up) == ("m", "y")
+    registered = Build(out=tmp_path / "run", scan=asked.scan, params=params, register="on")
+    assert stages_before(chosen_inputs(registered)) == (REGISTER_STAGE,)
+    assert chosen_registration(registered, chosen_inputs(registered)).params == params
+
+
+def test_photographs_alone(tmp_path):
+    root = capture_of(tmp_path / "capture")
+    asked = Build(out=tmp_path / "run", capture=root, frame=3)
+    inputs = chosen_inputs(asked)
+    assert stages_before(inputs) == (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE)
+    assert inputs.scan == tmp_path / "run" / reconstructed_scan(3) and not inputs.label_maps
+    reconstruction = chosen_reconstruction(asked, inputs)
+    assert reconstruction == ReconstructInputs(root, frames=(3,))
+    assert chosen_registration(asked, inputs).scan == inputs.scan
+
+
+def test_keypoints_need_no_body_found_in_the_surface(tmp_path):
+    root = capture_of(tmp_path / "capture")
+    given = Build(out=tmp_path / "run", capture=root, keypoints=PERSON / "keypoints")
+    own = Build(out=tmp_path / "run", capture=capture_of(tmp_path / "other", "keypoints"))
+    for asked in (given, own):
+        assert stages_before(chosen_inputs(asked)) == (RECONSTRUCT_STAGE, REGISTER_STAGE)
+    assert chosen_registration(given, chosen_inputs(given)).keypoints == given.keypoints
+
+
+def test_a_surface_that_was_reconstructed_stands(tmp_path):
+    """What `smplxpp reconstruct --frame all` has made is not made anew for one frame."""
+    root, run = capture_of(tmp_path / "capture"), tmp_path / "run"
+    asked, all_frames = Build(out=run, capture=root), ReconstructInputs(root, frames=(0, 1, 2))
+    (run / reconstructed_scan(0)).parent.mkdir(parents=True)
+    save_reconstruct(run, all_frames)
+    assert chosen_reconstruction(asked, chosen_inputs(asked)).frames == (0,)
+    (run / reconstructed_scan(0)).write_bytes(b"ply")
+    assert chosen_reconstruction(asked, chosen_inputs(asked)).frames == (0, 1, 2)
+
+
+def test_nobody_has_labelled_it(tmp_path):
+    root = capture_of(tmp_path / "capture", "scans", "params")
+    by_body = chosen_inputs(Build(out=tmp_path / "run", capture=root, label_source="body"))
+    assert by_body.labels is None and by_body.label_source == "body"
+    with pytest.raises(InputError, match="label maps of its views"):
+        chosen_inputs(Build(out=tmp_path / "run", capture=root, label_source="views"))
+
+
+def test_options_of_a_capture_beside_a_scan(tmp_path):
+    scan = PERSON / "scans" / "scan_000000.ply"
+    for name in ("keypoints", "masks"):
+        with pytest.raises(InputError, match=f"option {name}"):
+            chosen_inputs(Build(out=tmp_path / "run", scan=scan, **{name: tmp_path}))
+    with pytest.raises(InputError, match="either --capture or --scan"):
+        chosen_inputs(Build(out=tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
