@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -191,7 +191,7 @@ class Build:
                     f"option {name}", expected=f"a finite number, at least {least:g}{limit}", received=f"{value:g}"
                 )
         alone = self.scan is not None and self.params is None
-        changed = {
+        changed: dict[str, Any] = {
             "units": self.units if alone or self.units != "auto" else "m",
             "up": self.up if alone or self.up != "auto" else "y",
             "budgets": default.budgets | self.budgets,

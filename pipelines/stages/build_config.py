@@ -162,7 +162,13 @@ def _config(values: Mapping[str, Any]) -> BuildConfig:
 
 def _inputs(written: Mapping[str, Any]) -> BuildInputs:
     # Builds of earlier versions had no protocols, looked at no photographs, and registered what they were not given.
-    added = {"protocol": None, "photographs": {}, "label_source": "auto", "reconstructs": False, "locates": False}
+    added: dict[str, Any] = {
+        "protocol": None,
+        "photographs": {},
+        "label_source": "auto",
+        "reconstructs": False,
+        "locates": False,
+    }
     values = {**added, **written}
     values = {"registers": values.get("params") is None, **values}
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64, UInt8
-from smplxpp.register.locate import locate_body
 
 from pipelines.runs.checks import Check
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATION_FILE
@@ -24,6 +23,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.register.bare import bare_of_scan
 from smplxpp.register.landmark_file import read_landmarks
+from smplxpp.register.locate import locate_body
 from smplxpp.register.observations import ScanObservation
 from smplxpp.segment import label_by_body
 

@@ -83,7 +83,8 @@ def _work(
     progress: Report,
 ) -> StageOutput:
     """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
-    observations, lost = observed.observations, ()
+    observations = observed.observations
+    lost: tuple[str, ...] = ()
     if observed.found is not None and not observations.keypoints:
         initial = follow(body, observations, observed.found, at=inputs.frame, config=config, progress=progress)
         lost = lost_frames(body, observations, initial, at=inputs.frame)

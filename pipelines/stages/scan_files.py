@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from smplxpp.clean.scan_frame import AUTO, find_scan_frame
 
 from smplxpp.clean import (
     PointSurface,
@@ -23,6 +22,7 @@ from smplxpp.clean import (
     surface_from_points,
 )
 from smplxpp.clean.repair import Sanitized
+from smplxpp.clean.scan_frame import AUTO, find_scan_frame
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
