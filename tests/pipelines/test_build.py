@@ -315,7 +315,6 @@ def test_a_broken_scan_is_repaired_and_said_so(small):
         (lambda s: {"vertices": s.vertices[:, [1, 2, 0]]}, "--up x"),
         (lambda s: {"vertices": s.vertices + 5.0}, "stands in the scan"),
         (lambda s: {"vertices": s.vertices * np.nan}, "finite"),
-        (lambda s: {"faces": s.faces[:0]}, "not the point cloud"),
         (lambda s: {"faces": s.faces + 1}, "1-based"),
         (lambda s: {"labels": s.labels[:-3]}, "one a vertex"),
         (lambda s: {"labels": s.labels + 40}, "label set"),

@@ -7,7 +7,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import BUILD_STAGES
+from pipelines.runs.layout import BUILD_STAGES, TEMPLATE_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
 from smplxpp.core.errors import InputError
 from tests.runs.stages import stage_of
@@ -44,11 +44,11 @@ def test_a_whole_run(run):
 
 
 def test_a_run_under_way_names_what_is_missing_and_how_to_make_it(tmp_path, capsys):
-    add_stage(tmp_path, BUILD_STAGES[0])
+    add_stage(tmp_path, TEMPLATE_STAGES[0])
     result = Inspect(tmp_path).run()
-    assert result["unfinished"] == list(BUILD_STAGES[1:]) and BUILD_STAGES[1] in result["remedy"]
+    assert result["unfinished"] == list(TEMPLATE_STAGES[1:]) and TEMPLATE_STAGES[1] in result["remedy"]
     printed = capsys.readouterr().out
-    assert "missing" in printed and f"--from-stage {BUILD_STAGES[1]}" in printed and "none yet" in printed
+    assert "missing" in printed and f"--from-stage {TEMPLATE_STAGES[1]}" in printed and "none yet" in printed
 
 
 def test_damage_is_seen(run):

@@ -313,7 +313,9 @@ def test_neither_cameras_nor_scans_and_keypoints_without_cameras(tmp_path, captu
 
 def build_inputs(**changes) -> BuildInputs:
     files = {"scan": FIXTURE / "scans" / "scan_000000.ply", "labels": FIXTURE / "scans" / "scan_000000_labels.npz"}
-    return BuildInputs(**{"subject": "person", "params": None, "label_set": "capture", **files, **changes})
+    return BuildInputs(
+        **{"subject": "person", "params": None, "registers": True, "label_set": "capture", **files, **changes}
+    )
 
 
 def test_a_build_takes_the_reference_frame_of_its_registration(tmp_path, solver):
