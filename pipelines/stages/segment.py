@@ -100,6 +100,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     )
     numbers = {
         "labels_from": source,
+        "doubts": list(before.doubts),
         "corrected_by_hand": float(areas @ result.corrected),
         "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
     }
