@@ -51,7 +51,7 @@ def test_stray_points_and_faces_that_point_inward_change_nothing(person):
 
 
 def test_a_size_that_is_nobodys_in_any_unit_is_refused(person):
-    with pytest.raises(InputError, match="a person .* m high"):
+    with pytest.raises(InputError, match=r"a person .* m high"):
         find_scan_frame(person.vertices * 7.0, person.faces, up="y")
 
 
