@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
-from smplxpp.core.topology import component_labels, face_adjacency
+from smplxpp.core.mesh import normalize_rows
+from smplxpp.core.topology import component_labels
+from smplxpp.segment.corrected_faces import ScanSurface
 
 DOUBTFUL = 0.6
 """Confidence below which a face is doubtful."""
@@ -33,7 +34,7 @@ class DoubtfulRegion:
 
 
 def doubtful_regions(
-    mesh: TriangleMesh,
+    surface: ScanSurface,
     labels: Int[np.ndarray, " M"],
     confidence: Float[np.ndarray, " M"],
     corrected: Bool[np.ndarray, " M"],
@@ -41,7 +42,7 @@ def doubtful_regions(
     """Connected patches of faces with a confidence below 0.6 that no hand has set, of 2 square centimetres and more,
     at most 40, by area times doubt."""
     doubtful = (confidence < DOUBTFUL) & ~corrected
-    pairs, _ = face_adjacency(mesh.faces)
+    mesh, pairs = surface.mesh, surface.pairs
     patch = component_labels(pairs[doubtful[pairs].all(axis=1)], mesh.face_count)
     area = mesh.face_areas * doubtful
     of_patch = np.bincount(patch, area)

@@ -13,7 +13,7 @@ from pipelines.runs.layout import CORRECTIONS_FILE, LANDMARKS_FILE
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.topology import component_labels, face_adjacency
+from smplxpp.core.topology import component_labels
 from smplxpp.register.landmark_file import write_landmarks
 from smplxpp.segment import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.corrected_faces import ScanSurface
@@ -129,8 +129,7 @@ class LabelSession:
 
     def patch(self, label: int, face: int) -> int:
         """Give the whole patch that has this face's label, as far as it reaches, another label."""
-        labels = self.labels()
-        pairs, _ = face_adjacency(self.scan.mesh.faces)
+        labels, pairs = self.labels(), self.surface.pairs
         same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
         patch = component_labels(pairs[same], len(labels))
         faces = np.flatnonzero(patch == patch[face])

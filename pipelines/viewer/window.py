@@ -330,7 +330,7 @@ class LabelWindow:
         if session.has_labels:
             labels, mesh = session.labels(), session.scan.mesh
             self._legend.content = legend(labels, mesh.face_areas)
-            self._regions = doubtful_regions(mesh, labels, session.confidence(), session.corrected())
+            self._regions = doubtful_regions(session.surface, labels, session.confidence(), session.corrected())
         names = [f"{k + 1}: {LABELS[item.label].name}" for k, item in enumerate(session.corrections.items)]
         self._list.options = tuple(names[::-1]) or (_NONE,)
         self._at = min(self._at, len(self._regions) - 1)

@@ -52,9 +52,14 @@ class ScanSurface:
         return np.asarray(face, dtype=np.int64).reshape(-1), np.sqrt(np.asarray(squared).reshape(-1))
 
     @cached_property
+    def pairs(self) -> Int64[np.ndarray, "P 2"]:
+        """Faces that share an edge."""
+        return face_adjacency(self.mesh.faces)[0].astype(np.int64)
+
+    @cached_property
     def steps(self) -> csr_matrix:
         """Distances (M, M) between the centres of faces that share an edge, metres."""
-        pairs, _ = face_adjacency(self.mesh.faces)
+        pairs = self.pairs
         length = np.linalg.norm(self.centers[pairs[:, 0]] - self.centers[pairs[:, 1]], axis=1)
         # A distance of 0 would be no edge.
         return csr_matrix((np.maximum(length, 1e-9), pairs.T), shape=(self.mesh.face_count,) * 2)

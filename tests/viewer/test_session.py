@@ -12,6 +12,7 @@ from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import concatenate_meshes
 from smplxpp.register.landmark_file import read_landmarks
 from smplxpp.segment import Corrections
+from smplxpp.segment.corrected_faces import ScanSurface
 from tests.segment.test_corrections import tube
 
 
@@ -120,17 +121,17 @@ def test_a_scan_without_labels_takes_landmarks_alone(scan):
 
 
 def test_doubtful_regions_are_patches_by_doubt(scan):
-    mesh, middle = scan.mesh, scan.mesh.face_centers
+    mesh, middle, surface = scan.mesh, scan.mesh.face_centers, ScanSurface(scan.mesh)
     confidence = np.ones(mesh.face_count)
     high, low = (middle[:, 1] > 0.8) & (middle[:, 0] > 0), (middle[:, 1] < 0.1) & (middle[:, 0] < 0)
     confidence[high], confidence[low] = 0.5, 0.2
     lone = int(np.flatnonzero((middle[:, 1] > 0.4) & (middle[:, 1] < 0.6))[0])
     confidence[lone] = 0.0
     none = np.zeros(mesh.face_count, dtype=bool)
-    first, second = doubtful_regions(mesh, scan.labels, confidence, none)  # one face is too little
+    first, second = doubtful_regions(surface, scan.labels, confidence, none)  # one face is too little
     assert first.label == LOWER.id and second.label == SHOE.id
     assert first.area == pytest.approx(mesh.face_areas[high].sum()) and first.confidence == pytest.approx(0.5)
     np.testing.assert_allclose(second.center, [-0.2, 0.05, 0.0], atol=0.01)
-    (left,) = doubtful_regions(mesh, scan.labels, confidence, high)
+    (left,) = doubtful_regions(surface, scan.labels, confidence, high)
     assert left.label == SHOE.id
-    assert doubtful_regions(mesh, scan.labels, np.ones(mesh.face_count), none) == []
+    assert doubtful_regions(surface, scan.labels, np.ones(mesh.face_count), none) == []
