@@ -13,6 +13,8 @@ from smplxpp.segment.corrected_faces import ScanSurface
 _JUMP_RADII, _LEAST_JUMP = 2.0, 0.03
 # Rays a radius of the brush, between two places of the pointer.
 _RAYS, _MOST_RAYS = 2.0, 64
+# Points of a line nearer to each other than this share of the brush say nothing more; longer lines are cut.
+_NEAR_RADII, _MOST_POINTS = 0.2, 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +88,15 @@ def line_under(
     last: Hit | None = None
     for place in _between(np.asarray(places, dtype=np.float64), radius):
         hit = first_hit(surface, origin, place - origin)
-        if hit is not None:
-            jump = last is None or np.linalg.norm(hit.point - last.point) > max(_JUMP_RADII * radius, _LEAST_JUMP)
-            lines += [[]] if jump else []
+        if hit is None:
+            last = None
+            continue
+        step = np.inf if last is None else float(np.linalg.norm(hit.point - last.point))
+        if step > max(_JUMP_RADII * radius, _LEAST_JUMP):
+            lines.append([hit])
+        elif len(lines[-1]) >= _MOST_POINTS:
+            lines.append([lines[-1][-1], hit])
+        elif np.linalg.norm(hit.point - lines[-1][-1].point) > _NEAR_RADII * radius:
             lines[-1].append(hit)
         last = hit
     return [(np.stack([hit.point for hit in line]), np.stack([hit.normal for hit in line])) for line in lines]

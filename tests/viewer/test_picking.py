@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -62,3 +64,20 @@ def test_a_drag_across_both_legs_is_a_line_for_each(surface):
     legs = [{(x > 0, z < -0.2) for x, _, z in points} for points in lines]
     assert all(len(leg) == 1 for leg in legs) and {(False, False), (True, False)} <= set.union(*legs)
     assert line_under(surface, EYE, np.array([[0.0, 0.5, 0.5]]), 0.02) == []
+
+
+def test_a_pointer_that_lingers_leaves_no_more_points(surface):
+    there = np.repeat(np.array([[0.17, 0.3, 1.0], [0.17, 0.35, 1.0]]), 400, axis=0)
+    ((points, _),) = line_under(surface, EYE, there, 0.02)
+    assert 4 <= len(points) < 20 and np.linalg.norm(np.diff(points, axis=0), axis=1).min() > 0.004
+
+
+def test_a_very_long_drag_is_cut_into_lines_that_a_file_takes(surface):
+    up = np.linspace(0.1, 0.9, 60)
+    places = np.stack(
+        [np.full(6000, 0.17), np.resize(np.concatenate([up, up[::-1]]), 6000), np.full(6000, 1.0)], axis=1
+    )
+    lines = line_under(surface, EYE, places, 0.003)
+    assert len(lines) > 2 and all(len(points) <= 2000 for points, _ in lines)
+    for (one, _), (other, _) in pairwise(lines):
+        assert np.linalg.norm(one[-1] - other[0]) < 0.03  # none is missing between them
