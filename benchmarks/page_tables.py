@@ -113,3 +113,38 @@ def registration_lines(figures: Mapping[str, Any]) -> list[str]:
         "",
         *table(heads, rows),
     ]
+
+
+def reconstruction_lines(figures: Mapping[str, Any]) -> list[str]:
+    """Return hull and refined surface of every case, what was left out, and errors by confidence."""
+    heads = ("case", "views", "P2S mean", "median", "p95", "completeness mean", "median", "within 5 mm")
+    rows, costs, sure, lines = [], [], [], []
+    for case, row in figures["rows"].items():
+        for which in ("hull", "refined"):
+            forth, back = row[which]["p2s"], row[which]["completeness"]
+            numbers = [forth["mean"], forth["median"], forth["p95"], back["mean"], back["median"], back["within_5_mm"]]
+            rows.append((f"{case}: {which}", row["views"], *numbers))
+        seen = row["refined"]["seen_by_two"]
+        rows.append(
+            (f"{case}: refined, seen by two", row["views"], seen["mean"], seen["median"], seen["p95"]) + (None,) * 3
+        )
+        what = ("pixel_mm", "cell_mm", "vertices", "genus", "unseen", "silhouettes", "seconds", "cpu_seconds")
+        costs.append((case, *(row[key] for key in what), row["peak_memory_gib"]))
+        sure += [
+            (case, *(one[key] for key in ("from", "share", "mean", "median", "p95")))
+            for one in row["refined"]["by_confidence"]
+        ]
+        if row["left_out"]:
+            lines += [
+                f"Left out of {case}: " + "; ".join(f"{name} ({why})" for name, why in row["left_out"].items()) + ".",
+                "",
+            ]
+    return [
+        *table(heads, rows),
+        *lines,
+        *table(
+            ("case", "pixel, mm", "cell, mm", "vertices", "genus", "unseen", "IoU with masks", "s", "CPU s", "GiB"),
+            costs,
+        ),
+        *table(("case", "confidence from", "share of vertices", "error mean", "median", "p95"), sure),
+    ]

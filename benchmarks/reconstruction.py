@@ -83,7 +83,8 @@ class ReconstructionBenchmark:
                 "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
             }
             print(case, rows[case], sep="\n  ", flush=True)
-        if self.store:
+            if not self.store:
+                continue
             sizes = sorted({(camera.width, camera.height) for camera in capture.cameras.values()})
             figures = {"frame": self.frame, "images": sizes, "cameras": len(capture.cameras), "rows": rows}
             print(f"stored {store_results(f'reconstruction_{self.name or self.capture.name}', COMMAND, figures).name}")

@@ -26,6 +26,8 @@ from pipelines.runs.checks import Check
 from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
+from pipelines.stages.photographed import unit_cube_of
+from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct, save_reconstruct
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.body import load_body
 from smplxpp.core.errors import GeometryWarning
@@ -86,6 +88,7 @@ def _write_run(run: Path) -> None:
     inputs = BuildInputs(scan=run / "scan.ply", params=run / "params.npz", subject="Dancer")
     save_build(run, inputs, BuildConfig())
     save_register(run, RegisterInputs(capture=run))
+    save_reconstruct(run, ReconstructInputs(run, (0, 3), hold_out=("Cam1",), cell_mm=5.0))
 
 
 _FIT = {
@@ -118,6 +121,7 @@ def _open_run(run: Path) -> None:
     write_report(run / "report.html", Report("Dancer", sections=tuple(sections)))
     load_build(run)
     load_register(run)
+    load_reconstruct(run)
 
 
 def _model_door(kind: str, *, compact: bool = False) -> Door:
@@ -160,6 +164,11 @@ def run_doors() -> list[Door]:
             lambda folder: EvalReport.load(folder / "m.json"),
         ),
         Door("stage arrays", lambda f: save_arrays(f / "a.npz", groups), lambda f: load_arrays(f / "a.npz")),
+        Door(
+            "unit cube",
+            lambda folder: (folder / "transform.json").write_text(json.dumps({"scale": 0.5, "offset": [0.5] * 3})),
+            unit_cube_of,
+        ),
         Door("run", _write_run, _open_run, ("**/*.json",), refuses=False),
         Door(
             "splats",
