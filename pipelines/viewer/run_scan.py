@@ -10,11 +10,21 @@ import numpy as np
 
 from pipelines.runs.arrays import read_named, take
 from pipelines.runs.artefacts import load_scan, load_scan_labels
-from pipelines.runs.layout import CORRECTIONS_FILE, LANDMARKS_FILE, SCAN, SCAN_LABELS, SEGMENT_STAGE
+from pipelines.runs.layout import (
+    CORRECTIONS_FILE,
+    LANDMARKS_FILE,
+    RECONSTRUCT_FILE,
+    REGISTER_FILE,
+    REGISTER_STAGE,
+    SCAN,
+    SCAN_LABELS,
+    SEGMENT_STAGE,
+)
 from pipelines.runs.reading import values_of
 from pipelines.stages.build import build
 from pipelines.stages.build_config import load_build
 from pipelines.stages.capture import GREY
+from pipelines.stages.reconstruct_config import load_reconstruct
 from pipelines.stages.register_config import load_register
 from pipelines.stages.scan_files import read_scan
 from pipelines.viewer.session import LabelledScan, LabelSession
@@ -109,10 +119,25 @@ def label_again(run: Path, *, progress: Callable[[str, bool], None] = lambda nam
             remedy="give `smplxpp build` again",
         )
     inputs, config = found
-    registration = load_register(run) if inputs.params is None else None
-    if inputs.params is None and registration is None:
+    registration = load_register(run) if REGISTER_STAGE in inputs.stages else None
+    reconstruction = load_reconstruct(run) if inputs.reconstructs else None
+    lacks = (registration is None and REGISTER_STAGE in inputs.stages, reconstruction is None and inputs.reconstructs)
+    if any(lacks):
+        name = REGISTER_FILE if lacks[0] else RECONSTRUCT_FILE
         raise InputError(
-            f"run {run}", expected="what it was registered to (register.json)", received="nothing of the kind"
+            f"run {run}",
+            expected=f"what it was made from ({name})",
+            received="nothing of the kind",
+            remedy="give `smplxpp build` again",
         )
-    build(run, inputs, config, registration=registration, first=SEGMENT_STAGE, last=SEGMENT_STAGE, progress=progress)
+    build(
+        run,
+        inputs,
+        config,
+        registration=registration,
+        reconstruction=reconstruction,
+        first=SEGMENT_STAGE,
+        last=SEGMENT_STAGE,
+        progress=progress,
+    )
     return open_session(run)

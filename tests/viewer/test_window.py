@@ -14,13 +14,15 @@ from pipelines.cli import main
 from pipelines.commands import label as label_command
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
-from pipelines.viewer.run_scan import open_session
+from pipelines.stages.register_config import RegisterInputs
+from pipelines.viewer.run_scan import label_again, open_session
 from pipelines.viewer.session import LabelledScan, LabelSession
 from pipelines.viewer.window import LabelWindow, open_window
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LOWER, SHOE, UPPER
 from smplxpp.core.mesh import concatenate_meshes
 from smplxpp.segment import Corrections
+from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
 from tests.pipelines.test_build import Small, small, small_scan  # noqa: F401
 from tests.segment.test_corrections import tube
 
@@ -217,6 +219,23 @@ def test_a_run_that_does_not_say_what_it_was_built_from_is_not_labelled_again(ru
         assert "error" in said(window) and "build.json" in said(window)
     finally:
         window.close()
+
+
+def test_labels_are_made_again_in_a_run_that_registers(small: Small, monkeypatch):  # noqa: F811
+    """Its registration stands, and is not asked for again."""
+    use_keypoints(monkeypatch)
+    solver = use_solver(monkeypatch)
+    run, inputs = small.folder / "registered", small.inputs(params=None, registers=True)
+    registration = RegisterInputs(capture=FIXTURE, params=FIXTURE / "params" / "params_noisy.npz", frames=(0, 1))
+    build(run, inputs, BuildConfig(), registration=registration, last="20_segment")
+    session = open_session(run)
+    session.box(HAIR.id, session.scan.mesh.vertices[0], np.full(3, 0.2), np.eye(3))
+    session.save(run)
+    again = label_again(run)
+    assert len(solver.shown) == 1 and (again.labels() == session.labels()).all()
+    (run / "register.json").unlink()
+    with pytest.raises(InputError, match=r"register\.json"):
+        label_again(run)
 
 
 def test_build_and_viewer_meet_in_the_files(small: Small, run):  # noqa: F811
