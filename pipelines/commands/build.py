@@ -82,6 +82,8 @@ class Build:
     """Units of the scan file. auto: found where the scan comes alone, else those of the parameters, metres."""
     up: Literal["auto", "y", "z", "x", "-y", "-z", "-x"] = "auto"
     """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
+    detector: OptionalText = None
+    """`mediapipe` (extra detect) or a pose model in ONNX: asked which way the person faces whose scan comes alone."""
     keep_webs: bool = False
     """Keep the scan's surface where it bridges two limbs, as under the arms; it tears when the pose opens them."""
     method: Literal["ours", "paper"] = "ours"
@@ -112,11 +114,14 @@ class Build:
         from pipelines.commands.inspect import Inspect
         from pipelines.report.sections.build import write_build_report
         from pipelines.stages.build import build
+        from smplxpp.detect import load_detector
         from smplxpp.register.landmark_file import read_landmarks
         from smplxpp.segment import Corrections
 
         keep_out_of_capture(self.out, self.capture)
         config, inputs = self.config(), self.inputs()
+        if self.detector is not None:
+            load_detector(self.detector)  # before work starts
         take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         take_file(self.out, CORRECTIONS_FILE, self.corrections, read=Corrections.load)
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)

@@ -67,7 +67,11 @@ class _Part:
 
 PARTS: dict[str, _Part] = {
     LOCATE_STAGE: _Part(
-        locate, (RECONSTRUCT_STAGE,), settings=("units", "up"), files=("scan", "body"), by_hand=(LANDMARKS_FILE,)
+        locate,
+        (RECONSTRUCT_STAGE,),
+        settings=("units", "up", "detector"),
+        files=("scan", "body"),
+        by_hand=(LANDMARKS_FILE,),
     ),
     CAPTURE_STAGE: _Part(
         capture,

@@ -86,6 +86,7 @@ class BuildConfig:
 
     Attributes:
         units, up: how the scan file is written; it is converted to metres, +Y up.
+        detector: asked which way a person faces whose scan comes alone: "mediapipe" or an ONNX file; None: nobody.
         budgets: faces kept by part name.
         clearance_mm: how far outer layers are kept from inner ones.
         max_influences: joints a vertex.
@@ -97,6 +98,7 @@ class BuildConfig:
 
     units: str = "m"
     up: str = "y"
+    detector: str | None = None
     budgets: dict[str, int] = field(default_factory=_default_budgets)
     clearance_mm: float = 1.0
     max_influences: int = 8

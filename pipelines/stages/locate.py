@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -15,15 +16,17 @@ from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from pipelines.stages.located import write_located
 from pipelines.stages.scan_files import read_scan
+from pipelines.stages.scan_keypoints import facing, keypoints_of_scan
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import smooth_if_rough
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.detect import load_detector
 from smplxpp.register.bare import bare_of_scan
 from smplxpp.register.landmark_file import read_landmarks
-from smplxpp.register.locate import locate_body
+from smplxpp.register.locate import LocatedBody, locate_body
 from smplxpp.register.observations import ScanObservation
 from smplxpp.segment import label_by_body
 
@@ -41,13 +44,11 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     placed = build.run / LANDMARKS_FILE
     labeller = partial(sure_labels, mesh, body, colors)
-    found = locate_body(
-        body,
-        mesh,
-        colors=colors,
-        landmarks=read_landmarks(placed) if placed.exists() else None,
-        labeller=labeller,
-    )
+    look = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
+    found = look(landmarks=read_landmarks(placed) if placed.exists() else None)
+    witness = ""
+    if build.config.detector is not None and not placed.exists():
+        found, witness = _witnessed(found, look, mesh, colors, build.config.detector)
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
     of_faces = labeller(found.params)
     known = of_faces != BACKGROUND
@@ -58,6 +59,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         "units": scan.units,
         "up": scan.up,
         "said": scan.said,
+        "detector": witness,
         "facing_degrees": found.candidates[0].facing_degrees,
         "confidence": found.confidence,
         "problems": list(found.problems),
@@ -76,6 +78,29 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         + "".join(f"; {problem}" for problem in found.problems),
     )
     return StageOutput([check], jsonable(numbers))
+
+
+def _witnessed(
+    found: LocatedBody,
+    look: Callable[..., LocatedBody],
+    mesh: TriangleMesh,
+    colors: UInt8[np.ndarray, "N 3"] | None,
+    detector: str,
+) -> tuple[LocatedBody, str]:
+    """The body as it was found if a detector's keypoints on pictures of the scan face the same way, else as they say.
+
+    Keypoints are centimetres off, geometry is not: they are asked for the front alone, and where both disagree the
+    search is done again with them.
+    """
+    landmarks = keypoints_of_scan(mesh, colors, load_detector(detector))
+    front = facing(landmarks)
+    if front is None:
+        return found, "the detector's keypoints do not tell the front"
+    own = np.radians(found.candidates[0].facing_degrees)
+    if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
+        return found, "the detector's keypoints face the same way"
+    again = look(landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
+    return again, "the surface alone was taken for somebody who faces the other way than the detector's keypoints do"
 
 
 def sure_labels(

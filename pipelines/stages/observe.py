@@ -159,7 +159,8 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Non
             f"scan {inputs.scan.name}",
             expected="a fit, or landmarks, to start from: a scan alone does not say where its limbs are",
             received="neither",
-            remedy="name a fit with --params, or landmarks with --landmarks",
+            remedy="name a fit with --params, or landmarks with --landmarks; `smplxpp build --scan` finds the body by "
+            "itself",
         )
     initial = None
     if given is not None:

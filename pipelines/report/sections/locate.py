@@ -29,7 +29,7 @@ def locate_section(record: StageRecord, body: BodyModel, scan: TriangleMesh) -> 
     shown = np.where(bare[:, None], _BARE, _COVERED).astype(np.uint8)
     bodies = [render_shaded(found, camera, vertex_colors=shown) for camera in cameras]
     with values_of(path):
-        said = [as_text(content["said"], subject="said")]
+        said = [as_text(content[name], subject=name) for name in ("said", "detector")]
         problems = [as_text(words, subject="problem") for words in as_list(content["problems"], subject="problems")]
         candidates = [
             as_object(one, subject="candidate") for one in as_list(content["candidates"], subject="candidates")
@@ -57,7 +57,7 @@ def locate_section(record: StageRecord, body: BodyModel, scan: TriangleMesh) -> 
     return Section(
         title="Body found in the scan",
         text=(
-            " ".join(said),
+            ". ".join(words for words in said if words),
             "Nothing but the surface said where the body is. Look at hands, feet and face: the body's own colour shows "
             "where it comes through. Landmarks placed with `smplxpp label` settle what is wrong.",
         ),

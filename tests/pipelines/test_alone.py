@@ -1,0 +1,133 @@
+"""A scan with nothing beside it, in other units and on its side, becomes a labelled body; a hand may help it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.commands.build import Build
+from pipelines.report.sections.locate import locate_section
+from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, SEGMENT_STAGE
+from pipelines.runs.stage import require_stage
+from pipelines.stages import locate
+from pipelines.stages.located import read_located, read_located_labels
+from smplxpp.body import load_body, load_params
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import BACKGROUND, SKIN
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
+from smplxpp.register.locate import Candidate, LocatedBody
+from smplxpp.segment import read_labels
+
+PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+BODY = load_body()
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """The fixture's scan in centimetres, lying on its back as files with z up do."""
+    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
+    x, y, z = raw.vertices.T
+    path = tmp_path_factory.mktemp("scan") / "me.ply"
+    lying = TriangleMesh(100.0 * np.stack([x, -z, y], axis=1), raw.faces)
+    write_ply(path, lying, vertex_colors=raw.vertex_colors)
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(scan):
+    run = scan.parent / "run"
+    Build(out=run, scan=scan, until_stage=SEGMENT_STAGE, json=True).run()
+    return run
+
+
+def test_the_body_is_found(alone):
+    true = BODY.forward(load_params(PERSON / "params" / "params.npz").frame(0)).frame(0)
+    found = BODY.forward(load_params(alone / "00_capture" / "params.npz")).frame(0)
+    assert 1e3 * np.linalg.norm(found.vertices - true.vertices, axis=1).mean() < 15.0
+    assert 1e3 * np.linalg.norm(found.joints - true.joints, axis=1)[:22].mean() < 12.0
+    numbers = require_stage(alone, LOCATE_STAGE).manifest["numbers"]
+    assert (numbers["units"], numbers["up"]) == ("cm", "z") and "cm" in numbers["said"]
+    assert abs(numbers["facing_degrees"]) < 10.0 and numbers["confidence"] > 0.5 and numbers["problems"] == []
+    facings = [one["facing_degrees"] for one in numbers["candidates"]]
+    assert max(np.cos(np.radians(facings))) > 0.9 and min(np.cos(np.radians(facings))) < -0.9
+
+
+def test_labels_are_told(alone):
+    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
+    true = read_labels(
+        PERSON / "scans" / "scan_000000_labels.npz",
+        vertex_count=len(raw.vertices),
+        face_count=len(raw.faces),
+        label_set="capture",
+    )
+    with np.load(alone / SEGMENT_STAGE / "labels.npz") as labels, np.load(alone / "00_capture" / "scan.npz") as kept:
+        told, source = labels["face_labels"], kept["scan/source_face"]
+    corners = true[raw.faces[source]]
+    one = (corners == corners[:, :1]).all(axis=1) & (corners[:, 0] != BACKGROUND)
+    assert (told[one] == corners[one, 0]).mean() > 0.93
+    assert require_stage(alone, SEGMENT_STAGE).manifest["numbers"]["labels_from"] == "body"
+
+
+def test_what_a_registration_takes_up(alone):
+    params, bare = read_located(alone / LOCATE_STAGE, BODY)
+    labels = read_located_labels(
+        alone / LOCATE_STAGE, len(read_raw_mesh(alone / SEGMENT_STAGE / "labels.ply").vertices)
+    )
+    assert len(params) == 1 and 0.2 < bare.mean() < 0.7
+    assert (labels == SKIN.id).mean() > 0.2 and (labels == BACKGROUND).any()
+    assert read_located_labels(alone / LOCATE_STAGE, 7) is None
+
+
+def test_the_report_shows_what_else_it_might_have_been(alone):
+    record = require_stage(alone, LOCATE_STAGE)
+    with np.load(alone / "00_capture" / "scan.npz") as kept:
+        mesh = TriangleMesh(kept["scan/vertices"], kept["scan/faces"])
+    section = locate_section(record, BODY, mesh)
+    assert len(section.pictures) == 2 and "found units cm" in section.text[0]
+    assert [row[0].startswith("chosen") for row in section.tables[0].rows][:2] == [True, False]
+
+
+def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, scan, monkeypatch):
+    shown = []
+    fit = load_params(PERSON / "params" / "params.npz").frame(0)
+
+    def look(body, mesh, *, colors, landmarks, labeller):
+        shown.append(landmarks)
+        return LocatedBody(fit, 0.1, ("one hand is not there",), (Candidate("by hand", 0.0, 1.0, 1.0, 1.0),))
+
+    monkeypatch.setattr(locate, "locate_body", look)
+    build = Build(out=tmp_path / "run", scan=scan, until_stage=LOCATE_STAGE, json=True)
+    checks = build.run()["checks"]
+    assert checks[0]["status"] == "fail" and "one hand is not there" in checks[0]["explanation"]
+    (tmp_path / "run" / LANDMARKS_FILE).write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
+    build.run()
+    build.run()
+    assert shown[0] is None and set(shown[1]) == {"nose"} and len(shown) == 2
+
+
+def test_what_is_no_person_is_refused_before_anything_is_written(tmp_path):
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    faces = np.array(
+        [
+            [0, 1, 3],
+            [0, 3, 2],
+            [4, 6, 7],
+            [4, 7, 5],
+            [0, 4, 5],
+            [0, 5, 1],
+            [2, 3, 7],
+            [2, 7, 6],
+            [0, 2, 6],
+            [0, 6, 4],
+            [1, 5, 7],
+            [1, 7, 3],
+        ]
+    )
+    write_ply(tmp_path / "cube.ply", TriangleMesh(cube * 1.8, faces))
+    with pytest.raises(InputError):
+        Build(out=tmp_path / "run", scan=tmp_path / "cube.ply", json=True).run()
+    assert not list((tmp_path / "run").glob("[0-9]*"))
