@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float64, Num
 
 from smplxpp.body import BodyModel
-from smplxpp.core.labels import HAIR, LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import face_adjacency
@@ -18,7 +17,7 @@ from smplxpp.segment.by_body_appearance import Blend, label_costs
 from smplxpp.segment.by_body_chart import BodyChart, chart_of_scan
 from smplxpp.segment.by_body_colors import Palette, SkinModel, fit_skin, has_colors
 from smplxpp.segment.by_body_doubts import find_doubts
-from smplxpp.segment.by_body_hair import hanging_hair, is_bald
+from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_outfit import (
     ARM_END,
     ARM_START,
@@ -30,7 +29,7 @@ from smplxpp.segment.by_body_outfit import (
     in_arm,
     in_column,
 )
-from smplxpp.segment.by_body_prior import face_core, hand_core, place_prior
+from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
@@ -79,14 +78,14 @@ class Evidence:
 
     Attributes:
         chart: places on the body. outfit: the outline. skin: the skin model; None without colours.
-        bald: no hair on the skull. misfit: metres by which the body misses bare skin.
+        layers: what lies over the rest. misfit: metres by which the body misses bare skin.
         costs: (M, L) nats.
     """
 
     chart: BodyChart
     outfit: Outfit
     skin: SkinModel | None
-    bald: bool
+    layers: Layers
     misfit: float
     costs: Float64[np.ndarray, "M L"]
 
@@ -148,24 +147,20 @@ def weigh_evidence(
     chart = chart_of_scan(mesh, body, params)
     area = mesh.face_areas
     pairs, _ = face_adjacency(mesh.faces)
-    bare = face_core(chart) | hand_core(chart)
+    bare = chart.face_core | chart.hand_core
     misfit = float(np.clip(1.4826 * np.median(np.abs(chart.distance[bare])), 0.003, 0.02)) if bare.any() else 0.02
     skin, palette = None, None
     ratio = np.zeros(mesh.face_count)
-    bald = False
-    hanging = np.zeros(mesh.face_count, dtype=bool)
+    layers = Layers.none(mesh.face_count)
     skin_like = np.full(mesh.face_count, 0.5)
     if lab is not None:
         palette = Palette.of(lab)
-        skin = fit_skin(lab, face_core(chart), hand_core(chart), area)
+        skin = fit_skin(lab, chart.face_core, chart.hand_core, area)
         ratio = skin.log_ratio(lab)
         skin_like = 1.0 / (1.0 + np.exp(-(ratio + 1.0)))
-        bald = is_bald(chart, ratio, area)
-        if not bald:
-            hanging = hanging_hair(chart, palette, skin_like, area, pairs)
+        layers = find_layers(chart, palette, ratio, area, pairs)
 
-    def rings(mask: np.ndarray, place: np.ndarray, start: float, end: float) -> Rings:
-        mask = mask & ~hanging
+    def rings(mask: np.ndarray, over: np.ndarray, place: np.ndarray, start: float, end: float) -> Rings:
         return Rings.of(
             place[mask],
             start,
@@ -175,16 +170,13 @@ def weigh_evidence(
             color_count=1 if palette is None else palette.size,
             skin=ratio[mask],
             distance=chart.distance[mask],
+            used=~over[mask],
         )
 
-    column = rings(in_column(chart), chart.height, 0.0, COLUMN_END)
-    arm = rings(in_arm(chart), chart.reach, ARM_START, ARM_END)
+    column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
+    arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
     outfit = find_outfit(column, arm, config.outfit, misfit=misfit)
-    prior = place_prior(chart, outfit, softness=config.softness, body_softness=config.body_softness)
-    prior[hanging] = 0.2 * prior[hanging] + 0.8 * np.eye(len(LABELS))[HAIR.id]
-    if bald:
-        prior[:, HAIR.id] *= 0.02
-        prior /= prior.sum(axis=1, keepdims=True)
+    prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
     blend = Blend.of(
         pairs,
         np.ones(len(pairs)) if lab is None else likeness(lab, pairs),
@@ -199,11 +191,11 @@ def weigh_evidence(
         area=area,
         far=weight * _cloth_by_distance(chart.distance, misfit),
         blend=blend,
-        bald=bald,
+        bald=layers.bald,
         rounds=config.rounds,
         cap=config.color_cap,
     )
-    return Evidence(chart, outfit, skin, bald, misfit, costs)
+    return Evidence(chart, outfit, skin, layers, misfit, costs)
 
 
 def _cloth_by_distance(distance: np.ndarray, misfit: float) -> np.ndarray:

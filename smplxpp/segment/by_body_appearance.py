@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.sparse import csr_matrix
 
 from smplxpp.core.labels import HAIR, LABELS, SKIN
@@ -94,12 +94,3 @@ def _color_shares(palette: Palette, sure: np.ndarray, area: np.ndarray) -> Float
         for k in range(len(LABELS))
     ]
     return np.stack(shares, axis=1)
-
-
-def connected_to(
-    mask: Bool[np.ndarray, " M"], root: Bool[np.ndarray, " M"], component: Int64[np.ndarray, " M"]
-) -> Bool[np.ndarray, " M"]:
-    """Faces of a mask whose component (numbered from 0) has a face of `root` in it."""
-    rooted = np.zeros(int(component.max(initial=0)) + 1, dtype=bool)
-    rooted[component[root & mask]] = True
-    return mask & rooted[component]

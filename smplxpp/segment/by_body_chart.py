@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
@@ -53,6 +53,23 @@ class BodyChart:
     def __getitem__(self, index: np.ndarray) -> BodyChart:
         names = ("region", "height", "reach", "azimuth", "face_height", "distance", "side")
         return BodyChart(*(getattr(self, name)[index] for name in names))
+
+    @property
+    def face_core(self) -> Bool[np.ndarray, " n"]:
+        """Well within the face, between chin and brows."""
+        inside = (self.face_height > 0.05) & (self.face_height < 0.62)
+        return (self.region == HEAD) & (np.abs(self.azimuth) < 0.8) & inside
+
+    @property
+    def hand_core(self) -> Bool[np.ndarray, " n"]:
+        """Well within the hands."""
+        return (self.region == HAND) & (self.reach > WRIST + 0.04)
+
+    @property
+    def skull_cap(self) -> Bool[np.ndarray, " n"]:
+        """Where hair grows on those who have any: the top and the back of the head."""
+        back = (np.abs(self.azimuth) > 2.0) & (self.face_height > 0.4)
+        return (self.region == HEAD) & (back | (self.face_height > 0.9))
 
 
 def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:

@@ -20,7 +20,8 @@ _SKIN_LIGHT = (0.2, 0.97)
 _LEAST_SPREAD = np.array([0.05, 0.012, 0.012])
 _MOST_SPREAD = np.array([0.12, 0.03, 0.03])
 # The skin of face and hands differs by less.
-_ONE_SKIN = np.array([0.25, 0.045, 0.045])
+_ONE_SKIN = np.array([0.2, 0.04, 0.04])
+_FACE_SHARE = 0.25
 # Density of colours of things at large, within the colours that a screen can show.
 _ANY_COLOR = 10.0
 _GREY_SPREAD = 0.012
@@ -120,7 +121,12 @@ def fit_skin(
         face, hands: faces that lie well within these regions of the body.
     """
     of_face, of_hands = _main_color(lab[face], area[face]), _main_color(lab[hands], area[hands])
-    agree = of_face is not None and of_hands is not None and bool((abs(of_face[0] - of_hands[0]) < _ONE_SKIN).all())
+    agree = False
+    if of_face is not None and of_hands is not None:
+        # Hair over the face, or a body turned by some degrees: then part of the face alone has the hands' colour.
+        like_hands = (np.abs(lab - of_hands[0]) < _ONE_SKIN).all(axis=1)
+        agree = area[face & like_hands].sum() > _FACE_SHARE * area[face].sum()
+        face = face & like_hands if agree else face
     chosen = (face | hands) if agree else face if of_face is not None else hands
     main = _main_color(lab[chosen], area[chosen]) or of_face or of_hands
     if main is None:
@@ -136,7 +142,10 @@ def _main_color(lab: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if len(lab) < 10 or area[skin].sum() < 0.33 * area.sum():
         return None
     lab = lab[skin]
-    center = np.median(lab, axis=0)
+    # The densest place, then the mean of what is around it.
+    sample = lab[:: max(1, len(lab) // 500)] / COLOR_STEP
+    near = cKDTree(sample).query_ball_point(sample, 1.5, return_length=True)
+    center = sample[int(near.argmax())] * COLOR_STEP
     for _ in range(5):
         spread = np.clip(1.4826 * np.median(np.abs(lab - center), axis=0), _LEAST_SPREAD, _MOST_SPREAD)
         near = (np.abs(lab - center) < 2.5 * spread).all(axis=1)

@@ -75,24 +75,28 @@ class Rings:
         color_count: int,
         skin: np.ndarray,
         distance: np.ndarray,
+        used: np.ndarray,
     ) -> Rings:
         """Gather faces by their place along the column.
 
         Args:
-            place, area, skin, distance: of some faces; skin: log ratios. color: their palette index.
+            place, area, skin, distance: of some faces; skin: log ratios. color: their palette index. used: which of
+                them count; a ring of which little is left has little weight.
         """
         count = round((end - start) / STEP)
         ring = np.floor((place - start) / STEP).astype(np.int64)
         inside = (ring >= 0) & (ring < count)
+        whole = np.bincount(ring[inside], area[inside], minlength=count)
+        inside &= used
         ring, area, color, skin, distance = (x[inside] for x in (ring, area, color, skin, distance))
         total = np.bincount(ring, area, minlength=count)
         share = np.maximum(total, 1e-12)
         colors = np.bincount(ring * color_count + color, area, minlength=count * color_count)
         parts = [np.bincount(ring, area * np.maximum(sign * skin, 0), minlength=count) / share for sign in (1, -1)]
-        usual = float(np.median(total[total > 0])) if (total > 0).any() else 1.0
+        usual = float(np.median(whole[whole > 0])) if (whole > 0).any() else 1.0
         return Rings(
             start,
-            np.clip(2.0 * total / usual, 0, 1),
+            np.clip(2.0 * np.minimum(total / usual, total / np.maximum(whole, 1e-12)), 0, 1),
             colors.reshape(count, color_count) / share[:, None],
             np.stack(parts, axis=1),
             np.bincount(ring, area * np.clip(distance, -0.03, 0.08), minlength=count) / share,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK_BASE, TRUNK, WRIST, BodyChart
+from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
 
 # What else may be there, by region, whatever the outline says: a share of the whole, over all labels.
@@ -18,10 +19,12 @@ _ELSE: dict[int, dict[int, float]] = {
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
 _NEVER = 1e-6
+# Hair where the skull is bald, and what may be wrong about a layer that was found.
+_BALD_HAIR, _UNLAYERED = 0.02, 0.2
 
 
 def place_prior(
-    chart: BodyChart, outfit: Outfit, *, softness: float, body_softness: float
+    chart: BodyChart, outfit: Outfit, layers: Layers, *, softness: float, body_softness: float
 ) -> Float64[np.ndarray, "M L"]:
     """P(label) at each face's place, before its colour is looked at; rows sum to 1.
 
@@ -52,25 +55,19 @@ def place_prior(
     out[neck] += _neck(chart.azimuth[neck])
     head = chart.region == HEAD
     out[head] += _head(chart.azimuth[head], chart.face_height[head], body_softness)
+    out /= out.sum(axis=1, keepdims=True)
+    if layers.bald:
+        out[:, HAIR.id] *= _BALD_HAIR
+    if layers.bib:
+        front = top & (np.abs(chart.azimuth) < 1.2)
+        out[front] = 0.6 * out[front] + 0.4 * _only(LOWER.id)
+    for mask, label in ((layers.hair, HAIR), (layers.coat, OUTER)):
+        out[mask] = _UNLAYERED * out[mask] + (1.0 - _UNLAYERED) * _only(label.id)
     return out / out.sum(axis=1, keepdims=True)
 
 
-def face_core(chart: BodyChart) -> Bool[np.ndarray, " M"]:
-    """Well within the face, between chin and brows."""
-    return (
-        (chart.region == HEAD) & (np.abs(chart.azimuth) < 0.8) & (chart.face_height > 0.05) & (chart.face_height < 0.62)
-    )
-
-
-def hand_core(chart: BodyChart) -> Bool[np.ndarray, " M"]:
-    """Well within the hands."""
-    return (chart.region == HAND) & (chart.reach > WRIST + 0.04)
-
-
-def skull_cap(chart: BodyChart) -> Bool[np.ndarray, " M"]:
-    """Where hair grows on those who have any: the top and the back of the head."""
-    back = (np.abs(chart.azimuth) > 2.0) & (chart.face_height > 0.4)
-    return (chart.region == HEAD) & (back | (chart.face_height > 0.9))
+def _only(label: int) -> np.ndarray:
+    return (np.arange(len(LABELS)) == label).astype(np.float64)
 
 
 def _above(x: np.ndarray, border: float, softness: float) -> np.ndarray:
