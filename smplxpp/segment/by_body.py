@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Num
@@ -175,7 +175,8 @@ def weigh_evidence(
 
     column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
-    outfit = find_outfit(column, arm, config.outfit, misfit=misfit)
+    outline = config.outfit if lab is not None else replace(config.outfit, habit=1.0)
+    outfit = find_outfit(column, arm, outline, misfit=misfit)
     prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
     blend = Blend.of(
         pairs,

@@ -89,7 +89,8 @@ def _hanging_hair(
 
 @dataclass(frozen=True, eq=False)
 class _ClothColors:
-    """Histograms of the trunk's front, sides and back, of sleeves and of legs; None where there is hardly any cloth."""
+    """Histograms of the trunk's front, sides and back, of sleeves and of legs, and of the front at three heights; None
+    where there is hardly any cloth."""
 
     front: np.ndarray | None
     side: np.ndarray | None
@@ -124,7 +125,8 @@ class _ClothColors:
     def coat(self) -> bool:
         """Sides, back and sleeves are one cloth, and the whole height of the front's middle is another."""
         over = _differ(self.side, self.back) < _SAME and _differ(self.side, self.sleeve) < _SAME
-        return over and not self.bib and all(_differ(part, self.side) > _OTHER for part in (self.front, *self.heights))
+        known = [x for x in (_differ(part, self.side) for part in self.heights) if np.isfinite(x)]
+        return over and not self.bib and len(known) > 1 and min(known) > _OTHER
 
     @property
     def bib(self) -> bool:

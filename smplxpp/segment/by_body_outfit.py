@@ -17,6 +17,10 @@ from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HIP, KNEE, LEG, TRUNK
 
 STEP = 0.015  # of a ring, standard metres
 COLUMN_END, ARM_START, ARM_END = 1.32, -0.06, 0.62
+# Trousers that end below this, metres, and look like skin by more than these nats; a low shoe's top.
+_LONG, _SKIN_COLORED, _LOW_SHOE = 0.13, 1.0, 0.09
+# Habits: a waist here, two garments rather than one (nats), legs covered (nats a ring), at least short sleeves.
+_WAIST, _TWO_PIECES, _BARE_LEG, _SHORT_SLEEVE = 0.98, 10.0, 0.7, 0.15
 _COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
 
 
@@ -32,7 +36,8 @@ class OutfitConfig:
         distance: a ring's mean distance to the body, a nat of log ratio.
         bare_pelvis: a ring of skin about the pelvis.
         split: of two garments where one would do. midriff: of skin between two garments.
-        crease: bonus of a border with a full step or ring of folds.
+        crease: bonus of a border with a full step of the distance to the body.
+        habit: 0 to 1, how far what people mostly wear (sleeves, trousers, a waist at the waist) stands in for colours.
     """
 
     samples: float = 8.0
@@ -45,6 +50,7 @@ class OutfitConfig:
     split: float = 25.0
     midriff: float = 12.0
     crease: float = 12.0
+    habit: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +147,11 @@ def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: floa
     """
     borders, margins = _cut_column(column, config, misfit)
     cuff, margins["cuff"] = _cut_arm(arm, config, misfit)
+    shoe_top, lower_start, lower_end, _ = borders
+    trousers = (column.places[:-1] >= lower_start) & (column.places[:-1] < lower_end)
+    if shoe_top == 0.0 and lower_start < _LONG and trousers.any() and column.skin[trousers, 0].mean() > _SKIN_COLORED:
+        # Trousers of the colour of skin: so may shoes be, and bare feet below trousers are rare.
+        borders, margins["shoe_top"] = (_LOW_SHOE, max(_LOW_SHOE, lower_start), *borders[2:]), 0.0
     return Outfit(*borders, cuff, margins)
 
 
@@ -211,7 +222,10 @@ def _cut_column(
     shoe = shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
-    lower = np.where(empty, 6.0, cloth + config.split + usual + on_foot)
+    habit = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0) - _TWO_PIECES
+    habit += _between(np.where(middle < _WAIST, _BARE_LEG, 0.0))[0][i]
+    split = (1.0 - config.habit) * config.split + config.habit * habit
+    lower = np.where(empty, 6.0, cloth + split + usual + on_foot)
     midriff = skin + np.where(empty, 0.0, config.midriff)
     upper = cloth + on_foot + _usual(place[i], -0.1, 1.2, 60.0) - np.where(i > 0, fold[i], 0.0)
     runs = [shoe, skin, lower, midriff, upper]
@@ -239,6 +253,7 @@ def _cut_column(
 def _cut_arm(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[float, float]:
     _, cloth, skin = _run_costs(rings, config, misfit)
     cost = cloth[0] + skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
+    cost += config.habit * _usual(rings.places, _SHORT_SLEEVE, 1.0, 20.0)
     best = int(cost.argmin())
     return float(rings.places[best]), _margin(cost, rings.places, best)
 
