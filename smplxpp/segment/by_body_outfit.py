@@ -19,6 +19,7 @@ STEP = 0.015  # of a ring, standard metres
 COLUMN_END, ARM_START, ARM_END = 1.32, -0.06, 0.62
 # Trousers that end below this, metres, and look like skin by more than these nats; a low shoe's top.
 _LONG, _SKIN_COLORED, _LOW_SHOE = 0.13, 1.0, 0.09
+_SKIRT = 0.025  # metres: what is about the thighs and lies farther from them on the mean
 # Habits: a waist here, two garments rather than one (nats), legs covered (nats a ring), at least short sleeves.
 _WAIST, _TWO_PIECES, _BARE_LEG, _SHORT_SLEEVE = 0.98, 10.0, 0.7, 0.15
 _COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
@@ -31,11 +32,12 @@ class OutfitConfig:
     Attributes:
         samples: independent samples of colour that a ring is worth.
         skin_in_cloth: a sample of cloth that looks like skin, a nat of log ratio; in all at most `skin_colored`, what
-            it costs that a garment has the colour of skin, or `skin_colored_shoe`.
+            it costs that a garment has the colour of skin; `skin_colored_top`, `skin_colored_shoe` for those.
         other_in_skin: a sample of skin that does not look like it, a nat of log ratio.
         distance: a ring's mean distance to the body, a nat of log ratio.
         bare_pelvis: a ring of skin about the pelvis.
-        split: of two garments where one would do. midriff: of skin between two garments.
+        split: of two garments where one would do, about legs that a skirt hides; `split_at_legs` about legs that show
+            (a suit of one colour is more usual than a jumpsuit). midriff: of skin between two garments.
         crease: bonus of a border with a full step of the distance to the body.
         habit: 0 to 1, how far what people mostly wear (sleeves, trousers, a waist at the waist) stands in for colours.
     """
@@ -43,11 +45,13 @@ class OutfitConfig:
     samples: float = 8.0
     skin_in_cloth: float = 0.8
     skin_colored: float = 25.0
+    skin_colored_top: float = 40.0
     skin_colored_shoe: float = 60.0
     other_in_skin: float = 1.0
     distance: float = 0.7
     bare_pelvis: float = 6.0
-    split: float = 25.0
+    split: float = 45.0
+    split_at_legs: float = 6.0
     midriff: float = 12.0
     crease: float = 12.0
     habit: float = 0.0
@@ -116,6 +120,11 @@ class Rings:
         """Where rings begin, and where the last one ends."""
         return self.start + STEP * np.arange(len(self) + 1)
 
+    def looks_like_skin(self, low: float, high: float) -> bool:
+        """Whether the rings between two places have, on the whole, the colour of skin."""
+        between = (self.places[:-1] >= low) & (self.places[:-1] < high)
+        return bool(between.any() and self.skin[between, 0].mean() > _SKIN_COLORED)
+
 
 @dataclass(frozen=True)
 class Outfit:
@@ -146,28 +155,36 @@ def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: floa
         misfit: metres by which the body usually misses bare skin.
     """
     borders, margins = _cut_column(column, config, misfit)
-    cuff, margins["cuff"] = _cut_arm(arm, config, misfit)
-    shoe_top, lower_start, lower_end, _ = borders
-    trousers = (column.places[:-1] >= lower_start) & (column.places[:-1] < lower_end)
-    if shoe_top == 0.0 and lower_start < _LONG and trousers.any() and column.skin[trousers, 0].mean() > _SKIN_COLORED:
+    shoe_top, lower_start, lower_end, upper_start = borders
+    skin_colored = column.looks_like_skin(upper_start, COLUMN_END)
+    cuff, margins["cuff"] = _cut_arm(arm, config, misfit, skin_colored=skin_colored)
+    if shoe_top == 0.0 and lower_start < _LONG and column.looks_like_skin(lower_start, lower_end):
         # Trousers of the colour of skin: so may shoes be, and bare feet below trousers are rare.
         borders, margins["shoe_top"] = (_LOW_SHOE, max(_LOW_SHOE, lower_start), *borders[2:]), 0.0
     return Outfit(*borders, cuff, margins)
 
 
-def _run_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(R + 1, R + 1) each: at [i, j] what rings i..j-1 cost as a shoe, as another cloth, and as skin; infinite where
-    i > j."""
-    n = rings.weight * config.samples
-    cross = _cross_costs(rings, n)
-    cloth_far, skin_far = _distance_costs(rings, config, misfit)
-    like_skin = _between(config.skin_in_cloth * n * rings.skin[:, 0])
-    cloth = cross + _between(cloth_far)
-    skin = cross + _between(config.other_in_skin * n * rings.skin[:, 1] + skin_far)
-    shoe = cloth + np.minimum(like_skin, config.skin_colored_shoe)
-    cloth = cloth + np.minimum(like_skin, config.skin_colored)
-    there = np.triu(np.ones(cross.shape, dtype=bool))
-    return np.where(there, shoe, np.inf), np.where(there, cloth, np.inf), np.where(there, skin, np.inf)
+@dataclass(frozen=True, eq=False)
+class _RunCosts:
+    """(R + 1, R + 1) each: at [i, j] what rings i..j-1 cost as that; infinite where i > j."""
+
+    shoe: np.ndarray
+    top: np.ndarray
+    cloth: np.ndarray
+    skin: np.ndarray
+
+    @staticmethod
+    def of(rings: Rings, config: OutfitConfig, misfit: float) -> _RunCosts:
+        n = rings.weight * config.samples
+        cross = _cross_costs(rings, n)
+        cloth_far, skin_far = _distance_costs(rings, config, misfit)
+        like_skin = _between(config.skin_in_cloth * n * rings.skin[:, 0])
+        cloth = cross + _between(cloth_far)
+        skin = cross + _between(config.other_in_skin * n * rings.skin[:, 1] + skin_far)
+        most = (config.skin_colored_shoe, config.skin_colored_top, config.skin_colored)
+        runs = (*(cloth + np.minimum(like_skin, one) for one in most), skin)
+        there = np.triu(np.ones(cross.shape, dtype=bool))
+        return _RunCosts(*(np.where(there, run, np.inf) for run in runs))
 
 
 def _between(ring: np.ndarray) -> np.ndarray:
@@ -208,8 +225,8 @@ def _cut_column(
     rings: Rings, config: OutfitConfig, misfit: float
 ) -> tuple[tuple[float, float, float, float], dict[str, float]]:
     place, count = rings.places, len(rings)
-    shoe, cloth, skin = _run_costs(rings, config, misfit)
-    i, j = np.indices(cloth.shape)
+    runs = _RunCosts.of(rings, config, misfit)
+    i, j = np.indices(runs.cloth.shape)
     empty, length = i == j, place[j] - place[i]
     # Steps of the distance to the body: hems.
     mean = np.convolve(rings.distance, np.ones(2) / 2, mode="valid")
@@ -217,29 +234,31 @@ def _cut_column(
     fold = config.crease * np.clip(jump / 0.010, 0.0, 1.0)
     middle = 0.5 * (place[1:] + place[:-1])
     on_foot = _between(_COVERS_FOOT * (middle < 0.045))
-    skin = skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
+    skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
     # What is usual of the place and length of each run.
-    shoe = shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
+    shoe = runs.shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
-    habit = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0) - _TWO_PIECES
-    habit += _between(np.where(middle < _WAIST, _BARE_LEG, 0.0))[0][i]
-    split = (1.0 - config.habit) * config.split + config.habit * habit
-    lower = np.where(empty, 6.0, cloth + split + usual + on_foot)
+    at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
+    legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < _SKIRT
+    split = at_waist + config.split_at_legs if legs_show else config.split
+    habit = at_waist - _TWO_PIECES + _between(np.where(middle < _WAIST, _BARE_LEG, 0.0))[0][i]
+    split = (1.0 - config.habit) * split + config.habit * habit
+    lower = np.where(empty, 6.0, runs.cloth + split + usual + on_foot)
     midriff = skin + np.where(empty, 0.0, config.midriff)
-    upper = cloth + on_foot + _usual(place[i], -0.1, 1.2, 60.0) - np.where(i > 0, fold[i], 0.0)
-    runs = [shoe, skin, lower, midriff, upper]
+    upper = runs.top + on_foot + _usual(place[i], -0.1, COLUMN_END, 60.0) - np.where(i > 0, fold[i], 0.0)
+    order = [shoe, skin, lower, midriff, upper]
     # forward[k][j]: runs before k end at j. backward[k][i]: runs from k on start at i.
     forward = [np.where(np.arange(count + 1) == 0, 0.0, np.inf)]
-    for cost in runs:
+    for cost in order:
         forward.append((forward[-1][:, None] + cost).min(axis=0))
     backward = [np.where(np.arange(count + 1) == count, 0.0, np.inf)]
-    for cost in reversed(runs):
+    for cost in reversed(order):
         backward.append((cost + backward[-1][None, :]).min(axis=1))
     backward.reverse()
     cuts = [count]
-    for k in range(len(runs) - 1, -1, -1):
-        cuts.append(int((forward[k] + runs[k][:, cuts[-1]]).argmin()))
+    for k in range(len(order) - 1, -1, -1):
+        cuts.append(int((forward[k] + order[k][:, cuts[-1]]).argmin()))
     cuts = cuts[::-1][1:-1]
     names = ("shoe_top", "lower_start", "lower_end", "upper_start")
     margins = {
@@ -250,9 +269,11 @@ def _cut_column(
     return (shoe_top, lower_start, lower_end, upper_start), margins
 
 
-def _cut_arm(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[float, float]:
-    _, cloth, skin = _run_costs(rings, config, misfit)
-    cost = cloth[0] + skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
+def _cut_arm(rings: Rings, config: OutfitConfig, misfit: float, *, skin_colored: bool) -> tuple[float, float]:
+    runs = _RunCosts.of(rings, config, misfit)
+    # A shirt of another colour than skin has no sleeves of the colour of skin.
+    sleeve = runs.cloth if skin_colored else runs.shoe
+    cost = sleeve[0] + runs.skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
     cost += config.habit * _usual(rings.places, _SHORT_SLEEVE, 1.0, 20.0)
     best = int(cost.argmin())
     return float(rings.places[best]), _margin(cost, rings.places, best)

@@ -61,8 +61,8 @@ def place_prior(
     if layers.bib:
         front = top & (np.abs(chart.azimuth) < 1.2)
         out[front] = 0.6 * out[front] + 0.4 * _only(LOWER.id)
-    for mask, label in ((layers.hair, HAIR), (layers.coat, OUTER)):
-        out[mask] = _UNLAYERED * out[mask] + (1.0 - _UNLAYERED) * _only(label.id)
+    for mask, worn in ((layers.hair, HAIR), (layers.coat, OUTER)):
+        out[mask] = _UNLAYERED * out[mask] + (1.0 - _UNLAYERED) * _only(worn.id)
     return out / out.sum(axis=1, keepdims=True)
 
 
