@@ -73,6 +73,10 @@ class Sight:
     cosine: Float32[np.ndarray, "N V"]
     pixel: Float32[np.ndarray, "N V"]
 
+    def select(self, rows: Bool[np.ndarray, " N"]) -> Sight:
+        """The sight of some of the vertices."""
+        return Sight(self.cosine[rows], self.pixel[rows])
+
     def chosen(self, most: int, *, least_cosine: float) -> Int32[np.ndarray, "N most"]:
         """The views that look at a vertex most squarely; -1 where there are fewer."""
         most = min(most, self.cosine.shape[1])

@@ -26,6 +26,8 @@ _NOISE = 0.006
 # Agreement at which a place counts for nothing.
 _WORTHLESS = 0.5
 _CLEAR = 0.2
+# How often scores are averaged with their neighbours'.
+_AVERAGED = 2
 # Below it the next coarser patches are asked.
 _CONVINCING = 0.4
 # What a centimetre of displacement costs in agreement.
@@ -91,10 +93,18 @@ def refine_surface(
     open_ = np.ones(mesh.vertex_count, dtype=bool)
     for coarseness in level.coarseness:
         patches = PatchConfig(coarseness, level.half, most_views)
-        scores = sweep_scores(mesh.vertices, normals, seen, pyramids, offsets, patches)
+        if not open_.any():
+            break
+        asked = open_
+        for _ in range(_AVERAGED):  # with the neighbours that their scores are averaged with
+            asked = asked | (mean @ asked.astype(np.float64) > 0)
+        scores = np.zeros(outside.shape, np.float32)
+        scores[asked] = sweep_scores(
+            mesh.vertices[asked], normals[asked], seen.select(asked), pyramids, offsets, patches
+        )
         scores[~watched] = 0.0
         scores[outside] = -1.0
-        for _ in range(2):
+        for _ in range(_AVERAGED):
             scores = 0.5 * scores + 0.5 * (mean @ scores)
         found = _best_places(scores, offsets, watched, level)
         for kept, new in zip((displacement, confidence, agreement), found, strict=True):

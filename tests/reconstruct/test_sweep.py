@@ -123,3 +123,25 @@ def test_taubin_keeps_a_sphere_and_removes_noise(ball):
     off = [np.abs(inside_ball(v)) for v in (ball.vertices + noise, smooth.vertices)]
     assert off[1].mean() < 0.5 * off[0].mean()
     assert np.linalg.norm(taubin(ball, mean, steps=5).vertices, axis=1) == pytest.approx(0.5, abs=0.002)
+
+
+def test_coarser_patches_are_asked_where_fine_ones_convince_nobody_and_nowhere_else(ball, photographs, monkeypatch):
+    from smplxpp.reconstruct import sweep
+
+    asked, whole = [], sweep.sweep_scores
+
+    def counted(points, *rest):
+        asked.append(len(points))
+        return whole(points, *rest)
+
+    monkeypatch.setattr(sweep, "sweep_scores", counted)
+    level = SweepLevel(0.1, 0.01, 0.01, 0.06, (1.0, 2.0, 4.0))
+    fine = refine_surface(
+        ball, photographs, SweepLevel(0.1, 0.01, 0.01, 0.06), everywhere, most_views=6, smoothness=0.3
+    )
+    found = refine_surface(ball, photographs, level, everywhere, most_views=6, smoothness=0.3)
+    assert asked[:2] == [ball.vertex_count] * 2
+    assert len(asked) > 2 and max(asked[2:]) < ball.vertex_count
+    sure = fine.agreement > 0.4
+    assert sure.mean() > 0.9
+    assert (found.agreement[sure] == fine.agreement[sure]).all()
