@@ -125,9 +125,11 @@ def test_taubin_keeps_a_sphere_and_removes_noise(ball):
     assert np.linalg.norm(taubin(ball, mean, steps=5).vertices, axis=1) == pytest.approx(0.5, abs=0.002)
 
 
-def test_coarser_patches_are_asked_where_fine_ones_convince_nobody_and_nowhere_else(ball, photographs, monkeypatch):
+def test_coarser_patches_are_asked_where_fine_ones_convince_nobody_and_nowhere_else(ball, monkeypatch):
     from smplxpp.reconstruct import sweep
 
+    above = [camera for camera in ring() if camera.position[1] > 0]  # nobody sees the bottom
+    photographs = Pyramids.of([photograph(ball, camera, "") for camera in above])
     asked, whole = [], sweep.sweep_scores
 
     def counted(points, *rest):
@@ -143,5 +145,5 @@ def test_coarser_patches_are_asked_where_fine_ones_convince_nobody_and_nowhere_e
     assert asked[:2] == [ball.vertex_count] * 2
     assert len(asked) > 2 and max(asked[2:]) < ball.vertex_count
     sure = fine.agreement > 0.4
-    assert sure.mean() > 0.9
+    assert 0.3 < sure.mean() < 0.95
     assert (found.agreement[sure] == fine.agreement[sure]).all()
