@@ -69,6 +69,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Animate",
         "show a template moving: MP4, GIF, PNG frames or an animated GLB",
     ),
+    "export": (
+        "pipelines.commands.export",
+        "Export",
+        "a finished template as one closed, printable solid: STL, 3MF, PLY or GLB, posed or in the T-pose",
+    ),
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
     "synth": ("pipelines.commands.synth", "Synth", "make a synthetic capture of a clothed person with moving cloth"),
     "capture check": (

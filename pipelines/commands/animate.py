@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from pipelines.commands.options import OptionalFloat, OptionalInt
+from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from smplxpp.core.camera import Camera
@@ -24,7 +25,6 @@ from smplxpp.core.spread import spread
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.template.template import Template
 
-TEMPLATE_FILE = Path("60_assemble") / "smplxpp.npz"
 DEFAULT_FPS = 20.0
 _FRAMING_POSES = 24  # poses that the camera is fitted to
 _BLOCK = 16  # frames posed at a time
@@ -64,7 +64,7 @@ class Animate:
         """Pose the template frame by frame and write the result, whole or not at all."""
         suffix = self.out.suffix.lower()
         self._check_options(suffix)
-        template = Template.load(self._template_file())
+        template = load_run_template(self.run_folder)
         params, fps = self._load_params(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
@@ -105,25 +105,9 @@ class Animate:
                     received=f"{foreign[0]} in it" if self.out.is_dir() else "a file",
                 )
 
-    def _template_file(self) -> Path:
-        path = self.run_folder / TEMPLATE_FILE
-        if not path.is_file():
-            raise InputError(
-                f"run {self.run_folder}",
-                expected=f"a finished template in {TEMPLATE_FILE}",
-                received="no such folder" if not self.run_folder.is_dir() else "a run without it",
-                remedy="make it with `smplxpp build`; `smplxpp inspect RUN` tells which stages stand",
-            )
-        return path
-
     def _load_params(self, template: Template) -> tuple[BodyParams, float]:
         """Read the chosen frames, and how many of them a second shows."""
-        from smplxpp.body import load_params
-
-        # Layouts that turn the body about the origin need its root joint. The identity is in the template already:
-        # without shape directions the betas of the file do not move that joint a second time.
-        body = template.body
-        params = load_params(self.params, body=replace(body, shapedirs=np.zeros_like(body.shapedirs)))
+        params = load_params_for(template, self.params)
         count = len(params)
         chosen = range(count)[self.start : self.stop : self.step]
         if not len(chosen):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +19,19 @@ from pipelines.stages.completeness import completeness_checks
 from pipelines.stages.motion import motion_of_build
 from pipelines.stages.photographs import photograph_checks
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
-from smplxpp.clean import loop_lengths
+from smplxpp.clean import loop_lengths, thickened
+from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.solids import closed_mesh
 from smplxpp.core.spread import spread
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import (
     CompareConfig,
     DirectedDistances,
     directed_distances,
+    interpenetration,
     mesh_quality,
     point_to_surface,
     stretch_report,
@@ -34,9 +39,11 @@ from smplxpp.metrics import (
 )
 from smplxpp.metrics.conventions import convention_named
 from smplxpp.metrics.distance import MM
-from smplxpp.template.template import Template
+from smplxpp.template.template import BODY_PART, Template
 
 MOTION_FRAMES = 12
+CLOTH = 1e-3
+"""Thickness of the cloth, inward, whose volume is measured; metres."""
 
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
@@ -53,6 +60,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     checks += seen
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
+    numbers["shared_volume"] = _shared_volumes(template)
     flips = _flips(template, posed, build.run)
     checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
     poses = {"hard poses": stress_poses(reference)}
@@ -114,6 +122,22 @@ def _against_scan(
             Check("scan's skin to the template: mean", fit, "mm", 5.0, 15.0, explanation="how well the body was fitted")
         )
     return checks, {"template_vs_scan": result.as_dict()}, back
+
+
+def _shared_volumes(template: Template) -> dict[str, dict[str, float]]:
+    """The volumes that the body and each part, and any two parts share at rest, parts as cloth of `CLOTH` metres.
+
+    Pairs of which one has no volume, such as a body with edges of three faces, are left out.
+    """
+    solids = {name: template.part_mesh(name) for name in template.part_names}
+    solids = {
+        name: closed_mesh(mesh) if name == BODY_PART else thickened(mesh, inward=CLOTH) for name, mesh in solids.items()
+    }
+    out = {}
+    for a, b in combinations(solids, 2):
+        with suppress(InputError):
+            out[f"{a}, {b}"] = interpenetration(solids[a], solids[b]).as_dict()
+    return out
 
 
 def _flips(template: Template, posed: TriangleMesh, run: Path) -> int:

@@ -8,6 +8,7 @@ from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
 from smplxpp.clean.scan_frame import ScanFrame, find_scan_frame
 from smplxpp.clean.simplify import Simplified, simplify
 from smplxpp.clean.smooth import ROUGH, Smoothed, roughness, smooth_if_rough
+from smplxpp.clean.solid import Solid, SolidConfig, SolidReport, solid_of_parts, thickened, wall_thickness
 from smplxpp.clean.units import METRES_PER_UNIT, check_human_scale, convert_points
 from smplxpp.clean.webs import WebConfig, cut_webs, find_webs
 
@@ -24,6 +25,9 @@ __all__ = [
     "ScanFrame",
     "Simplified",
     "Smoothed",
+    "Solid",
+    "SolidConfig",
+    "SolidReport",
     "WebConfig",
     "check_human_scale",
     "clean_parts",
@@ -39,5 +43,8 @@ __all__ = [
     "sanitize",
     "simplify",
     "smooth_if_rough",
+    "solid_of_parts",
     "surface_from_points",
+    "thickened",
+    "wall_thickness",
 ]

@@ -12,6 +12,7 @@ from smplxpp.metrics.distance import (
     point_to_surface,
     summarize,
 )
+from smplxpp.metrics.interpenetration import Interpenetration, interpenetration
 from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
 from smplxpp.metrics.mirror import mirror_ratio
 from smplxpp.metrics.mirror_views import mirrored_by_views
@@ -27,6 +28,7 @@ __all__ = [
     "Convention",
     "DirectedDistances",
     "DirectionStats",
+    "Interpenetration",
     "MeshComparison",
     "MeshQuality",
     "Patch",
@@ -43,6 +45,7 @@ __all__ = [
     "edge_stretch",
     "far_patches",
     "flipped_faces",
+    "interpenetration",
     "mean_pose_error",
     "mesh_quality",
     "mirror_ratio",

@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from pipelines.cli import main
-from pipelines.commands.animate import TEMPLATE_FILE, Animate
+from pipelines.commands.animate import Animate
+from pipelines.runs.layout import TEMPLATE
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.params import BodyParams
@@ -29,7 +30,7 @@ def run(tmp_path_factory):
     count = len(body.v_template)
     colors = np.where(body.v_template[:, :1] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8)
     folder = tmp_path_factory.mktemp("runs") / "person"
-    path = folder / TEMPLATE_FILE
+    path = folder / TEMPLATE
     path.parent.mkdir(parents=True)
     Template(
         vertices=body.v_template,

@@ -1,0 +1,122 @@
+"""A closed surface as a file for printers and modellers: STL, 3MF, PLY, GLB."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.core.validation import require_choice
+from smplxpp.export.gltf_buffers import BufferBuilder
+
+SUFFIXES = (".stl", ".3mf", ".ply", ".glb")
+PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+_3MF_UNITS = {"m": "meter", "cm": "centimeter", "mm": "millimeter"}
+# Zips carry a time; the oldest that they can: the same surface gives the same bytes.
+_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> None:
+    """Write a closed surface, whole or not at all; the suffix tells the format.
+
+    STL and 3MF stand on a printer's bed: z up, the lowest point at 0. PLY and GLB keep +Y up, and GLB its metres, as
+    glTF demands.
+
+    Args:
+        path: `.stl` (binary), `.3mf`, `.ply` or `.glb`.
+        mesh: metres, +Y up.
+        units: "m", "cm" or "mm".
+
+    Raises:
+        InputError: another suffix or unit.
+    """
+    path = Path(path)
+    check_solid_path(path)
+    require_choice("option units", units, tuple(PER_METRE))
+    suffix = path.suffix.lower()
+    if suffix == ".glb":
+        atomic_write_bytes(path, _glb(mesh))
+        return
+    points = mesh.vertices * PER_METRE[units]
+    if suffix == ".ply":
+        write_ply(path, mesh.with_vertices(points))
+        return
+    points = points @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # y to z, z to -y
+    points[:, 2] -= points[:, 2].min()
+    upright = mesh.with_vertices(points)
+    atomic_write_bytes(path, _stl(upright) if suffix == ".stl" else _3mf(upright, _3MF_UNITS[units]))
+
+
+def check_solid_path(path: Path) -> None:
+    """Refuse a suffix that no writer knows.
+
+    Raises:
+        InputError: it names those that are known.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"output {path}", expected=", ".join(SUFFIXES), received=path.suffix or "no suffix")
+
+
+def _stl(mesh: TriangleMesh) -> bytes:
+    """Binary STL: http://paulbourke.net/dataformats/stl/."""
+    rows = np.zeros(mesh.face_count, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    rows["normal"], rows["corners"] = mesh.face_normals, mesh.triangles
+    return b"smplxpp".ljust(80) + np.uint32(mesh.face_count).tobytes() + rows.tobytes()
+
+
+def _3mf(mesh: TriangleMesh, unit: str) -> bytes:
+    """The 3MF core specification's smallest package: content types, relationships, one model of one object."""
+    vertices = '<vertex x="%.6g" y="%.6g" z="%.6g"/>' * mesh.vertex_count
+    triangles = '<triangle v1="%d" v2="%d" v3="%d"/>' * mesh.face_count
+    model = (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        f'<model unit="{unit}" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+        f'<metadata name="Application">smplxpp {metadata.version("smplxpp")}</metadata>'
+        '<resources><object id="1" type="model"><mesh><vertices>'
+        + vertices % tuple(mesh.vertices.ravel().tolist())
+        + "</vertices><triangles>"
+        + triangles % tuple(mesh.faces.ravel().tolist())
+        + '</triangles></mesh></object></resources><build><item objectid="1"/></build></model>'
+    )
+    types = (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
+        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+        '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
+    )
+    relations = (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
+        '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
+        'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
+    )
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as package:
+        for name, text in (("[Content_Types].xml", types), ("_rels/.rels", relations), ("3D/3dmodel.model", model)):
+            entry = zipfile.ZipInfo(name, _TIME)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            package.writestr(entry, text)
+    return stream.getvalue()
+
+
+def _glb(mesh: TriangleMesh) -> bytes:
+    gltf = pygltflib.GLTF2(
+        asset=pygltflib.Asset(version="2.0", generator=f"smplxpp {metadata.version('smplxpp')}"), scene=0
+    )
+    buffers = BufferBuilder(gltf)
+    attributes = pygltflib.Attributes(
+        POSITION=buffers.add(mesh.vertices.astype(np.float32), target=pygltflib.ARRAY_BUFFER, bounds=True)
+    )
+    indices = buffers.add(mesh.faces.astype(np.uint32).ravel(), target=pygltflib.ELEMENT_ARRAY_BUFFER)
+    gltf.meshes = [pygltflib.Mesh(primitives=[pygltflib.Primitive(attributes=attributes, indices=indices)])]
+    gltf.nodes = [pygltflib.Node(mesh=0, name="solid")]
+    gltf.scenes = [pygltflib.Scene(nodes=[0])]
+    return buffers.glb()
