@@ -238,7 +238,7 @@ DOORS: dict[str, set[str]] = {
     "pickle.load": set(),
     "pickle.loads": set(),
     "Image.open": {"smplxpp/core/files/image_file.py"},
-    "zipfile.ZipFile": {"smplxpp/core/files/array_file.py"},
+    "zipfile.ZipFile": {"smplxpp/core/files/array_file.py", "smplxpp/core/files/zip_file.py"},
     "safe_open": {"avatar/gaussians/tensor_file.py"},
     "load_file": set(),  # of safetensors
     "torch.load": {"avatar/losses/perceptual.py"},  # weights of a metric, tensors alone

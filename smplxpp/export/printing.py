@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from importlib import metadata
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import pygltflib
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.zip_file import zip_bytes
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_choice
@@ -20,8 +19,6 @@ from smplxpp.export.gltf_buffers import BufferBuilder
 SUFFIXES = (".stl", ".3mf", ".ply", ".glb")
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _3MF_UNITS = {"m": "meter", "cm": "centimeter", "mm": "millimeter"}
-# Zips carry a time; the oldest that they can: the same surface gives the same bytes.
-_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> None:
@@ -98,13 +95,7 @@ def _3mf(mesh: TriangleMesh, unit: str) -> bytes:
         '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
         'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
     )
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as package:
-        for name, text in (("[Content_Types].xml", types), ("_rels/.rels", relations), ("3D/3dmodel.model", model)):
-            entry = zipfile.ZipInfo(name, _TIME)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            package.writestr(entry, text)
-    return stream.getvalue()
+    return zip_bytes({"[Content_Types].xml": types, "_rels/.rels": relations, "3D/3dmodel.model": model})
 
 
 def _glb(mesh: TriangleMesh) -> bytes:
