@@ -67,10 +67,14 @@ def joined(points: Float64[np.ndarray, "N 3"], normals: Float64[np.ndarray, "N 3
 
 
 def truncated_distance(
-    points: Float64[np.ndarray, "N 3"], normals: Float64[np.ndarray, "N 3"], surface: SurfacePoints
+    points: Float64[np.ndarray, "N 3"],
+    normals: Float64[np.ndarray, "N 3"],
+    surface: SurfacePoints,
+    *,
+    far: float = _FAR,
 ) -> float:
-    """Mean of the distances of points to a surface and of the surface to them, each at most `_FAR`, metres."""
+    """Mean of the distances of points to a surface and of the surface to them, each at most `far`, metres."""
     there = joined(points, normals)
-    one, _ = surface.tree.query(there, distance_upper_bound=_FAR)
-    other, _ = cKDTree(there).query(surface.tree.data, distance_upper_bound=_FAR)
-    return float(0.5 * (np.minimum(one, _FAR).mean() + np.minimum(other, _FAR).mean()))
+    one, _ = surface.tree.query(there, distance_upper_bound=far)
+    other, _ = cKDTree(there).query(surface.tree.data, distance_upper_bound=far)
+    return float(0.5 * (np.minimum(one, far).mean() + np.minimum(other, far).mean()))

@@ -50,9 +50,11 @@ def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
     return state
 
 
-def state_distance(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState) -> float:
-    """How far body and surface are from each other, metres."""
-    return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface)
+def state_distance(
+    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, **options: float
+) -> float:
+    """How far body and surface are from each other, metres; options of `truncated_distance`."""
+    return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, **options)
 
 
 def _arms() -> list[_Limb]:

@@ -17,6 +17,7 @@ from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.config import LocateConfig
 from smplxpp.register.locate.descend import DrawnTogether, Term, descend
 from smplxpp.register.locate.dressed import Dressed, OuterBody
+from smplxpp.register.locate.hands import try_hands
 from smplxpp.register.locate.limbs import state_distance, try_limbs
 from smplxpp.register.locate.misfit import Misfit, misfit
 from smplxpp.register.locate.pinned import Pinned
@@ -126,7 +127,7 @@ class Search:
         """
         skin = np.zeros(len(self.fine), dtype=bool) if skin is None else skin
         term = Dressed(self.outer, self.bare, self.fine, skin)
-        state, steps = found.state, self.config.finish_steps
+        state, steps = try_hands(self.kinematics, self.many, self.fine, found.state), self.config.finish_steps
         for k, reach in enumerate(np.geomspace(0.03, 0.015, steps)):
             term.reach = float(reach)
             state = self._step(state, term, fingers=True)
