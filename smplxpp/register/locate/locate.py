@@ -68,7 +68,7 @@ def locate_body(
     return LocatedBody(
         best.state.to_params(body),
         confidence_of(best, others),
-        problems_of(best, others, search),
+        problems_of(best, others),
         tuple(_candidate(one) for one in (best, *others)),
     )
 

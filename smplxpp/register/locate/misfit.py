@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,18 @@ from smplxpp.register.locate.proxy import BodyProxy, Region
 # Metres: what is farther counts as so far; clothes may stand off so much for nothing, and inside counts double.
 _CAP, _LOOSE = 0.04, 0.025
 _BARE = (Region.HAND, Region.FACE)
+# Parts that a person's scan shows, by their joints.
+PARTS = {
+    "head": "head",
+    "left hand": "left_wrist",
+    "right hand": "right_wrist",
+    "left forearm": "left_elbow",
+    "right forearm": "right_elbow",
+    "left lower leg": "left_knee",
+    "right lower leg": "right_knee",
+    "left foot": "left_ankle",
+    "right foot": "right_ankle",
+}
 
 
 @dataclass(frozen=True)
@@ -23,14 +36,14 @@ class Misfit:
     Attributes:
         surface: of the surface's points to the body. bare: of hands, face and feet of the body to the surface.
         covered: share of the surface that the body explains. shown: share of the body's hands, face and feet there.
-        outside: share of the body that lies clearly outside of the surface.
+        parts: share of each of `PARTS` that the surface has.
     """
 
     surface: float
     bare: float
     covered: float
     shown: float
-    outside: float
+    parts: Mapping[str, float]
 
     @property
     def total(self) -> float:
@@ -61,5 +74,17 @@ def misfit(
         float(off[shown].mean()),
         float((each < _CAP).mean()),
         float((off[shown] < _CAP).mean()),
-        float(((along > _LOOSE) & (facing > 0.3)).mean()),
+        {name: float((off[rows] < _CAP).mean()) for name, rows in _rows_of_parts(kinematics, proxy).items()},
     )
+
+
+def _rows_of_parts(kinematics: Kinematics, proxy: BodyProxy) -> dict[str, np.ndarray]:
+    """Points of each part: those of its joint, and all that hangs on it where it is an end."""
+    names = list(kinematics.body.joint_names)
+    out = {}
+    for part, joint in PARTS.items():
+        index = names.index(joint)
+        whole = part.split()[-1] in ("head", "hand", "foot")
+        limbs = kinematics.hangs_on[:, index] if whole else np.arange(len(names)) == index
+        out[part] = np.flatnonzero(limbs[proxy.limb])
+    return out

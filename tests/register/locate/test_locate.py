@@ -102,6 +102,14 @@ def test_labels_of_a_labeller_are_asked_for_once_the_body_stands(body, scan, tru
     assert _error(body, found, truth) < 0.010
 
 
+def test_an_arm_that_is_cut_off_is_named_and_believed_less(body, scan, located):
+    arm = scan.face_centers[:, 0] > 0.27
+    found = locate_body(body, scan.submesh(~arm)[0], config=QUICK)
+    assert "left hand" in " ".join(found.problems)
+    assert "right hand" not in " ".join(found.problems)
+    assert found.confidence < 0.5 < located.confidence
+
+
 def test_a_box_is_nobody(body):
     corners = np.array([[x, y, z] for x in (0, 0.6) for y in (0, 1.7) for z in (0, 0.4)], dtype=np.float64)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
