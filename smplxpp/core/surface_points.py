@@ -12,7 +12,7 @@ from smplxpp.core.mesh import TriangleMesh
 
 TURN_M = 0.15
 """Metres that a turn of the normal by 1 (57 degrees) counts as in the search for the nearest point."""
-_FAR = 0.25
+FAR = 0.25
 """A distance that says no more than "far": metres."""
 
 
@@ -71,7 +71,7 @@ def truncated_distance(
     normals: Float64[np.ndarray, "N 3"],
     surface: SurfacePoints,
     *,
-    far: float = _FAR,
+    far: float = FAR,
 ) -> float:
     """Mean of the distances of points to a surface and of the surface to them, each at most `far`, metres."""
     there = joined(points, normals)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.core.surface_points import SurfacePoints, truncated_distance
+from smplxpp.core.surface_points import FAR, SurfacePoints, truncated_distance
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
 
@@ -51,10 +51,10 @@ def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
 
 
 def state_distance(
-    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, **options: float
+    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, *, far: float = FAR
 ) -> float:
-    """How far body and surface are from each other, metres; options of `truncated_distance`."""
-    return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, **options)
+    """How far body and surface are from each other, metres; what is beyond `far` counts as so far."""
+    return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, far=far)
 
 
 def _arms() -> list[_Limb]:
