@@ -5,8 +5,8 @@
     python -m benchmarks.photographs_alone --run RUN --truth CAPTURE [--name NAME]
 
 PHOTOGRAPHS is a folder with no more than `rgbs/`, `masks/`, the cameras and, in capture.json, what is held out, of
-the capture CAPTURE, whose truth is looked at in measuring alone. PSNR stands beside that of the stored trainings of the same
-capture on `exact` and on `tracked` inputs.
+the capture CAPTURE, whose truth is looked at in measuring alone. PSNR stands beside that of the stored trainings of the
+same capture on `exact` and on `tracked` inputs.
 """
 
 from __future__ import annotations
