@@ -96,7 +96,7 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
     }
     if labels:
         labelled = label_by_body(scan.mesh.with_vertices(vertices), body, found.params, colors=scan.colors)
-        row["labels_right"] = float((labelled.labels == scan.face_labels)[scan.seen].mean())
+        row["labels_right"] = float((labelled.face_labels == scan.face_labels)[scan.seen].mean())
     return row
 
 
