@@ -286,10 +286,10 @@ PARTS = (
     Part(
         "scan_alone_captures",
         "Bodies found in scans alone",
-        "Scans of three captures, as they are and turned, lying, in centimetres, mirrored in pose, decimated and noisy; "
-        "each is read without parameters, labels, units and axis. Errors of the body's vertices and of its 22 joints in "
-        "mm; labels are the share of faces that the scanner saw. Constants were chosen on procedural people and on these "
-        "three. The labels that follow are of the first fit: a build fits once more with them.",
+        "Scans of three captures, as they are and turned, lying, in centimetres, mirrored in pose, decimated and "
+        "noisy; each is read without parameters, labels, units and axis. Errors of the body's vertices and of its 22 "
+        "joints in mm; labels are the share of faces that the scanner saw. Constants were chosen on procedural people "
+        "and on these three. The labels that follow are of the first fit: a build fits once more with them.",
     ),
     Part(
         "driving_alone",
