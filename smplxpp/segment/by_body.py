@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Num
 
 from smplxpp.body import BodyModel
+from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import face_adjacency
@@ -16,7 +17,7 @@ from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_appearance import Blend, label_costs
 from smplxpp.segment.by_body_chart import BodyChart, chart_of_scan
 from smplxpp.segment.by_body_colors import Palette, SkinModel, fit_skin, has_colors
-from smplxpp.segment.by_body_doubts import find_doubts
+from smplxpp.segment.by_body_doubts import AWAY, find_doubts
 from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_outfit import (
     ARM_END,
@@ -111,8 +112,10 @@ def label_by_body(
             rest on the distance to the body alone, and the doubts say so.
 
     Raises:
-        InputError: several frames, colours of another number of vertices or out of range.
+        InputError: no faces, several frames, colours of another number of vertices or out of range.
     """
+    if not mesh.face_count:
+        raise InputError("scan to be labelled", expected="a mesh with faces", received="none")
     config = config or ByBodyConfig()
     pairs, ends = face_adjacency(mesh.faces)
     lab = None if colors is None else face_colors(mesh, colors)
@@ -128,7 +131,7 @@ def label_by_body(
     share /= share.sum(axis=1, keepdims=True)
     rows = np.arange(len(cut))
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
-    confidence = share[rows, labels]
+    confidence = share[rows, labels] * min(1.0, AWAY / max(found.misfit, 1e-9))
     seen = outer_visible_points(mesh, mesh.face_centers, tolerance=_SEEN_WITHIN)
     doubts = find_doubts(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
     return SegmentedScan(
@@ -148,7 +151,8 @@ def weigh_evidence(
     area = mesh.face_areas
     pairs, _ = face_adjacency(mesh.faces)
     bare = chart.face_core | chart.hand_core
-    misfit = float(np.clip(1.4826 * np.median(np.abs(chart.distance[bare])), 0.003, 0.02)) if bare.any() else 0.02
+    misfit = float(1.4826 * np.median(np.abs(chart.distance[bare if bare.any() else slice(None)])))
+    misplaced = float(np.clip(misfit, 0.003, 0.02))
     skin, palette = None, None
     ratio = np.zeros(mesh.face_count)
     layers = Layers.none(mesh.face_count)
@@ -176,7 +180,7 @@ def weigh_evidence(
     column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
     outline = config.outfit if lab is not None else replace(config.outfit, habit=1.0)
-    outfit = find_outfit(column, arm, outline, misfit=misfit)
+    outfit = find_outfit(column, arm, outline, misfit=misplaced)
     prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
     blend = Blend.of(
         pairs,
@@ -190,7 +194,7 @@ def weigh_evidence(
         palette,
         skin_like,
         area=area,
-        far=weight * _cloth_by_distance(chart.distance, misfit),
+        far=weight * _cloth_by_distance(chart.distance, misplaced),
         blend=blend,
         bald=layers.bald,
         rounds=config.rounds,

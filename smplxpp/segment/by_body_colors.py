@@ -81,13 +81,13 @@ class SkinModel:
 
     Attributes:
         center, spread: OKLab. found: whether the face or the hands gave it; else it is people's skin at large.
-        hands: whether the hands have it (not: gloves, or a face that is covered).
+        hands: whether the hands have it (not: gloves, or a face that is covered); None where there are no hands.
     """
 
     center: Float64[np.ndarray, " 3"]
     spread: Float64[np.ndarray, " 3"]
     found: bool
-    hands: bool
+    hands: bool | None
 
     def log_ratio(self, lab: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
         """log p(colour | this skin) / p(colour | anything), between -4 and 4."""
@@ -125,15 +125,20 @@ def fit_skin(
     if of_face is not None and of_hands is not None:
         # Hair over the face, or a body turned by some degrees: then part of the face alone has the hands' colour.
         like_hands = (np.abs(lab - of_hands[0]) < _ONE_SKIN).all(axis=1)
-        agree = area[face & like_hands].sum() > _FACE_SHARE * area[face].sum()
+        agree = bool(area[face & like_hands].sum() > _FACE_SHARE * area[face].sum())
         face = face & like_hands if agree else face
     chosen = (face | hands) if agree else face if of_face is not None else hands
     main = _main_color(lab[chosen], area[chosen]) or of_face or of_hands
     if main is None:
         hue = np.radians(_SKIN_HUE)
         center = np.array([0.65, 0.06 * np.cos(hue), 0.06 * np.sin(hue)])
-        return SkinModel(center, np.array([0.2, 0.03, 0.03]), False, False)
-    return SkinModel(main[0], np.clip(main[1], _LEAST_SPREAD, _MOST_SPREAD), True, agree or of_face is None)
+        return SkinModel(center, np.array([0.2, 0.03, 0.03]), False, None)
+    return SkinModel(
+        main[0],
+        np.clip(main[1], _LEAST_SPREAD, _MOST_SPREAD),
+        True,
+        None if not hands.any() else agree or of_face is None,
+    )
 
 
 def _main_color(lab: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -20,6 +20,8 @@ _WORDS = {
     "cuff": "where the sleeves end",
 }
 _LOW, _MUCH = 0.6, 0.15
+AWAY = 0.05
+"""Metres between the body and the scan's bare skin from which the body is not the scan's."""
 
 
 def find_doubts(
@@ -37,9 +39,11 @@ def find_doubts(
         out.append("the scan has no colours: labels rest on the distance to the body alone")
     elif not skin.found:
         out.append("neither the face nor the hands show skin: skin is told by what people's skin looks like at large")
-    elif not skin.hands:
+    elif skin.hands is False:
         out.append("hands and face differ in colour (gloves, a covered face): skin has the colour of the face")
-    if misfit > 0.012:
+    if misfit > AWAY:
+        out.append(f"the body lies {1e3 * misfit:.0f} mm from the scan's face and hands: no label can be trusted")
+    elif misfit > 0.012:
         out.append(f"the body misses face and hands by {1e3 * misfit:.0f} mm: clothes are told by colour alone")
     close = [_WORDS[name] for name, margin in outfit.margins.items() if margin < _CLOSE_CALL]
     out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))

@@ -12,7 +12,7 @@ Where their classes are finer or other than ours:
 | dress, jumpsuit | upper | one garment from the shoulders; it stays whole |
 | pants, skirt, belt | lower | |
 | bag | background | not worn: no votes, the surface takes its neighbours' label |
-| undefined background | background | |
+| undefined background, ignored (255) | background | |
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
 
+_IGNORED = 255
 _OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
 
 
@@ -49,8 +50,13 @@ class LabelSet:
         return {number: _OURS[ours] for number, _, ours in self.classes}
 
 
-def _numbered(name: str, *classes: tuple[str, str], first: int = 0) -> LabelSet:
-    return LabelSet(name, tuple((first + k, theirs, ours) for k, (theirs, ours) in enumerate(classes)))
+def _numbered(name: str, *classes: tuple[str, str]) -> LabelSet:
+    return LabelSet(name, tuple((k, theirs, ours) for k, (theirs, ours) in enumerate(classes)))
+
+
+def _parser(name: str, *classes: tuple[str, str]) -> LabelSet:
+    """A parser's classes from 0; its maps mark pixels to be ignored by 255, which do not vote."""
+    return LabelSet(name, (*_numbered(name, *classes).classes, (_IGNORED, "ignored", "background")))
 
 
 _LIP = (
@@ -103,9 +109,9 @@ LABEL_SETS: dict[str, LabelSet] = {
             ("lower", "lower"),
             ("other body", "skin"),
         ),
-        _numbered("lip", *_LIP),
-        _numbered("cihp", *_LIP[:10], ("torso skin", "skin"), *_LIP[11:]),
-        _numbered(
+        _parser("lip", *_LIP),
+        _parser("cihp", *_LIP[:10], ("torso skin", "skin"), *_LIP[11:]),
+        _parser(
             "atr",
             ("background", "background"),
             ("hat", "hair"),
@@ -126,7 +132,7 @@ LABEL_SETS: dict[str, LabelSet] = {
             ("bag", "background"),
             ("scarf", "outer"),
         ),
-        _numbered(
+        _parser(
             "sapiens",
             ("background", "background"),
             ("apparel", "outer"),

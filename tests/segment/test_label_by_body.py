@@ -115,6 +115,26 @@ def test_wrong_input_is_refused(body, scanned):
         label_by_body(mesh, body, params, colors=colors.astype(np.float64))
 
 
+def test_a_body_that_is_not_in_the_scan_leaves_nothing_sure(body, scanned):
+    mesh, colors, _, params = scanned
+    elsewhere = replace(params, transl=params.transl + 0.5)
+    result = label_by_body(mesh, body, elsewhere, colors=colors)
+    assert result.confidence.max() < 0.5
+    assert any("no label can be trusted" in doubt for doubt in result.doubts)
+
+
+def test_parts_of_a_person_are_labelled_and_nothing_is_refused(body, scanned):
+    mesh, colors, truth, params = scanned
+    height = mesh.face_centers[:, 1]
+    for kept in (height > 1.42, height < 0.7):
+        part, index = mesh.submesh(kept)
+        found = label_by_body(part, body, params, colors=colors[index]).face_labels
+        assert accuracy(part, found, truth[kept]) > 0.9
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    with pytest.raises(InputError, match="faces"):
+        label_by_body(empty, body, params)
+
+
 def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
     mesh, colors, truth, params = scanned
     votes = np.zeros((mesh.face_count, 6))

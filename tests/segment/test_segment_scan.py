@@ -8,10 +8,10 @@ import trimesh
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LOWER, SHOE, SKIN
+from smplxpp.core.labels import LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh, view_directions
-from smplxpp.segment import SegmentConfig, segment_scan, vote_on_faces
+from smplxpp.segment import SegmentConfig, SegmentedScan, map_labels, segment_scan, vote_on_faces
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +200,44 @@ def test_capture_label_maps(captures):
     assert rows["label maps", False]["accuracy"] > 0.975
     assert rows["label maps", True]["accuracy_seen"] > 0.96 > rows["label maps", True]["accuracy_before_seen"]
     assert rows["vertex labels", False]["accuracy"] > 0.995
+
+
+@pytest.mark.parametrize("name", ["lip", "cihp", "atr", "sapiens", "4ddress"])
+def test_maps_of_every_parser_vote_for_the_same(ball, name):
+    ours = halves(ball)
+    theirs = {3: {"sapiens": 22, "atr": 4, "4ddress": 3}.get(name, 5), 4: {"sapiens": 12, "atr": 6, "4ddress": 4}}
+    theirs[4] = theirs[4].get(name, 9)
+    background = -1 if name == "4ddress" else 0
+    views = []
+    for camera, labels in views_of(ball, ours):
+        written = np.where(labels == 3, theirs[3], np.where(labels == 4, theirs[4], background))
+        views.append((camera, map_labels(written, name)))
+    result = segment_scan(ball, votes=vote_on_faces(ball, views))
+    assert (result.face_labels == ours).mean() > 0.97
+
+
+def test_a_parser_without_coats_leaves_them_to_the_prior(ball):
+    """Votes say upper for a coat and a shirt alike; the prior tells them apart."""
+    votes = np.zeros((ball.face_count, 6))
+    votes[:, UPPER.id] = 3.0
+    coat = ball.face_centers[:, 0] > 0
+    labels = np.where(coat, OUTER.id, UPPER.id)
+    known = segment_scan(ball, face_labels=labels)
+    sure = SegmentedScan(labels, np.full(ball.face_count, 0.9), known.seen, 0, 0.0, 0.0)
+    told = segment_scan(ball, votes=votes, prior=sure)
+    assert (told.face_labels == labels).mean() > 0.97
+    assert (segment_scan(ball, votes=votes).face_labels == UPPER.id).all()
+
+
+def test_borders_settle_on_edges_of_colour(ball):
+    """Votes that wander about the true border; on a sphere no fold says where it is."""
+    truth = halves(ball)
+    votes = np.zeros((ball.face_count, 6))
+    height = ball.face_centers[:, 1]
+    wandering = np.where(height > 0.12 * np.sin(7 * np.arctan2(*ball.face_centers[:, [0, 2]].T)), 3, 4)
+    near = np.abs(height) < 0.15
+    votes[np.arange(ball.face_count), wandering] = np.where(near, 0.3, 3.0)
+    colors = np.where((ball.vertices[:, 1] > 0)[:, None], [200, 40, 40], [40, 40, 200]).astype(np.uint8)
+    plain = (segment_scan(ball, votes=votes).face_labels == truth).mean()
+    colored = (segment_scan(ball, votes=votes, colors=colors).face_labels == truth).mean()
+    assert colored > plain + 0.01
