@@ -123,13 +123,12 @@ def test_a_body_that_is_not_in_the_scan_leaves_nothing_sure(body, scanned):
     assert any("no label can be trusted" in doubt for doubt in result.doubts)
 
 
-def test_parts_of_a_person_are_labelled_and_nothing_is_refused(body, scanned):
+def test_a_head_alone_is_labelled_and_nothing_at_all_is_refused(body, scanned):
     mesh, colors, truth, params = scanned
-    height = mesh.face_centers[:, 1]
-    for kept in (height > 1.42, height < 0.7):
-        part, index = mesh.submesh(kept)
-        found = label_by_body(part, body, params, colors=colors[index]).face_labels
-        assert accuracy(part, found, truth[kept]) > 0.9
+    kept = mesh.face_centers[:, 1] > 1.42
+    part, index = mesh.submesh(kept)
+    found = label_by_body(part, body, params, colors=colors[index]).face_labels
+    assert accuracy(part, found, truth[kept]) > 0.9
     empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(InputError, match="faces"):
         label_by_body(empty, body, params)
