@@ -92,6 +92,9 @@ class Build:
         dict[str, int], tyro.conf.arg(metavar="PART FACES [PART FACES ...]", help_behavior_hint="(optional)")
     ] = field(default_factory=dict)
     """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
+    remesh: Literal["quadric", "isotropic"] = "quadric"
+    """What the parts' faces are made by: quadric edge collapse, or isotropic remeshing to faces of one size by
+    pymeshlab (extra remesh; GPL-3)."""
     clearance_mm: float = 1.0
     """Distance kept between layers, 0.1 to 10."""
     max_influences: int = 8
@@ -114,6 +117,7 @@ class Build:
         from pipelines.commands.inspect import Inspect
         from pipelines.report.sections.build import write_build_report
         from pipelines.stages.build import build
+        from smplxpp.clean.remesh import require_remesher
         from smplxpp.detect import load_detector
         from smplxpp.register.landmark_file import read_landmarks
         from smplxpp.segment import Corrections
@@ -122,6 +126,7 @@ class Build:
         config, inputs = self.config(), self.inputs()
         if self.detector is not None:
             load_detector(self.detector)  # before work starts
+        require_remesher(self.remesh)
         take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         take_file(self.out, CORRECTIONS_FILE, self.corrections, read=Corrections.load)
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)

@@ -87,7 +87,7 @@ PARTS: dict[str, _Part] = {
         files=("labels", "label_maps", "cameras", "scan", "body"),
         by_hand=(CORRECTIONS_FILE,),
     ),
-    CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets",)),
+    CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets", "remesh")),
     TRANSFER_STAGE: _Part(
         transfer, (POSE_BODY_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
     ),

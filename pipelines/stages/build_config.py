@@ -87,7 +87,7 @@ class BuildConfig:
     Attributes:
         units, up: how the scan file is written; it is converted to metres, +Y up.
         detector: asked which way a person faces whose scan comes alone: "mediapipe" or an ONNX file; None: nobody.
-        budgets: faces kept by part name.
+        budgets: faces kept by part name. remesh: what they are made by, "quadric" or "isotropic".
         clearance_mm: how far outer layers are kept from inner ones.
         max_influences: joints a vertex.
         webs: what of a part is cut because it bridges two limbs; no `rounds`: nothing is.
@@ -100,6 +100,7 @@ class BuildConfig:
     up: str = "y"
     detector: str | None = None
     budgets: dict[str, int] = field(default_factory=_default_budgets)
+    remesh: str = "quadric"
     clearance_mm: float = 1.0
     max_influences: int = 8
     webs: WebConfig = field(default_factory=WebConfig)

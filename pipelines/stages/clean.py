@@ -23,7 +23,8 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write one clean mesh within its face budget for every part that is not skin."""
     scan, colors, _ = load_scan(build.run)
     face_labels = load_scan_labels(build.run, scan.face_count)
-    parts = clean_parts(scan, face_labels, config=PartsConfig(face_budgets=build.config.budgets), vertex_colors=colors)
+    config = PartsConfig(face_budgets=build.config.budgets, method=build.config.remesh)
+    parts = clean_parts(scan, face_labels, config=config, vertex_colors=colors)
     save_arrays(
         folder / "parts.npz",
         {

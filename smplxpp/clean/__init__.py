@@ -4,6 +4,7 @@ from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
 from smplxpp.clean.point_normals import estimate_normals
 from smplxpp.clean.poisson import PointSurface, PoissonConfig, surface_from_points
+from smplxpp.clean.remesh import remesh
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize
 from smplxpp.clean.scan_frame import ScanFrame, find_scan_frame
 from smplxpp.clean.simplify import Simplified, simplify
@@ -39,6 +40,7 @@ __all__ = [
     "find_scan_frame",
     "find_webs",
     "loop_lengths",
+    "remesh",
     "roughness",
     "sanitize",
     "simplify",

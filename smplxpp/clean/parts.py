@@ -1,4 +1,4 @@
-"""Loose parts of a labelled scan: cut out, without specks and pinholes, simplified to a budget."""
+"""Loose parts of a labelled scan: cut out, without specks and pinholes, brought within a budget."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Int, Int64, UInt8
 
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
+from smplxpp.clean.remesh import METHODS, remesh, require_remesher
 from smplxpp.clean.simplify import simplify
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
+from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,16 @@ class PartsConfig:
         face_budgets: faces of a part by label name; `Label.face_budget` where a name is missing.
         speck_area: components below this fraction of the part's area go.
         pinhole_length: border loops with a perimeter below this many metres are closed.
+        method: what the faces are made by: "quadric" (`simplify`) or "isotropic" (`remesh`).
     """
 
     face_budgets: Mapping[str, int] = field(default_factory=dict)
     speck_area: float = 1e-3
     pinhole_length: float = 0.04
+    method: str = "quadric"
 
     def __post_init__(self) -> None:
+        require_choice("method", self.method, METHODS)
         unknown = sorted(set(self.face_budgets) - set(LABEL_BY_NAME))
         if unknown:
             raise InputError("face budgets", expected=f"names among {sorted(LABEL_BY_NAME)}", received=str(unknown))
@@ -93,8 +98,10 @@ def clean_parts(
 
     Raises:
         InputError: labels of another length or unknown, or no loose part at all.
+        MissingExtraError: parts to remesh without pymeshlab.
     """
     config = config or PartsConfig()
+    require_remesher(config.method)
     face_labels = np.asarray(face_labels)
     if face_labels.shape != (mesh.face_count,):
         raise InputError("face labels", expected=f"shape ({mesh.face_count},)", received=f"shape {face_labels.shape}")
@@ -134,7 +141,7 @@ def _clean_part(
     loops = len(border_loops(part.faces))
     part, of_cut = fill_pinholes(part, max_length=config.pinhole_length)
     source = source[of_cut]
-    small = simplify(part, budget)
+    small = remesh(part, budget) if config.method == "isotropic" else simplify(part, budget)
     tree = igl.AABB()
     tree.init(small.mesh.vertices, small.mesh.faces)
     distance = np.sqrt(tree.squared_distance(small.mesh.vertices, small.mesh.faces, part.vertices)[0])

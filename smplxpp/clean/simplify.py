@@ -69,7 +69,7 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     locked = np.zeros(mesh.face_count, dtype=bool)
     for rings in range(1, _MAX_ROUNDS + 1):
         result, new_from_old = _collapse(mesh, locked, face_budget)
-        flipped = _opposed(result, mesh, tree)
+        flipped = opposed(result, mesh, tree)
         # Locked faces come last; the source's own faces are right by definition, even where it folds onto itself.
         flipped[result.face_count - int(locked.sum()) :] = False
         bad = flipped | _non_manifold(result.faces)
@@ -90,7 +90,7 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     faces, source_of_cut = manifold_corners(result.faces)
     result = TriangleMesh(result.vertices[source_of_cut], faces)
     source = _nearest_source(mesh, result, new_from_old, source_of_cut)
-    result = _apart(result, source_of_cut)
+    result = drawn_apart(result, source_of_cut)
     return Simplified(result, new_from_old, source, int(locked.sum()), int(flipped.sum()))
 
 
@@ -135,8 +135,8 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
     return TriangleMesh(vertices, np.concatenate([small_faces, new_from_old[mesh.faces[locked]]])), new_from_old
 
 
-def _opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
-    """The faces whose normal opposes the source face nearest to their middle, or that have no area."""
+def opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
+    """(m,) the faces whose normal opposes the source face nearest to their middle, or that have no area."""
     _, nearest, _ = tree.squared_distance(source.vertices, source.faces, result.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", result.face_normals, source.face_normals[nearest])
     return (cosine < 0) | (result.face_areas <= 0)
@@ -176,8 +176,8 @@ def _non_manifold(faces: np.ndarray) -> np.ndarray:
     return bad
 
 
-def _apart(result: TriangleMesh, source_of_cut: np.ndarray) -> TriangleMesh:
-    """The mesh with vertices that a cut doubled moved towards the middle of their own fans."""
+def drawn_apart(result: TriangleMesh, source_of_cut: np.ndarray) -> TriangleMesh:
+    """The mesh with vertices that a cut (`manifold_corners`) doubled moved towards the middle of their own fans."""
     doubled = np.bincount(source_of_cut)[source_of_cut] > 1
     doubled[np.unique(source_of_cut, return_index=True)[1]] = False
     if not doubled.any():

@@ -6,6 +6,7 @@ import fcntl
 import json
 import re
 import shutil
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, 
 from smplxpp.body import load_params
 from smplxpp.body.stress_poses import stress_poses
 from smplxpp.clean import WebConfig, simplify
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.labels import CLOTH_LABELS, HAIR
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.segment import BoxCorrection, Corrections
@@ -212,7 +213,7 @@ def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
 # --- resuming -------------------------------------------------------------------------------------------------------
 
 
-def test_only_what_is_damaged_or_changed_runs_again(small):
+def test_only_what_is_damaged_or_changed_runs_again(small, monkeypatch):
     inputs = small.inputs()
     first = small.build("run", inputs)
     assert all(record.ran for record in first.values())
@@ -234,6 +235,19 @@ def test_only_what_is_damaged_or_changed_runs_again(small):
     assert ran(last="30_clean", budgets=BUDGETS | {"upper": 1000}) == ["30_clean"]
     states = {stage["stage"]: stage["state"] for stage in summarise_run(run)[0]["stages"]}
     assert [states[name] for name in TEMPLATE_STAGES] == ["done"] * 4 + ["outdated"] * 3 + ["missing"]
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    with pytest.raises(MissingExtraError, match="pymeshlab"):  # other faces are made, not those that stand taken
+        ran(last="30_clean", budgets=BUDGETS | {"upper": 1000}, remesh="isotropic")
+
+
+def test_a_build_from_before_the_choice_of_faces_has_quadric_ones(small):
+    save_build(small.folder, small.inputs(), BuildConfig(remesh="isotropic"))
+    assert load_build(small.folder)[1].remesh == "isotropic"
+    content = json.loads((small.folder / "build.json").read_text())
+    del content["config"]["remesh"]
+    (small.folder / "build.json").write_text(json.dumps(content))
+    assert load_build(small.folder)[1] == BuildConfig()
+    assert Build(out=small.folder, remesh="isotropic").config().remesh == "isotropic"
 
 
 def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):

@@ -99,12 +99,20 @@ def scan_section(
     )
 
 
+_METHODS = {
+    "quadric": "simplified to their budgets by quadric edge collapse (fast-simplification)",
+    "isotropic": "covered anew with faces of one size by isotropic remeshing (pymeshlab, which is under the GPL 3)",
+}
+
+
 def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     """Show the parts and how simplification changed them."""
     parts = load_cleaned_parts(run)
     mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
     labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
     numbers = record.manifest["numbers"]
+    # Stages from before the choice have none.
+    method = as_text(record.manifest["config"].get("remesh", "quadric"), subject="remesh")
     rows = tuple(
         (
             name,
@@ -119,7 +127,7 @@ def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks:
     )
     return Section(
         title="Parts",
-        text=("Clothes, hair and shoes cut out, cleaned and simplified to their budgets; openings are kept.",),
+        text=(f"Clothes, hair and shoes cut out, cleaned and {_METHODS.get(method, method)}; openings are kept.",),
         pictures=(Picture("parts", _sheet(mesh, cameras, face_colors=display_colors(labels))),),
         tables=(
             Table(("part", "faces before", "faces", "pieces", "openings", "to scan, mean mm", "p95 mm"), rows, "parts"),
