@@ -34,7 +34,8 @@ def remesh(mesh: TriangleMesh, face_budget: int) -> Simplified:
 
     Openings stay, and their edges are divided anew as all others are; edges that turn by more than 30 degrees keep
     their place, so that crumpled surfaces end above the budget: that is warned of. Every vertex lies on
-    the source. The edge length follows from the area, L^2 = 4 A / (sqrt(3) faces), and is corrected once by the count that it gave.
+    the source. The edge length follows from the area, L^2 = 4 A / (sqrt(3) faces), and is corrected once
+    by the count that it gave.
 
     Args:
         mesh: manifold, possibly open (`sanitize`, `manifold_corners`).
