@@ -124,6 +124,7 @@ class Build:
 
         keep_out_of_capture(self.out, self.capture)
         config, inputs = self.config(), self.inputs()
+        registration, reconstruction = self.registration(inputs), chosen_reconstruction(self, inputs)
         if self.detector is not None:
             load_detector(self.detector)  # before work starts
         require_remesher(self.remesh)
@@ -137,8 +138,8 @@ class Build:
                 self.out,
                 inputs,
                 config,
-                registration=self.registration(inputs),
-                reconstruction=chosen_reconstruction(self, inputs),
+                registration=registration,
+                reconstruction=reconstruction,
                 first=self.from_stage,
                 last=self.until_stage,
                 progress=step,

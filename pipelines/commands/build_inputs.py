@@ -10,6 +10,7 @@ from pipelines.runs.layout import REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.places import same_place
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildInputs
+from pipelines.stages.photographed import open_photographs, usable_cameras, usable_frames
 from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
 from pipelines.stages.register_config import RegisterInputs, load_register, named_params
 from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
@@ -162,14 +163,22 @@ def chosen_registration(asked: Build, inputs: BuildInputs) -> RegisterInputs | N
 
 def chosen_reconstruction(asked: Build, inputs: BuildInputs) -> ReconstructInputs | None:
     """The photographs that the scan is made of, None where there is one; what `smplxpp reconstruct` has made of
-    this frame stands."""
+    this frame stands.
+
+    Raises:
+        InputError: no cameras or no photographs of the frame, known before work starts.
+    """
     if not inputs.reconstructs:
         return None
     assert asked.capture is not None
     found = load_reconstruct(asked.out)
     if found is not None and inputs.scan.is_file() and same_place(found.capture, asked.capture):
         return found
-    return ReconstructInputs(asked.capture, frames=(asked.frame,), masks=asked.masks, protocol=asked.protocol)
+    photographed = ReconstructInputs(asked.capture, frames=(asked.frame,), masks=asked.masks, protocol=asked.protocol)
+    capture = open_photographs(photographed)
+    usable_cameras(capture, ())
+    usable_frames(capture, photographed.frames)
+    return photographed
 
 
 def _scan_labels(asked: Build, found: ReferenceFrame) -> Path | None:

@@ -112,7 +112,7 @@ class SaidOfInputs:
     def labels(self, build: BuildInputs) -> str:
         """The word for the labels that a template was built with; what the body told is an estimate."""
         sources = list(build.label_maps.values()) or [build.labels or build.scan]
-        if (build.reconstructs or all(path.exists() for path in sources)) and label_source(build) == "body":
+        if (build.reconstructs or all(path.exists() for path in sources)) and _told_by_body(build):
             return WORDS[TRACKED]
         if not all(path.exists() and lies_in(path, self.root) for path in sources):
             return NOT_KNOWN
@@ -152,3 +152,11 @@ def folder_of_maps(capture: Capture, kind: str) -> str | None:
     """Name of the folder with the maps of a kind."""
     series = next(iter(capture.recording.files.get(kind, {}).values()), None)
     return None if series is None else series.folder.parent.name
+
+
+def _told_by_body(build: BuildInputs) -> bool:
+    """Whether the body in the scan told its labels; a scan that cannot be read any more does not say it."""
+    try:
+        return label_source(build) == "body"
+    except InputError:
+        return False

@@ -94,10 +94,10 @@ def test_unknown_commands_are_answered_with_the_known(capsys):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["build", "--out", "x"], "either --capture, or --scan with --params"),
-        (["build", "--out", "x", "--scan", SCAN], "--params with --scan"),
+        (["build", "--out", "x"], "either --capture or --scan"),
+        (["build", "--out", "x", "--scan", SCAN, "--keypoints", FIXTURE], "with --capture"),
         (["build", "--out", "x", "--capture", "nowhere"], "an existing folder, received nowhere"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--frame", "7"], "another frame with --frame"),
+        (["build", "--out", "x", "--capture", FIXTURE, "--frame", "99"], "frame"),
         (["build", "--out", "x", "--capture", FIXTURE, "--budgets", "hat", "500"], "hat"),
         (["build", "--out", "x", "--capture", FIXTURE, "--clearance-mm", "nan"], "received nan"),
         (["build", "--out", "x", "--capture", FIXTURE, "--seed", "-1"], "at least 0"),
