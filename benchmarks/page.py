@@ -292,6 +292,12 @@ PARTS = (
         "and on these three. The labels that follow are of the first fit: a build fits once more with them.",
     ),
     Part(
+        "registration_icp",
+        "The baseline of a body found in a scan: iterated closest points",
+        "open3d's ICP of the mean body in an A-pose to three scans, from the true facing, a quarter and half a turn off; "
+        "mean distance of the body's vertices in mm. The bodies above are found in the same scans.",
+    ),
+    Part(
         "driving_alone",
         "Templates of scans alone, driven",
         "Visible vertices of templates built from a scan with nothing beside it, with exact parameters, and with "
