@@ -294,8 +294,8 @@ PARTS = (
     Part(
         "registration_icp",
         "The baseline of a body found in a scan: iterated closest points",
-        "open3d's ICP of the mean body in an A-pose to three scans, from the true facing, a quarter and half a turn off; "
-        "mean distance of the body's vertices in mm. The bodies above are found in the same scans.",
+        "open3d's ICP of the mean body in an A-pose to three scans, from the true facing, a quarter and half a turn "
+        "off; mean distance of the body's vertices in mm. The bodies above are found in the same scans.",
     ),
     Part(
         "driving_alone",
