@@ -1,6 +1,6 @@
 """Accuracy of `label_by_body` on scans of known people, and what its confidence is worth; prints tables, stores them.
 
-    SMPLXPP_PEOPLE=/tmp/people python -m benchmarks.labels_by_body [--count 36] [--seed 0] [--only NAME]
+    SMPLXPP_PEOPLE=DIR python -m benchmarks.labels_by_body [--count 36] [--seed 0] [--only NAME]
 
 The cast of `benchmarks.people`, the fixture, and the captures where they are. Accuracy is of the seen faces, by area
 and by number. The body is
