@@ -39,14 +39,14 @@ DOUBTFUL = 0.5
 
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write a label, a confidence and a seen flag for every face."""
-    scan, colors, source_vertex = load_scan(build.run)
+    scan, stored_colors, source_vertex = load_scan(build.run)
+    # A scan without colours is stored in one.
+    colors = stored_colors if stored_colors.std() else None
     source = label_source(build.inputs)
     if source == "views":
-        result = _by_views(scan, build.inputs)
+        result = _by_views(scan, colors, build)
     elif source == "body":
-        body, params = load_body(build.inputs.body), load_params_of_run(build.run)
-        # A scan without colours is stored in one.
-        result = label_by_body(scan, body, params, colors=colors if colors.std() else None)
+        result = _by_body(scan, colors, build)
     else:
         result = _by_file(scan, source_vertex, build)
     before = result
@@ -118,12 +118,18 @@ def label_source(inputs: BuildInputs) -> str:
     return "body" if inputs.reconstructs or not holds_labels(inputs.scan) else "file"
 
 
-def _by_views(scan: TriangleMesh, inputs: BuildInputs) -> SegmentedScan:
-    """Votes of label maps.
+def _by_body(scan: TriangleMesh, colors: np.ndarray | None, build: BuildContext) -> SegmentedScan:
+    """What the body in the scan, of whatever parameters the run has, and the colours say."""
+    return label_by_body(scan, load_body(build.inputs.body), load_params_of_run(build.run), colors=colors)
+
+
+def _by_views(scan: TriangleMesh, colors: np.ndarray | None, build: BuildContext) -> SegmentedScan:
+    """Votes of label maps; what the body and the colours say where votes are few.
 
     Raises:
         InputError: maps of cameras that the camera file does not have.
     """
+    inputs = build.inputs
     file = inputs.cameras
     assert file is not None  # the build has checked it
     cameras = {camera.name: camera for camera in read_cameras(file)}
@@ -137,7 +143,8 @@ def _by_views(scan: TriangleMesh, inputs: BuildInputs) -> SegmentedScan:
     views = [
         (cameras[name], read_label_map(path, label_set=inputs.label_set)) for name, path in inputs.label_maps.items()
     ]
-    return segment_scan(scan, votes=vote_on_faces(scan, views))
+    votes = vote_on_faces(scan, views)
+    return segment_scan(scan, votes=votes, colors=colors, prior=_by_body(scan, colors, build))
 
 
 def _by_file(scan: TriangleMesh, source_vertex: np.ndarray, build: BuildContext) -> SegmentedScan:

@@ -18,6 +18,8 @@ from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weig
 _LOOKS_DOWN = -0.3
 """Height of a unit normal below which a face looks down; +Y is up."""
 _SURE_PRIOR = 0.6
+# Share of the area without a vote from which the prior's doubts are those of the labels.
+_MUCH_LEFT = 0.05
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class SegmentedScan:
         island_faces: faces relabelled because their patch was too small.
         energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
         corrected: (M,) bool: a hand has set the label (`Corrections.apply`); None: nobody was asked.
-        doubts: what is not sure, in words for the user; empty where labels or votes were given.
+        doubts: what is not sure, in words for the user; empty where labels were given, or votes all over the surface.
     """
 
     face_labels: Int64[np.ndarray, " M"]
@@ -146,7 +148,7 @@ def segment_scan(
         int((labels != cut).sum()),
         before / COST_SCALE,
         after / COST_SCALE,
-        doubts=() if prior is None else prior.doubts,
+        doubts=() if prior is None or _left_to_prior(mesh, total) < _MUCH_LEFT else prior.doubts,
     )
 
 
@@ -155,6 +157,11 @@ def _check_prior(mesh: TriangleMesh, prior: SegmentedScan) -> None:
         raise InputError(
             "prior", expected=f"labels of the scan's {mesh.face_count} faces", received=f"{len(prior.face_labels)}"
         )
+
+
+def _left_to_prior(mesh: TriangleMesh, votes: np.ndarray) -> float:
+    """Share of the area that faces without a vote have."""
+    return float(mesh.face_areas @ (votes == 0) / mesh.face_areas.sum())
 
 
 def _known_to(prior: SegmentedScan | None) -> Bool[np.ndarray, " L"]:

@@ -16,7 +16,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
-from pipelines.runs.artefacts import load_scan
+from pipelines.runs.artefacts import load_scan, load_source_faces
 from pipelines.runs.layout import TEMPLATE_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
@@ -26,8 +26,8 @@ from smplxpp.body.stress_poses import stress_poses
 from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.labels import CLOTH_LABELS, HAIR
-from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.segment import BoxCorrection, Corrections
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
+from smplxpp.segment import BoxCorrection, Corrections, read_labels
 from smplxpp.template.template import Template
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -106,6 +106,20 @@ def test_a_hard_pose_is_held_against_what_it_asks_of_the_hem(person_run):
     worst = max(one["p999"] / max(one["opening"], 1.0) for part in poses.values() for one in part.values())
     (check,) = (c for c in metrics["checks"] if c["name"] == "edge stretch p99.9, hard poses")
     assert check["value"] == pytest.approx(worst)
+
+
+def test_where_no_view_looks_the_body_says_what_is_what(person_run):
+    raw = read_raw_mesh(FIXTURE / "scans" / "scan_000000.ply")
+    counts = {"vertex_count": len(raw.vertices), "face_count": len(raw.faces)}
+    true = read_labels(FIXTURE / "scans" / "scan_000000_labels.npz", label_set="capture", **counts)
+    corners = true[raw.faces[load_source_faces(person_run)]]
+    one = (corners == corners[:, :1]).all(axis=1)
+    with np.load(person_run / "20_segment" / "labels.npz") as labels:
+        right, seen = labels["face_labels"] == corners[:, 0], labels["seen"]
+    assert right[one & seen].mean() > 0.995 and (one & ~seen).mean() > 0.1
+    assert right[one & ~seen].mean() > 0.95  # of votes alone four fifths
+    numbers = json.loads((person_run / "metrics.json").read_text())["stages"]["20_segment"]
+    assert numbers["labels_from"] == "views"
 
 
 def test_labels_corrected_by_hand_are_taken_up_and_kept(small):
