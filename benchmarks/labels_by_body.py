@@ -118,6 +118,19 @@ def _worst(wrong: np.ndarray) -> str:
     return ", ".join(f"{names[i]} as {names[j]} {wrong[i, j]:.1%}" for i, j in pairs)
 
 
+def _worst_by_confidence(rows: list[dict]) -> list[dict]:
+    """Of every bin of confidence the scan with the lowest rate of right faces, its name and rate, and the share of scans
+    whose rate is below the bin's lower edge; scans with less than 2 % of their area in it do not count.
+    """
+    out = []
+    for k in range(len(BINS) - 1):
+        rates = [(r["bin_right"][k] / r["bin_area"][k], r["person"]) for r in rows if r["bin_area"][k] > 0.02]
+        rate, name = min(rates, default=(None, None))
+        below = sum(own < BINS[k] for own, _ in rates) / max(len(rates), 1)
+        out.append({"scan": name, "right": rate, "scans_below_it": below})
+    return out
+
+
 def scans(count: int | None, seed: int, only: str) -> Iterator[PersonScan]:
     """The captures, then the cast."""
     for name in captured_names():
@@ -153,6 +166,7 @@ def main() -> None:
             "at_least_93": float((of >= 0.93).mean()),
             "share_by_confidence": (area / area.sum()).tolist(),
             "right_by_confidence": np.divide(right, area, out=np.full(len(area), np.nan), where=area > 0).tolist(),
+            "worst_by_confidence": _worst_by_confidence(own),
             "seconds_most": max(r["seconds"] for r in own),
         }
         s = summary[case]
@@ -160,10 +174,10 @@ def main() -> None:
             f"\n{case}: {len(own)} scans, mean {s['mean']:.1%} by area, {s['mean_faces']:.1%} by faces, "
             f"median {s['median']:.1%}, at least 93 %: {s['at_least_93']:.0%}"
         )
-        for low, high, share, good in zip(
-            BINS[:-1], BINS[1:], s["share_by_confidence"], s["right_by_confidence"], strict=True
-        ):
-            print(f"  confidence {low:.2f} to {high:.2f}: {share:6.1%} of the area, {good:6.1%} right")
+        told = zip(s["share_by_confidence"], s["right_by_confidence"], s["worst_by_confidence"], strict=True)
+        for low, high, (share, good, worst) in zip(BINS[:-1], BINS[1:], told, strict=True):
+            least = "" if worst["scan"] is None else f", worst {worst['right']:6.1%} ({worst['scan'][:40]})"
+            print(f"  confidence {low:.2f} to {high:.2f}: {share:6.1%} of the area, {good:6.1%} right{least}")
         for r in own[:12]:
             print(f"  {r['accuracy']:6.1%} {r['accuracy_faces']:6.1%}  {r['person'][:44]:44s} {r['worst']}")
     if not options.only:

@@ -15,7 +15,8 @@ from smplxpp.core.topology import face_adjacency
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_appearance import Blend, label_costs
-from smplxpp.segment.by_body_chart import BodyChart, chart_of_scan
+from smplxpp.segment.by_body_certainty import most_certain
+from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan
 from smplxpp.segment.by_body_colors import Palette, SkinModel, fit_skin, has_colors
 from smplxpp.segment.by_body_doubts import AWAY, find_doubts
 from smplxpp.segment.by_body_layers import Layers, find_layers
@@ -39,6 +40,8 @@ _SEEN_WITHIN = 0.005  # metres
 _MOST_NATS = 12.0
 # Cloth lies above the body by some millimetres and up to some centimetres.
 _ABOVE = 0.012
+# A scan has a chest if this share of its area lies above this height of the trunk, standard metres.
+_CHEST, _SOME = 1.05, 0.01
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,8 @@ def label_by_body(
     outline of the clothes (`find_outfit`) gives each place its likely label; labels learn their colours from it; a
     graph cut along folds and edges of colour settles the borders.
 
-    Confidence is P(label) of a face given all that, over the faces around it. `doubts` says what cannot be known.
+    Confidence is P(label) of a face given all that, over the faces around it, and not above the probability of the
+    outline that it rests on. `doubts` says what cannot be known.
 
     Args:
         params: one frame, in the pose of the scan. colors: sRGB of the vertices, bytes or 0..1; without them labels
@@ -131,7 +135,8 @@ def label_by_body(
     share /= share.sum(axis=1, keepdims=True)
     rows = np.arange(len(cut))
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
-    confidence = share[rows, labels] * min(1.0, AWAY / max(found.misfit, 1e-9))
+    own = np.minimum(share[rows, labels], most_certain(found.chart, labels, found.outfit, found.layers))
+    confidence = own * min(1.0, AWAY / max(found.misfit, 1e-9))
     seen = outer_visible_points(mesh, mesh.face_centers, tolerance=_SEEN_WITHIN)
     doubts = find_doubts(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
     return SegmentedScan(
@@ -180,7 +185,8 @@ def weigh_evidence(
     column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
     outline = config.outfit if lab is not None else replace(config.outfit, habit=1.0)
-    outfit = find_outfit(column, arm, outline, misfit=misplaced)
+    chest = (chart.region == TRUNK) & (chart.height > _CHEST)
+    outfit = find_outfit(column, arm, outline, misfit=misplaced, chest=area[chest].sum() > _SOME * area.sum())
     prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
     blend = Blend.of(
         pairs,

@@ -7,7 +7,6 @@ from jaxtyping import Float64, Int64
 
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.segment.by_body_chart import HIP
 from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_outfit import Outfit
 
@@ -47,7 +46,7 @@ def find_doubts(
         out.append(f"the body misses face and hands by {1e3 * misfit:.0f} mm: clothes are told by colour alone")
     close = [_WORDS[name] for name, margin in outfit.margins.items() if margin < _CLOSE_CALL]
     out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))
-    if not outfit.has_lower and outfit.upper_start < HIP - 0.1:
+    if outfit.one_piece:
         out.append("no seam at the waist: taken as one garment (dress, jumpsuit), labelled upper")
     area = mesh.face_areas
     for label in LABELS:

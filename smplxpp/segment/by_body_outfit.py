@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HIP, KNEE, LEG, TRUNK, WRIST, BodyChart
 
 STEP = 0.015  # of a ring, standard metres
@@ -23,6 +24,10 @@ _SKIRT = 0.025  # metres: what is about the thighs and lies farther from them on
 # Habits: a waist here, two garments rather than one (nats), legs covered (nats a ring), at least short sleeves.
 _WAIST, _TWO_PIECES, _BARE_LEG, _SHORT_SLEEVE = 0.98, 10.0, 0.7, 0.15
 _COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
+_DOUBT = 8.0
+"""Nats of an outline's cost that are a nat of its probability: rings are not independent, and clothes are not all as
+usual. Chosen on the people of `benchmarks.people`, always without the one who is measured (6 to 8 for 36 of 38)."""
+RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
 
 
 @dataclass(frozen=True)
@@ -126,7 +131,7 @@ class Rings:
         return bool(between.any() and self.skin[between, 0].mean() > _SKIN_COLORED)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outfit:
     """Borders in standard metres.
 
@@ -134,6 +139,7 @@ class Outfit:
         shoe_top: 0 for bare feet. lower_start: the lower hem. lower_end: its upper end; not above `lower_start` where
             there is no lower garment. upper_start: the upper garment's hem. cuff: the sleeve's end along the arm.
         margins: by border, what the next best clothes with another border (by more than 6 cm) cost more, nats.
+        column: P(label) in the column's rings over all outlines. sleeve: P(sleeve) in the arm's.
     """
 
     shoe_top: float
@@ -142,26 +148,36 @@ class Outfit:
     upper_start: float
     cuff: float
     margins: dict[str, float]
+    column: Float64[np.ndarray, "R L"]
+    sleeve: Float64[np.ndarray, " Q"]
 
     @property
     def has_lower(self) -> bool:
         return self.lower_end > self.lower_start
 
+    @property
+    def one_piece(self) -> bool:
+        """Whether one garment covers trunk and thighs: a dress, a jumpsuit."""
+        return not self.has_lower and self.upper_start < HIP - 0.1
 
-def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float) -> Outfit:
+
+def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float, chest: bool = True) -> Outfit:
     """The cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
 
     Args:
-        misfit: metres by which the body usually misses bare skin.
+        misfit: metres by which the body usually misses bare skin. chest: whether there is any surface about it.
     """
-    borders, margins = _cut_column(column, config, misfit)
+    order = _column_costs(column, config, misfit, chest=chest)
+    borders, margins = _cut_column(column.places, order)
     shoe_top, lower_start, lower_end, upper_start = borders
-    skin_colored = column.looks_like_skin(upper_start, COLUMN_END)
-    cuff, margins["cuff"] = _cut_arm(arm, config, misfit, skin_colored=skin_colored)
+    of_arm = _arm_costs(arm, config, misfit, skin_colored=column.looks_like_skin(upper_start, COLUMN_END))
+    best = int(of_arm.argmin())
+    cuff, margins["cuff"] = float(arm.places[best]), _margin(of_arm, arm.places, best)
     if shoe_top == 0.0 and lower_start < _LONG and column.looks_like_skin(lower_start, lower_end):
         # Trousers of the colour of skin: so may shoes be, and bare feet below trousers are rare.
         borders, margins["shoe_top"] = (_LOW_SHOE, max(_LOW_SHOE, lower_start), *borders[2:]), 0.0
-    return Outfit(*borders, cuff, margins)
+    ends = np.exp((of_arm.min() - of_arm) / _DOUBT)
+    return Outfit(*borders, cuff, margins, _label_shares(order), 1.0 - np.cumsum(ends)[:-1] / ends.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,10 +237,9 @@ def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[
     return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
 
 
-def _cut_column(
-    rings: Rings, config: OutfitConfig, misfit: float
-) -> tuple[tuple[float, float, float, float], dict[str, float]]:
-    place, count = rings.places, len(rings)
+def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool) -> list[np.ndarray]:
+    """(R + 1, R + 1) each, of the column's `RUNS`: at [i, j] what rings i..j-1 cost as that."""
+    place = rings.places
     runs = _RunCosts.of(rings, config, misfit)
     i, j = np.indices(runs.cloth.shape)
     empty, length = i == j, place[j] - place[i]
@@ -244,10 +259,19 @@ def _cut_column(
     split = at_waist + config.split_at_legs if legs_show else config.split
     habit = at_waist - _TWO_PIECES + _between(np.where(middle < _WAIST, _BARE_LEG, 0.0))[0][i]
     split = (1.0 - config.habit) * split + config.habit * habit
-    lower = np.where(empty, 6.0, runs.cloth + split + usual + on_foot)
+    # Where a scan ends below the chest, one garment about the legs is the lower one.
+    first, second = (split, 0.0) if chest else (0.0, np.where(_between(rings.weight) > 0, config.split, 0.0))
+    lower = np.where(empty, 6.0, runs.cloth + first + usual + on_foot)
     midriff = skin + np.where(empty, 0.0, config.midriff)
-    upper = runs.top + on_foot + _usual(place[i], -0.1, COLUMN_END, 60.0) - np.where(i > 0, fold[i], 0.0)
-    order = [shoe, skin, lower, midriff, upper]
+    upper = runs.top + second + on_foot + _usual(place[i], -0.1, COLUMN_END, 60.0) - np.where(i > 0, fold[i], 0.0)
+    return [shoe, skin, lower, midriff, upper]
+
+
+def _cut_column(
+    place: np.ndarray, order: list[np.ndarray]
+) -> tuple[tuple[float, float, float, float], dict[str, float]]:
+    """The cheapest borders between the runs, and their margins."""
+    count = len(place) - 1
     # forward[k][j]: runs before k end at j. backward[k][i]: runs from k on start at i.
     forward = [np.where(np.arange(count + 1) == 0, 0.0, np.inf)]
     for cost in order:
@@ -269,14 +293,33 @@ def _cut_column(
     return (shoe_top, lower_start, lower_end, upper_start), margins
 
 
-def _cut_arm(rings: Rings, config: OutfitConfig, misfit: float, *, skin_colored: bool) -> tuple[float, float]:
+def _label_shares(order: list[np.ndarray]) -> Float64[np.ndarray, "R L"]:
+    """P(label) of every ring: the sum over all ways to cut the column, exp(-cost / `_DOUBT`) each."""
+    log = [-cost / _DOUBT for cost in order]
+    count = len(log[0]) - 1
+    ends = np.arange(count + 1)
+    # before[k][j]: runs before k end at j. after[k][i]: runs from k on start at i.
+    before, after = [np.where(ends == 0, 0.0, -np.inf)], [np.where(ends == count, 0.0, -np.inf)]
+    for of_run in log:
+        before.append(np.logaddexp.reduce(before[-1][:, None] + of_run, axis=0))
+    for of_run in reversed(log):
+        after.append(np.logaddexp.reduce(of_run + after[-1][None, :], axis=1))
+    after.reverse()
+    shares = np.zeros((count, len(LABELS)))
+    for k, (label, of_run) in enumerate(zip(RUNS, log, strict=True)):
+        # P(the run is i..j-1): it begins to count at i and ceases to at j.
+        cut = np.exp(before[k][:, None] + of_run + after[k + 1][None, :] - before[-1][-1])
+        shares[:, label.id] += np.cumsum(cut.sum(axis=1) - cut.sum(axis=0))[:-1]
+    return np.clip(shares, 0.0, 1.0)
+
+
+def _arm_costs(rings: Rings, config: OutfitConfig, misfit: float, *, skin_colored: bool) -> Float64[np.ndarray, " R1"]:
+    """What it costs that the sleeve ends where each ring begins, or the last one ends."""
     runs = _RunCosts.of(rings, config, misfit)
     # A shirt of another colour than skin has no sleeves of the colour of skin.
     sleeve = runs.cloth if skin_colored else runs.shoe
     cost = sleeve[0] + runs.skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
-    cost += config.habit * _usual(rings.places, _SHORT_SLEEVE, 1.0, 20.0)
-    best = int(cost.argmin())
-    return float(rings.places[best]), _margin(cost, rings.places, best)
+    return cost + config.habit * _usual(rings.places, _SHORT_SLEEVE, 1.0, 20.0)
 
 
 def _margin(cost: np.ndarray, place: np.ndarray, best: int) -> float:
