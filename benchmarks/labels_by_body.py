@@ -119,8 +119,8 @@ def _worst(wrong: np.ndarray) -> str:
 
 
 def _worst_by_confidence(rows: list[dict]) -> list[dict]:
-    """Of every bin of confidence the scan with the lowest rate of right faces, its name and rate, and the share of scans
-    whose rate is below the bin's lower edge; scans with less than 2 % of their area in it do not count.
+    """Of every bin of confidence the scan with the lowest rate of right faces, that rate, and the share of scans whose
+    rate is below the bin's lower edge; scans with less than 2 % of their area in it do not count.
     """
     out = []
     for k in range(len(BINS) - 1):

@@ -24,7 +24,7 @@ _SKIRT = 0.025  # metres: what is about the thighs and lies farther from them on
 # Habits: a waist here, two garments rather than one (nats), legs covered (nats a ring), at least short sleeves.
 _WAIST, _TWO_PIECES, _BARE_LEG, _SHORT_SLEEVE = 0.98, 10.0, 0.7, 0.15
 _COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
-_DOUBT = 8.0
+NAT = 8.0
 """Nats of an outline's cost that are a nat of its probability: rings are not independent, and clothes are not all as
 usual. Chosen on the people of `benchmarks.people`, always without the one who is measured (6 to 8 for 36 of 38)."""
 RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
@@ -176,8 +176,8 @@ def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: floa
     if shoe_top == 0.0 and lower_start < _LONG and column.looks_like_skin(lower_start, lower_end):
         # Trousers of the colour of skin: so may shoes be, and bare feet below trousers are rare.
         borders, margins["shoe_top"] = (_LOW_SHOE, max(_LOW_SHOE, lower_start), *borders[2:]), 0.0
-    ends = np.exp((of_arm.min() - of_arm) / _DOUBT)
-    return Outfit(*borders, cuff, margins, _label_shares(order), 1.0 - np.cumsum(ends)[:-1] / ends.sum())
+    ends = np.exp((of_arm.min() - of_arm) / NAT)
+    return Outfit(*borders, cuff, margins, label_shares(order), 1.0 - np.cumsum(ends)[:-1] / ends.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,9 +293,9 @@ def _cut_column(
     return (shoe_top, lower_start, lower_end, upper_start), margins
 
 
-def _label_shares(order: list[np.ndarray]) -> Float64[np.ndarray, "R L"]:
-    """P(label) of every ring: the sum over all ways to cut the column, exp(-cost / `_DOUBT`) each."""
-    log = [-cost / _DOUBT for cost in order]
+def label_shares(order: list[np.ndarray]) -> Float64[np.ndarray, "R L"]:
+    """P(label) of every ring: the sum over all ways to cut the column, exp(-cost / `NAT`) each."""
+    log = [-cost / NAT for cost in order]
     count = len(log[0]) - 1
     ends = np.arange(count + 1)
     # before[k][j]: runs before k end at j. after[k][i]: runs from k on start at i.

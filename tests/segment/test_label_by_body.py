@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import label_by_body, read_labels, segment_scan
+from smplxpp.segment.by_body_outfit import NAT, RUNS, label_shares
 
 PERSON = Path(__file__).resolve().parents[2] / "data/fixtures/person"
 _SKIN_RGB, _BLUE, _GREY = (222, 176, 150), (58, 98, 170), (90, 90, 94)
@@ -103,6 +105,49 @@ def test_a_bald_person_with_bare_feet_has_neither_hair_nor_shoes(body):
     share = np.array([area[labels == k].sum() for k in range(6)])
     assert share[HAIR.id] < 0.002 and share[SHOE.id] < 0.002
     assert share[UPPER.id] > 0.2 and share[LOWER.id] > 0.2 and share[SKIN.id] > 0.15
+
+
+def test_a_garment_that_may_be_one_or_two_is_not_sure(body):
+    """Shirt and trousers of two colours, and the same of one: what is upper and what lower is a guess then."""
+    sure = []
+    for trousers in (_GREY, _BLUE):
+        mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": trousers, "hair": _GREY})
+        result = label_by_body(mesh, body, params, colors=colors)
+        cloth = np.isin(result.face_labels, (UPPER.id, LOWER.id))
+        sure.append(mesh.face_areas[cloth] @ result.confidence[cloth] / mesh.face_areas[cloth].sum())
+    assert sure[0] > 0.88 and sure[1] < sure[0] - 0.05
+
+
+def test_nothing_tells_a_closed_jacket_from_a_shirt(body, scanned):
+    mesh, colors, _, params = scanned
+    result = label_by_body(mesh, body, params, colors=colors)
+    assert result.confidence[result.face_labels == UPPER.id].max() < 0.95
+    assert np.median(result.confidence[result.face_labels == LOWER.id]) > 0.95
+
+
+def test_legs_alone_wear_a_lower_garment(body, scanned):
+    mesh, colors, truth, params = scanned
+    kept = mesh.face_centers[:, 1] < mesh.vertices[:, 1].min() + 0.5 * np.ptp(mesh.vertices[:, 1])
+    part, index = mesh.submesh(kept)
+    found = label_by_body(part, body, params, colors=colors[index]).face_labels
+    assert accuracy(part, found, truth[kept]) > 0.95 and not (found == UPPER.id).any()
+
+
+def test_shares_of_labels_are_sums_over_all_outlines():
+    rng = np.random.default_rng(0)
+    rings = 5
+    there = np.triu(np.ones((rings + 1, rings + 1), dtype=bool))
+    order = [np.where(there, rng.uniform(0, 20, there.shape), np.inf) for _ in RUNS]
+    expected, total = np.zeros((rings, 6)), 0.0
+    for inner in combinations_with_replacement(range(rings + 1), len(RUNS) - 1):
+        cuts = (0, *inner, rings)
+        weight = np.exp(-sum(cost[a, b] for cost, a, b in zip(order, cuts[:-1], cuts[1:], strict=True)) / NAT)
+        total += weight
+        for label, a, b in zip(RUNS, cuts[:-1], cuts[1:], strict=True):
+            expected[a:b, label.id] += weight
+    shares = label_shares(order)
+    np.testing.assert_allclose(shares, expected / total, atol=1e-12)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
 
 
 def test_wrong_input_is_refused(body, scanned):
