@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import warnings
 
 import igl
 import numpy as np
@@ -49,16 +48,14 @@ def test_an_unknown_method_is_refused():
 def test_faces_of_equal_sides_within_the_budget_on_the_same_surface(budget: int):
     pytest.importorskip("pymeshlab", exc_type=ImportError)
     sleeve = stretched()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)
-        result = remesh(sleeve, budget)
+    result = remesh(sleeve, budget)
     mesh = result.mesh
-    assert 0.9 < mesh.face_count / min(budget, sleeve.face_count) < 1.4
+    assert 0.95 < mesh.face_count / min(budget, sleeve.face_count) < 1.05
     assert igl.is_edge_manifold(mesh.faces)[0] and igl.is_vertex_manifold(mesh.faces).all()
     assert result.flipped_faces == 0 and len(np.unique(mesh.vertices, axis=0)) == mesh.vertex_count
     assert rounded(mesh).mean() > rounded(sleeve).mean() + 0.25
-    assert point_to_surface(mesh.vertices, sleeve)[0].max() < 1e-6
-    assert point_to_surface(sleeve.vertices, mesh)[0].max() < 2e-3
+    assert point_to_surface(mesh.vertices, sleeve)[0].max() < 1.5e-3
+    assert point_to_surface(sleeve.vertices, mesh)[0].max() < 1.5e-3
     lengths = [sorted(loop_lengths(m, border_loops(m.faces))) for m in (sleeve, mesh)]
     np.testing.assert_allclose(*lengths, rtol=0.01)
     edge = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1), axis=2).max()
@@ -75,13 +72,23 @@ def test_bit_for_bit_and_moved_with_the_surface():
     assert larger.face_count == pytest.approx(first.face_count, rel=0.02)
 
 
-def test_a_crumpled_surface_above_its_budget_is_said():
+def test_a_crumpled_surface_keeps_its_budget():
     pytest.importorskip("pymeshlab", exc_type=ImportError)
     sleeve = tube()
     crumpled = sleeve.with_vertices(sleeve.vertices + np.random.default_rng(0).normal(0, 4e-3, sleeve.vertices.shape))
-    with pytest.warns(GeometryWarning, match="where 400 were asked for"):
-        result = remesh(crumpled, 400)
-    assert result.mesh.face_count > 440 and igl.is_edge_manifold(result.mesh.faces)[0]
+    result = remesh(crumpled, 400)
+    assert 380 <= result.mesh.face_count <= 420 and igl.is_edge_manifold(result.mesh.faces)[0]
+
+
+def test_pieces_that_need_more_faces_than_the_budget_are_said():
+    pytest.importorskip("pymeshlab", exc_type=ImportError)
+    sleeve, count = tube(), 20
+    many = TriangleMesh(
+        np.concatenate([sleeve.vertices + [k, 0, 0] for k in range(count)]),
+        np.concatenate([sleeve.faces + k * sleeve.vertex_count for k in range(count)]),
+    )
+    with pytest.warns(GeometryWarning, match="where 20 were asked for"):
+        assert remesh(many, 20).mesh.face_count > 21
 
 
 def test_colours_of_parts_follow():
