@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.validation import require_choice
+from smplxpp.detect import load_detector
 from smplxpp.segment import find_label_set
 
 METRICS_SCHEMA = 1
@@ -184,6 +186,10 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
     digests: dict[str, str] = {}
     for key in part.files:
         digests |= _file_digests(key, getattr(inputs, key))
+    if "detector" in part.settings and config.detector is not None:
+        # The path of a model says nothing of what is in it.
+        identity = load_detector(config.detector).identity
+        digests["detector"] = hashlib.sha256(identity.encode()).hexdigest()
     digests |= {file: sha256_file(context.run / file) for file in part.by_hand if (context.run / file).exists()}
     for other in (name for name in part.needs if name in records):
         digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
