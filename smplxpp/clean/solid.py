@@ -183,18 +183,23 @@ def solid_of_parts(
         warnings.warn(
             f"solid: {others} crumbs of the union and shells inside it are left out", GeometryWarning, stacklevel=2
         )
-    return Solid(_touching_apart(mesh_of_solid(largest)), _measured(largest, config, others, gaps))
+    return Solid(touching_apart(mesh_of_solid(largest)), _measured(largest, config, others, gaps))
 
 
-def _touching_apart(mesh: TriangleMesh) -> TriangleMesh:
+def touching_apart(mesh: TriangleMesh) -> TriangleMesh:
     """The mesh with vertices that lie together drawn inward, each to its own side.
 
-    A solid may touch itself in a vertex or an edge; a file of triangles alone, as STL is, would join it there.
+    A solid may touch itself in a vertex or an edge; a file of triangles alone, as STL is, would join it there. Those
+    that look the same way stay together then, and are drawn to the middles of their own fans.
     """
     size = _SHORT * float(np.ptp(mesh.vertices, axis=0).max())
     pairs = cKDTree(mesh.vertices).query_pairs(size, output_type="ndarray")
     vertices, moved = mesh.vertices.copy(), np.unique(pairs)
     vertices[moved] -= 2 * size * mesh.vertex_normals[moved]
+    still = pairs[np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1) < size]
+    for k in np.unique(still):
+        way = mesh.vertices[np.unique(mesh.faces[(mesh.faces == k).any(axis=1)])].mean(axis=0) - mesh.vertices[k]
+        vertices[k] += 2 * size * way / max(float(np.linalg.norm(way)), 1e-12)
     return mesh.with_vertices(vertices)
 
 

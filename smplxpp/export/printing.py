@@ -9,35 +9,46 @@ import numpy as np
 import pygltflib
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
 from smplxpp.core.files.zip_file import zip_bytes
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_choice
 from smplxpp.export.gltf_buffers import BufferBuilder
+from smplxpp.export.printing_check import MODEL, check_written
 
 SUFFIXES = (".stl", ".3mf", ".ply", ".glb")
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _3MF_UNITS = {"m": "meter", "cm": "centimeter", "mm": "millimeter"}
 
 
-def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> None:
+def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> float:
     """Write a closed surface, whole or not at all; the suffix tells the format.
 
     STL and 3MF stand on a printer's bed: z up, the lowest point at 0. PLY and GLB keep +Y up, and GLB its metres, as
-    glTF demands.
+    glTF demands. The file is read back before it takes its place.
 
     Args:
         path: `.stl` (binary), `.3mf`, `.ply` or `.glb`.
         mesh: metres, +Y up.
         units: "m", "cm" or "mm".
 
+    Returns:
+        The volume that the file encloses, cubic metres.
+
     Raises:
-        InputError: another suffix or unit.
+        InputError: another suffix or unit; what was read back is not closed and manifold or has another volume.
     """
     path = Path(path)
     check_solid_path(path)
     require_choice("option units", units, tuple(PER_METRE))
+    with atomic_path(path) as temporary:
+        _write(temporary, mesh, units)
+        in_metres = path.suffix.lower() == ".glb"
+        return check_written(temporary, mesh, per_metre=1.0 if in_metres else PER_METRE[units])
+
+
+def _write(path: Path, mesh: TriangleMesh, units: str) -> None:
     suffix = path.suffix.lower()
     if suffix == ".glb":
         atomic_write_bytes(path, _glb(mesh))
@@ -95,7 +106,7 @@ def _3mf(mesh: TriangleMesh, unit: str) -> bytes:
         '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
         'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
     )
-    return zip_bytes({"[Content_Types].xml": types, "_rels/.rels": relations, "3D/3dmodel.model": model})
+    return zip_bytes({"[Content_Types].xml": types, "_rels/.rels": relations, MODEL: model})
 
 
 def _glb(mesh: TriangleMesh) -> bytes:

@@ -14,6 +14,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.export.printing import write_solid
+from smplxpp.export.printing_check import check_written
 
 
 @pytest.fixture
@@ -64,3 +65,39 @@ def test_other_formats_and_units_are_refused(tmp_path: Path, bottle: TriangleMes
     with pytest.raises(InputError, match="units"):
         write_solid(tmp_path / "a.stl", bottle, units="inch")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".3mf", ".ply", ".glb"])
+def test_the_file_is_read_back_and_holds_the_volume(tmp_path: Path, bottle: TriangleMesh, suffix: str):
+    volume = trimesh.Trimesh(bottle.vertices, bottle.faces).volume
+    for units in ("mm", "m"):
+        assert write_solid(tmp_path / f"a{suffix}", bottle, units=units) == pytest.approx(volume, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda m: TriangleMesh(m.vertices, m.faces[1:]), "3 open edges"),
+        (lambda m: TriangleMesh(m.vertices, np.concatenate([m.faces[:1, ::-1], m.faces[1:]])), "wound against"),
+        (lambda m: TriangleMesh(m.vertices, np.concatenate([m.faces, m.faces[:1], m.faces[:1, ::-1]])), "more than two"),
+        (lambda m: m.with_vertices(m.vertices * 1e-3 + [1e4, 0, 0]), "received"),
+    ],
+)
+def test_what_no_printer_takes_is_refused_and_leaves_no_file(tmp_path: Path, bottle: TriangleMesh, spoil, words: str):
+    with pytest.raises(InputError, match=words):
+        write_solid(tmp_path / "a.stl", spoil(bottle))
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_volume_or_a_surface_that_touches_itself_is_told(tmp_path: Path, bottle: TriangleMesh):
+    write_solid(tmp_path / "a.stl", bottle)
+    with pytest.raises(InputError, match="cm3"):
+        check_written(tmp_path / "a.stl", bottle.with_vertices(1.01 * bottle.vertices), per_metre=1e3)
+    tip = int(bottle.vertices[:, 1].argmax())
+    mirrored = 2 * bottle.vertices[tip] - bottle.vertices
+    two = TriangleMesh(
+        np.concatenate([bottle.vertices, mirrored]),
+        np.concatenate([bottle.faces, bottle.faces[:, ::-1] + bottle.vertex_count]),
+    )
+    with pytest.raises(InputError, match="1 vertices in which the surface touches itself"):
+        write_solid(tmp_path / "b.stl", two)

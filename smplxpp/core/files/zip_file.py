@@ -1,4 +1,4 @@
-"""Zip packages made in memory: the same content gives the same bytes."""
+"""Zip packages of texts, made in memory: the same content gives the same bytes."""
 
 from __future__ import annotations
 
@@ -19,3 +19,9 @@ def zip_bytes(files: Mapping[str, str]) -> bytes:
             entry.compress_type = zipfile.ZIP_DEFLATED
             package.writestr(entry, text)
     return stream.getvalue()
+
+
+def zip_member(data: bytes, name: str) -> str:
+    """A text of a zip that `zip_bytes` made; nothing bounds what it unfolds to, so it is not for files of others."""
+    with zipfile.ZipFile(io.BytesIO(data)) as package:
+        return package.read(name).decode()

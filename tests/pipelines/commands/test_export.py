@@ -60,6 +60,7 @@ def test_a_print_is_one_watertight_piece_of_the_height_asked_for(run: Path, tmp_
     assert made.is_watertight and made.is_winding_consistent and made.body_count == 1
     assert made.extents[2] == pytest.approx(90, abs=0.1)
     assert made.volume / 1e3 == pytest.approx(report["volume_cm3"], rel=1e-3)
+    assert report["file_volume_cm3"] == pytest.approx(report["volume_cm3"], rel=1e-5)
     assert 5 < report["wall_mm_median"] < 20
 
 
