@@ -1,4 +1,4 @@
-"""Vertices of a coarse mesh moved to where its faces, not its corners, lie nearest to the surface that it stands for."""
+"""Vertices of a coarse mesh moved to where its faces, not its corners, lie nearest to the surface they stand for."""
 
 from __future__ import annotations
 

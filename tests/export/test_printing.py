@@ -79,7 +79,10 @@ def test_the_file_is_read_back_and_holds_the_volume(tmp_path: Path, bottle: Tria
     [
         (lambda m: TriangleMesh(m.vertices, m.faces[1:]), "3 open edges"),
         (lambda m: TriangleMesh(m.vertices, np.concatenate([m.faces[:1, ::-1], m.faces[1:]])), "wound against"),
-        (lambda m: TriangleMesh(m.vertices, np.concatenate([m.faces, m.faces[:1], m.faces[:1, ::-1]])), "more than two"),
+        (
+            lambda m: TriangleMesh(m.vertices, np.concatenate([m.faces, m.faces[:1], m.faces[:1, ::-1]])),
+            "more than two",
+        ),
         (lambda m: m.with_vertices(m.vertices * 1e-3 + [1e4, 0, 0]), "received"),
     ],
 )
