@@ -12,7 +12,9 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
 from smplxpp.core.surface_points import SurfacePoints, joined
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
-from smplxpp.register.locate.proxy import BodyProxy, Region, outer_vertices, regions
+from smplxpp.register.locate.cover import SKIN_COVER, Expected
+from smplxpp.register.locate.drape import NO_CELL, Drape
+from smplxpp.register.locate.proxy import BodyProxy, outer_vertices, regions
 from smplxpp.register.normal_equations import NormalEquations
 from smplxpp.register.robust import geman_mcclure
 
@@ -25,7 +27,7 @@ class Match:
 
     Attributes:
         corners, bary: the place. distance: metres, positive outside the body. normal: the body's there.
-        facing: cosine between both normals. region, limb: of the place.
+        facing: cosine between both normals. region, cell: of the place; see `Drape`.
     """
 
     corners: Int64[np.ndarray, "N 3"]
@@ -34,7 +36,7 @@ class Match:
     normal: Float64[np.ndarray, "N 3"]
     facing: Float64[np.ndarray, " N"]
     region: Int64[np.ndarray, " N"]
-    limb: Int64[np.ndarray, " N"]
+    cell: Int64[np.ndarray, " N"]
 
 
 class OuterBody:
@@ -46,7 +48,7 @@ class OuterBody:
         outer = np.zeros(body.vertex_count, dtype=bool)
         outer[outer_vertices(body)] = True
         self.faces = body.faces[outer[body.faces].all(axis=1)]
-        self.region, self.limb = regions(body), np.argmax(body.weights, axis=1)
+        self.region, self.drape = regions(body), Drape.of(body)
 
     def mesh(self, posture: Posture) -> TriangleMesh:
         """The posed body without what lies inside."""
@@ -75,39 +77,13 @@ class OuterBody:
             normal,
             np.einsum("nx,nx->n", normal, surface.normals),
             self.region[near],
-            self.limb[near],
+            self.drape.cell[near],
         )
-
-
-@dataclass(frozen=True)
-class Cover:
-    """What is expected over a region: how far off, how sure; metres.
-
-    Attributes:
-        gap: the usual distance. spread: of it; inside the body is never usual. weight: of a point beside one of skin.
-    """
-
-    gap: float
-    spread: float
-    weight: float
-
-
-SKIN_COVER = Cover(0.0, 0.003, 1.0)
-COVERS: dict[int, Cover] = {
-    Region.HAND: SKIN_COVER,
-    Region.FACE: SKIN_COVER,
-    Region.SCALP: Cover(0.015, 0.012, 0.3),
-    Region.FOOT: Cover(0.012, 0.010, 0.5),
-    Region.NECK: Cover(0.004, 0.010, 0.5),
-    Region.ARM: Cover(0.006, 0.010, 0.5),
-    Region.LEG: Cover(0.008, 0.012, 0.5),
-    Region.TRUNK: Cover(0.008, 0.010, 0.5),
-}
 
 
 @dataclass
 class Dressed:
-    """Distances of a surface's points to the body as `COVERS` expects them; hands and face also the other way.
+    """Distances of a surface's points to the body as `Expected` and `Drape` say; hands and face also the other way.
 
     Attributes:
         skin: which of the surface's points are bare skin for sure.
@@ -124,25 +100,25 @@ class Dressed:
 
     def add(self, equations: NormalEquations, kinematics: Kinematics, posture: Posture) -> None:
         """Add what is seen."""
-        mesh = self.outer.mesh(posture)
-        found = self.outer.match(mesh, self.surface)
-        gap, spread, share = (np.zeros(len(self.surface)) for _ in range(3))
-        for region, cover in COVERS.items():
-            there = found.region == region
-            gap[there], spread[there], share[there] = cover.gap, cover.spread, cover.weight
-        gap[self.skin], spread[self.skin], share[self.skin] = SKIN_COVER.gap, SKIN_COVER.spread, SKIN_COVER.weight
-        tight = spread <= SKIN_COVER.spread
-        residual = found.distance - gap
-        wide = np.maximum(self.reach * tight, 2.5 * spread)
-        weight = (found.facing > _FACING) * share * geman_mcclure(residual, wide) / spread**2
-        below = (found.distance < 0) & ~tight
-        weight = np.where(below, geman_mcclure(found.distance, 3 * self.reach) / self.inside**2, weight)
-        residual = np.where(below, found.distance, residual)
-        weight *= self.count / len(self.surface)
+        found = self.outer.match(self.outer.mesh(posture), self.surface)
+        expected, drape = Expected.over(found.region, self.skin), self.outer.drape
+        residual = found.distance - expected.gap
+        wide = np.maximum(self.reach * expected.skin, 2.5 * expected.spread)
+        weight = (found.facing > _FACING) * expected.weight / expected.spread**2 * self.count / len(self.surface)
+        below = (found.distance < 0) & ~expected.skin
+        worn = np.flatnonzero((found.cell != NO_CELL) & ~expected.skin & ~below)
+        alone = np.setdiff1d(np.arange(len(residual)), worn)
+        cell, off = found.cell[worn], np.zeros(len(residual))
+        off[worn] = drape.offsets(cell, residual[worn], weight[worn], wide[worn])
+        weight *= geman_mcclure(residual - off, wide)
+        inside = geman_mcclure(found.distance, 3 * self.reach) / self.inside**2 * self.count / len(self.surface)
+        weight, residual = np.where(below, inside, weight), np.where(below, found.distance, residual)
         points = self.outer.points.mixed(found.corners, found.bary)
         jacobian = equations.columns.jacobian(kinematics.motion(points, posture))
-        rows = np.einsum("nx,nxp->np", -found.normal, jacobian, optimize=True) * np.sqrt(weight)[:, None]
-        equations.add(0, rows, residual * np.sqrt(weight), shape=True)
+        rows = np.einsum("nx,nxp->np", -found.normal, jacobian, optimize=True)
+        root = np.sqrt(weight[alone])
+        equations.add(0, rows[alone] * root[:, None], residual[alone] * root, shape=True)
+        equations.add(0, *drape.eliminated(cell, weight[worn], rows[worn], residual[worn]), shape=True)
         self._add_bare(equations, kinematics, posture)
 
     def _add_bare(self, equations: NormalEquations, kinematics: Kinematics, posture: Posture) -> None:
