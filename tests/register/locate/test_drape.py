@@ -9,8 +9,8 @@ from smplxpp.body import load_body
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate import LocateConfig
-from smplxpp.register.locate.dressed import OuterBody
 from smplxpp.register.locate.drape import NO_CELL, Drape
+from smplxpp.register.locate.dressed import OuterBody
 from smplxpp.register.locate.proxy import Region, regions
 from smplxpp.register.locate.search import Search
 
