@@ -9,8 +9,12 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from pipelines.commands.options import OptionalInt, OptionalText
 from pipelines.synth.make_capture import SynthConfig, make_capture
+from pipelines.synth.motions import motion_kind
+from pipelines.synth.outfits import CLOTHES
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_at_least, require_choice
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 
@@ -21,24 +25,30 @@ class Synth:
 
     out: Path
     """Folder to write; it must not exist, or be empty."""
-    cameras: int = 12
-    """How many; from four on two of them are close-ups of the face, and some of the others are held out."""
+    motion: str = "turning"
+    """What she does: turning (gestures, a turn with steps, arms overhead) or talking (stands, talks, gestures)."""
     frames: int = 24
-    """Length of the performance; the last fifth of the frames is held out."""
+    """Length of the motion; the last fifth of the frames is held out."""
+    cameras: OptionalInt = None
+    """How many, 12 (talking: 8); from four on two are close-ups of the face, and some of the others are held out."""
     size: int = 640
-    """Height of body images in pixels; they are 4/5 as wide, close-ups are square and 3/4 as high."""
+    """Height of body images in pixels; close-ups are square and 3/4 as high."""
+    width: OptionalInt = None
+    """Width of body images in pixels, in eights; 4/5 of the height (talking: 3/5)."""
+    clothes: OptionalText = None
+    """What she wears below the shirt: skirt (loose) or trousers (tight); a skirt (talking: trousers)."""
     seed: int = 0
-    """Seed of the performance, the cameras and all noise."""
+    """Seed of the motion, the cameras and all noise."""
     fps: float = 10.0
     """Frames a second."""
     layout: Literal["simple", "actorshq"] = "simple"
     """Ours with everything, or images, masks and cameras in ActorsHQ's folders."""
     quality: int = 95
     """Quality of JPEG images."""
-    truth_step: int = 1
-    """Truth meshes of every n-th frame."""
-    normals_step: int = 1
-    """Normal maps of every n-th frame."""
+    truth_step: OptionalInt = None
+    """Truth meshes of every n-th frame, of all (talking: 2)."""
+    normals_step: OptionalInt = None
+    """Normal maps of every n-th frame, of all (talking: 4)."""
     scan_faces: int = 80_000
     """Size of the reference frame's scan; 0 makes none."""
     person: Path = FIXTURE
@@ -55,18 +65,7 @@ class Synth:
                 received=str(self.out),
                 remedy="name another, or delete it",
             )
-        config = SynthConfig(
-            cameras=self.cameras,
-            frames=self.frames,
-            size=self.size,
-            seed=self.seed,
-            fps=self.fps,
-            layout=self.layout,
-            quality=self.quality,
-            truth_step=self.truth_step,
-            normals_step=self.normals_step,
-            scan_faces=self.scan_faces,
-        )
+        config = self._config()
         console = Console(stderr=True)
         columns = (TextColumn("{task.description:<8}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
         with Progress(*columns, console=console) as bars:
@@ -79,9 +78,34 @@ class Synth:
 
             checks = make_capture(self.out, self.person / "geometry" / "topology.npz", config, progress=show)
         console.print(
-            f"{self.out}: {config.cameras} cameras, {config.frames} frames",
+            f"{self.out}: {config.motion}, {config.cameras} cameras, {config.frames} frames",
             highlight=False,
             soft_wrap=True,
             markup=False,
         )
         return {"out": str(self.out), "cameras": config.cameras, "frames": config.frames, "checks": checks}
+
+    def _config(self) -> SynthConfig:
+        """Make the configuration: what is left out is as the motion has it."""
+        kind = motion_kind(self.motion)
+        require_at_least("--size", self.size, 16)
+        if self.width is not None:
+            require_at_least("--width", self.width, 8)
+        clothes = kind.clothes if self.clothes is None else self.clothes
+        require_choice("--clothes", clothes, CLOTHES)
+        return SynthConfig(
+            cameras=kind.cameras if self.cameras is None else self.cameras,
+            frames=self.frames,
+            size=self.size,
+            seed=self.seed,
+            fps=self.fps,
+            layout=self.layout,
+            quality=self.quality,
+            truth_step=kind.truth_step if self.truth_step is None else self.truth_step,
+            normals_step=kind.normals_step if self.normals_step is None else self.normals_step,
+            scan_faces=self.scan_faces,
+            motion=self.motion,
+            clothes=clothes,
+            aspect=kind.aspect if self.width is None else self.width / self.size,
+            texel=kind.texel,
+        )

@@ -19,7 +19,13 @@ _MARGIN = 1.06
 
 
 def camera_rig(
-    points: Float[np.ndarray, "P 3"], heads: Float[np.ndarray, "Q 3"], *, count: int, size: int, seed: int
+    points: Float[np.ndarray, "P 3"],
+    heads: Float[np.ndarray, "Q 3"],
+    *,
+    count: int,
+    size: int,
+    seed: int,
+    aspect: float = 0.8,
 ) -> list[RigCamera]:
     """Place `count` cameras that see the person in every frame.
 
@@ -27,8 +33,9 @@ def camera_rig(
         points: what body cameras must hold: the person over all frames.
         heads: what face cameras must hold: the head over all frames.
         count: of cameras; from four on two of them look at the face.
-        size: height of body images in pixels; they are 4/5 as wide, face images square, 3/4 as high.
+        size: height of body images in pixels; face images are square, 3/4 as high.
         seed: of small irregularities of places and principal points.
+        aspect: width of body images by their height.
     """
     rng = np.random.default_rng([seed, 3])
     faces = 2 if count >= 4 else 0
@@ -36,7 +43,7 @@ def camera_rig(
     # Evenly around the ring, but not the first, which looks at the front.
     held_out = set(spread_inside(range(bodies), max(1, round(bodies / 6)))) if bodies >= 4 else set()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    width = max(8, round(size * 0.8 / 8) * 8)
+    width = max(8, round(size * aspect / 8) * 8)
     rig = []
     for k in range(bodies):
         azimuth = np.radians(360.0 * k / bodies + rng.uniform(-4, 4))

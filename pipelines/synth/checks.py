@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.contact import depths
 from pipelines.synth.person import PART_NAMES, Person
 from pipelines.synth.scan_simulation import SimulatedScan
 from pipelines.synth.simulate import Take
@@ -15,6 +14,7 @@ from smplxpp.core.signed_distance import SignedDistanceField
 
 _MM = 1e3
 _GARMENTS = ("upper", "lower")
+_DEPTHS = 100  # frames, evenly chosen, of which depth is measured
 
 
 def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, float]:
@@ -30,17 +30,27 @@ def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, floa
     for name in (*_GARMENTS, "hair"):
         own = person.vertex_part == PART_NAMES.index(name)
         out[f"{name}_vs_skinning_mean_mm"] = _MM * float(moved[:, own].mean())
-    bodies = [TriangleMesh(vertices[:count], person.body.faces) for vertices in take.vertices]
+    depth = _depths(person, take.vertices[:: -(-len(take.vertices) // _DEPTHS)])
     for name in _GARMENTS:
-        own = person.vertex_part == PART_NAMES.index(name)
-        depth = np.stack([depths(body, frame[own]) for body, frame in zip(bodies, take.vertices, strict=True)])
         strain = free_edge_strain(person, take, name)
         out |= {
-            f"{name}_depth_max_mm": _MM * float(depth.max()),
-            f"{name}_vertices_deeper_1mm_percent": 100 * float((depth > 1e-3).mean()),
-            f"{name}_strain_p99_percent": 100 * float(np.percentile(np.abs(strain), 99)),
+            f"{name}_depth_max_mm": _MM * float(depth[name].max()),
+            f"{name}_vertices_deeper_1mm_percent": 100 * float((depth[name] > 1e-3).mean()),
         }
+        if strain.size:
+            out[f"{name}_strain_p99_percent"] = 100 * float(np.percentile(np.abs(strain), 99))
     return out
+
+
+def _depths(person: Person, frames: Float[np.ndarray, "T V 3"]) -> dict[str, Float[np.ndarray, "T _"]]:
+    """Return how deep the garments' vertices lie in the body, metres, 0 outside."""
+    count, own = person.body.vertex_count, {k: person.vertex_part == PART_NAMES.index(k) for k in _GARMENTS}
+    found: dict[str, list[np.ndarray]] = {name: [] for name in _GARMENTS}
+    for vertices in frames:
+        body = SignedDistanceField(TriangleMesh(vertices[:count], person.body.faces), solid=True)
+        for name in _GARMENTS:
+            found[name].append(np.maximum(-body.query(vertices[own[name]]).distance, 0.0))
+    return {name: np.stack(rows) for name, rows in found.items()}
 
 
 def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarray, "T E"]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -139,7 +140,21 @@ _LOOKS: tuple[dict[str, float], ...] = (
     {"browOuterUpLeft": 0.5, "browOuterUpRight": 0.5, "eyeWideLeft": 0.2, "eyeWideRight": 0.2},
     {"browDownLeft": 0.4, "browDownRight": 0.4, "eyeSquintLeft": 0.25, "eyeSquintRight": 0.25},
 )
-_JAW_DEGREES = 9.0  # at jawOpen = 1
+JAW_DEGREES = 9.0  # at jawOpen = 1
+
+
+class Motion(Protocol):
+    """What a person does, as a function of time.
+
+    Attributes:
+        feet_stay: the feet keep their place on the floor, and the hips move over them.
+    """
+
+    feet_stay: ClassVar[bool]
+
+    def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
+        """Return the parameters at `times` in seconds, transl zero."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +168,7 @@ class Performance:
         seed: of timing, sizes of gestures, words and blinks.
     """
 
+    feet_stay: ClassVar[bool] = False
     betas: Float[np.ndarray, " B"]
     expression_names: tuple[str, ...]
     seconds: float
@@ -164,7 +180,7 @@ class Performance:
         pose, expression = self._poses(t), np.clip(self._faces(t), 0.0, 1.0)
         pose = pose + self._sway(t)
         pose[:, SMPLX_JOINTS.index("jaw"), 0] += (
-            np.radians(_JAW_DEGREES) * expression[:, self.expression_names.index("jawOpen")]
+            np.radians(JAW_DEGREES) * expression[:, self.expression_names.index("jawOpen")]
         )
         return BodyParams.from_full_pose(
             pose,
@@ -213,15 +229,20 @@ class Performance:
         out = np.zeros((len(t), len(SMPLX_JOINTS), 3))
         sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
         for name, degrees in sizes.items():
-            out[:, SMPLX_JOINTS.index(name)] = np.radians(degrees) * _wander(t, rng, hertz=1.1)
-        gaze = np.radians(2.5) * _wander(t, rng, hertz=1.6)
+            out[:, SMPLX_JOINTS.index(name)] = np.radians(degrees) * wander(t, rng, hertz=1.1)
+        gaze = np.radians(2.5) * wander(t, rng, hertz=1.6)
         gaze[:, 2] = 0.0
         for name in ("left_eye_smplhf", "right_eye_smplhf"):
             out[:, SMPLX_JOINTS.index(name)] = gaze
         return out * (1.0 - np.exp(-((t / 0.3) ** 2)))[:, None, None]
 
 
-def _wander(t: Float[np.ndarray, " T"], rng: np.random.Generator, *, hertz: float) -> Float[np.ndarray, "T 3"]:
+def relaxed_pose() -> Float[np.ndarray, "55 3"]:
+    """Return the relaxed A-pose with which a performance starts, axis-angle in radians."""
+    return _pose(_RELAXED, _RELAXED_FINGERS)
+
+
+def wander(t: Float[np.ndarray, " T"], rng: np.random.Generator, *, hertz: float) -> Float[np.ndarray, "T 3"]:
     """Return smooth curves of about unit size: a few sines an axis."""
     frequency = hertz * rng.uniform(0.4, 1.6, size=(4, 3))
     phase = rng.uniform(0, 2 * np.pi, size=(4, 3))

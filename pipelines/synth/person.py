@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
+from pipelines.synth.outfits import Clothes
 from smplxpp.body import BodyModel
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -34,6 +35,7 @@ class Person:
         betas: shape of the body.
         body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
         face: landmarks on the T-pose, for the colours.
+        clothes: what the part "lower" is.
     """
 
     tpose: TriangleMesh
@@ -44,6 +46,7 @@ class Person:
     betas: Float[np.ndarray, " 20"]
     body: BodyModel
     face: textures.FaceMarks
+    clothes: Clothes = "skirt"
 
     def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
@@ -70,7 +73,10 @@ class Person:
             elif name == "upper":
                 out[own] = textures.shirt_colors(points[own], joint["left_shoulder"])
             elif name == "lower":
-                out[own] = textures.skirt_colors(points[own], joint["pelvis"][2])
+                if self.clothes == "skirt":
+                    out[own] = textures.skirt_colors(points[own], joint["pelvis"][2])
+                else:
+                    out[own] = textures.trouser_colors(points[own], joint["left_hip"], joint["left_ankle"])
             elif name == "shoes":
                 out[own] = textures.shoe_colors(points[own], self.tpose.vertices[:, 1].min())
             else:

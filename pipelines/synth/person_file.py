@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipelines.synth.outfits import Clothes, with_trousers
 from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
@@ -17,8 +18,17 @@ from smplxpp.core.mesh import TriangleMesh
 _NEEDED = ("v_tpose", "faces", "face_part", "vertex_part", "vertex_label", "weights", "betas", "part_names")
 
 
-def load_person(topology_file: Path) -> Person:
-    """Read `geometry/topology.npz` of the fixture.
+def load_person(topology_file: Path, clothes: Clothes = "skirt") -> Person:
+    """Read `geometry/topology.npz` of the fixture, and dress her.
+
+    Raises:
+        InputError: no such file, keys missing, or other parts than the fixture person's.
+    """
+    return person_of(read_layers(topology_file, clothes), clothes)
+
+
+def read_layers(topology_file: Path, clothes: Clothes = "skirt") -> dict[str, np.ndarray]:
+    """Read the arrays of `geometry/topology.npz`, with the clothes that she wears.
 
     Raises:
         InputError: no such file, keys missing, or other parts than the fixture person's.
@@ -30,13 +40,18 @@ def load_person(topology_file: Path) -> Person:
             received=str(topology_file),
             remedy="run in a checkout, or name the folder with --person",
         )
-    arrays = read_arrays(topology_file, subject="person", keys=_NEEDED)
+    arrays = read_arrays(topology_file, subject="person")
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
         raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(arrays))
     parts = tuple(arrays["part_names"].tolist())
     if parts != PART_NAMES:
         raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))
+    return arrays if clothes == "skirt" else with_trousers(arrays, load_body())
+
+
+def person_of(arrays: dict[str, np.ndarray], clothes: Clothes = "skirt") -> Person:
+    """Make the person of the arrays of `read_layers`."""
     return Person(
         tpose=TriangleMesh(arrays["v_tpose"], arrays["faces"]),
         weights=arrays["weights"].astype(np.float64),
@@ -46,6 +61,7 @@ def load_person(topology_file: Path) -> Person:
         betas=arrays["betas"].astype(np.float64),
         body=load_body(),
         face=face_marks(face_landmarks()),
+        clothes=clothes,
     )
 
 

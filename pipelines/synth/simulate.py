@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from pipelines.synth.cloth_model import Fabric, build_cloth
 from pipelines.synth.cloth_solver import ClothSolver, SolverConfig, Tick
 from pipelines.synth.contact import body_contacts, sheet_contacts
-from pipelines.synth.motion import Performance
+from pipelines.synth.motion import Motion
 from pipelines.synth.noise import ramp
 from pipelines.synth.person import PART_NAMES, Person
 from smplxpp.core.mesh import TriangleMesh
@@ -64,7 +64,7 @@ class Take:
 
 def simulate(
     person: Person,
-    performance: Performance,
+    performance: Motion,
     frames: int,
     config: SimulationConfig,
     progress: Callable[[float], None] = lambda share: None,
@@ -95,7 +95,8 @@ def attachment(person: Person) -> Float[np.ndarray, " V"]:
     """Return how much each vertex follows the body: 1 exactly, 0 where it is free.
 
     Clothes hold on where they are worn tight and something carries them: the skirt at the waist, the shirt on the
-    shoulders and the upper sleeves. Tight is told by the distance to the skin in the T-pose.
+    shoulders and the upper sleeves. Tight is told by the distance to the skin in the T-pose; trousers are
+    tight all over.
     """
     vertices, part = person.tpose.vertices, person.vertex_part
     body = TriangleMesh(vertices[: person.body.vertex_count], person.body.faces)
@@ -116,6 +117,8 @@ def attachment(person: Person) -> Float[np.ndarray, " V"]:
     )
     # The waistband is tight by itself.
     band = (part == LOWER) & (y > waist - 0.03)
+    if person.clothes == "trousers":
+        band = part == LOWER
     out[cloth] = np.where(band, 1.0, tight * carried)[cloth]
     out[out > 0.6] = 1.0
     return out
@@ -138,6 +141,15 @@ class _Garment:
         model = build_cloth(rest, hold[self.vertices], config.fabric)
         self.solver = ClothSolver(model, rest.vertices, replace(config.solver, substeps=substeps))
         self.free = np.flatnonzero(~model.fixed)
+
+    def advance(self, tick: Tick, *, damped: bool) -> None:
+        """Go on by a tick; what is tight all over goes where the body takes it."""
+        if not len(self.free):
+            self.solver.position = tick.places[1]
+            return
+        if damped:
+            self.solver.velocity *= 0.7
+        self.solver.advance(tick)
 
     @property
     def mesh(self) -> TriangleMesh:
@@ -183,11 +195,13 @@ class HairLag:
 class _Stage:
     """The moving things at one instant."""
 
-    def __init__(self, person: Person, performance: Performance, config: SimulationConfig) -> None:
+    def __init__(self, person: Person, performance: Motion, config: SimulationConfig) -> None:
         self.person, self.performance, self.config = person, performance, config
         self.hair = np.flatnonzero(person.vertex_part == HAIR)
         self._skin_faces = _contact_faces(person)
         self._head = person.body.joint_names.index("head")
+        self._ankles = [person.body.joint_names.index(name) for name in ("left_ankle", "right_ankle")]
+        self._planted: Float[np.ndarray, " 3"] | None = None
         _, layers, transforms = self.standing(np.zeros(1))
         self._layers = layers[0]
         self._pivot = self._head_joint(transforms[0])
@@ -208,7 +222,23 @@ class _Stage:
         layers[..., 1] += up[:, None]
         transforms = posed_from_rest.copy()
         transforms[:, :, 1, 3] += up[:, None]
-        return replace(params, transl=np.stack([0 * up, up, 0 * up], axis=1)), layers, transforms
+        transl = np.stack([0 * up, up, 0 * up], axis=1)
+        if self.performance.feet_stay:
+            aside = self._aside(transforms)
+            transl += aside
+            layers += aside[:, None]
+            transforms[:, :, :3, 3] += aside[:, None]
+        return replace(params, transl=transl), layers, transforms
+
+    def _aside(self, transforms: Float[np.ndarray, "T 55 4 4"]) -> Float[np.ndarray, "T 3"]:
+        """Return the level way that keeps the middle between the ankles where it was at first."""
+        body = self.person.body
+        rest = body.joint_regressor[self._ankles] @ self.person.tpose.vertices[: body.vertex_count]
+        of_ankles = transforms[:, self._ankles]
+        middle = (np.einsum("tkij,kj->tki", of_ankles[..., :3, :3], rest) + of_ankles[..., :3, 3]).mean(axis=1)
+        if self._planted is None:
+            self._planted = middle[0]
+        return np.round((self._planted - middle) * [1.0, 0.0, 1.0], 5)
 
     def advance(self, time: float, seconds: float, *, damped: bool = False) -> None:
         """Go on to `time`, which is `seconds` later: the skirt on the body, then the shirt on both.
@@ -221,14 +251,15 @@ class _Stage:
         skin_before, skin_ends = TriangleMesh(before[:count], self._skin_faces), (before[:count], after[:count])
         skirt_before = self.skirt.mesh
         for garment in (self.skirt, self.shirt):
-            touching = body_contacts(skin_before, garment.mesh, garment.free, margin=self.config.skin_margin)
-            contacts = [(touching, skin_ends)]
+            contacts = []
+            if len(garment.free):
+                touching = body_contacts(skin_before, garment.mesh, garment.free, margin=self.config.skin_margin)
+                contacts.append((touching, skin_ends))
             if garment is self.shirt:
                 over = sheet_contacts(skirt_before, garment.mesh, garment.free, margin=self.config.sheet_margin)
                 contacts.insert(0, (over, (skirt_before.vertices, self.skirt.solver.position)))
-            if damped:
-                garment.solver.velocity *= 0.7
-            garment.solver.advance(Tick(seconds, (before[garment.vertices], after[garment.vertices]), contacts))
+            places = (before[garment.vertices], after[garment.vertices])
+            garment.advance(Tick(seconds, places, contacts), damped=damped)
         self.lag.advance(transforms[0, self._head, :3, :3], seconds)
         self._pivot = self._head_joint(transforms[0])
         self._layers = after

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
@@ -66,7 +66,7 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray,
     return total * (4.0 / config.directions)
 
 
-def bounced(light: Float64[np.ndarray, " P"], albedo: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 3"]:
+def bounced(light: Float[np.ndarray, " P"], albedo: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
     """Return the colour of surfaces of linear `albedo` in `light`, with light that bounces among them.
 
     What is not open sees surfaces of the same albedo and the same light: `E = a + (1 - a) albedo E`, so

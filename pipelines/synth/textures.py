@@ -15,6 +15,7 @@ SCLERA, IRIS, IRIS_LIGHT, PUPIL = (232, 227, 222), (72, 98, 84), (112, 134, 110)
 HAIR, HAIR_LIGHT = (62, 38, 24), (112, 72, 44)
 SHOE, SOLE = (124, 74, 46), (232, 226, 214)
 SHIRT, STRIPE = (240, 236, 226), (44, 62, 110)
+DENIM, WORN, SEAM = (52, 74, 108), (104, 128, 158), (198, 148, 88)
 PLAID = ((150, 34, 44), (28, 60, 66), (236, 204, 120))
 
 Color = tuple[int, int, int]
@@ -55,6 +56,26 @@ def skirt_colors(points: Float[np.ndarray, "N 3"], centre_z: float) -> Float[np.
     colors = colors + 0.8 * line[:, None] * (np.array(PLAID[2]) - colors)
     # Wool: threads along and across, of uneven strength.
     return colors * (1.0 + 0.09 * _weave(points, seed=12))[:, None]
+
+
+def trouser_colors(
+    points: Float[np.ndarray, "N 3"], hip: Float[np.ndarray, " 3"], ankle: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """Paint denim: worn on thighs and knees, with a seam along the outside of each leg and two rings at each knee.
+
+    `hip` and `ankle` are joints of the left leg.
+    """
+    x, y, z = points.T
+    along = np.clip((hip[1] - y) / (hip[1] - ankle[1]), 0.0, 1.0)
+    # From the leg's axis: to the front, and to the outside.
+    front, outside = z - (hip[2] + along * (ankle[2] - hip[2])), np.abs(x) - (hip[0] + along * (ankle[0] - hip[0]))
+    patches = smooth_noise(points, scale=(0.03, 0.06, 0.03), seed=13)
+    worn = ramp(front, 0.0, 0.08) * np.exp(-(((along - 0.3) / 0.25) ** 2))
+    colors = mix(DENIM, WORN, np.clip(0.8 * worn + 0.12 * patches, 0, 1))
+    side = ramp(np.abs(front + 0.01), 0.006, 0.003) * ramp(outside, 0.02, 0.035)
+    knee = band(y - 0.5 * (hip[1] + ankle[1]), period=0.05, width=0.005) * ramp(np.abs(along - 0.5), 0.06, 0.04)
+    colors = colors + (0.8 * np.maximum(side, knee))[:, None] * (np.array(SEAM) - colors)
+    return colors * (1.0 + 0.08 * _weave(points, seed=14))[:, None]
 
 
 def hair_colors(points: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:

@@ -6,6 +6,7 @@ What is written follows from the capture's files and the seed alone.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float
 from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimated_labels
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
+from smplxpp.capture.files import FileSeries
 from smplxpp.capture.images import read_labels
 from smplxpp.capture.keypoints import moved_keypoints
 from smplxpp.capture.writers.images import write_gray_png
@@ -114,13 +116,18 @@ def write_estimated_labels(
         series = capture.recording.series("label", name)
         if series is None:
             continue
-        for frame in series.numbers.tolist():
+
+        def one(frame: int, k: int = k, name: str = name, series: FileSeries = series) -> tuple[int, int]:
             path = series.required(frame)
             exact = np.asarray(read_labels(path))
             estimated = estimated_labels(exact, seed=[seed, _LABEL_SEED, k, frame], background=background)
             write_gray_png(root / ESTIMATED_LABELS / name / f"{path.stem}.png", estimated)
             foreground = ~np.isin(exact, background)
-            wrong, seen = wrong + int((estimated != exact)[foreground].sum()), seen + int(foreground.sum())
+            return int((estimated != exact)[foreground].sum()), int(foreground.sum())
+
+        with ThreadPoolExecutor(2) as pool:
+            counts = list(pool.map(one, series.numbers.tolist()))
+        wrong, seen = wrong + sum(w for w, _ in counts), seen + sum(s for _, s in counts)
         progress((k + 1) / len(capture.cameras))
     return wrong / seen if seen else 0.0
 

@@ -157,16 +157,19 @@ def estimated_labels(
     shift = np.stack([_smooth(rng, labels.shape, _WANDER * height) for _ in range(2)])
     blobs = _smooth(rng, labels.shape, max(_BLOB * height, 1.0))
     shift = shift * np.where(blobs > np.quantile(blobs, 1.0 - _BLOB_AREA), _BLOB_REACH, 1.0)
-    grid = np.indices(labels.shape)
-    limit = np.array(labels.shape)[:, None, None] - 1
-    best, best_error = labels, np.inf
+    # Only the person's pixels change.
+    pixels, shift, exact = np.stack(np.nonzero(foreground)), shift[:, foreground], labels[foreground]
+    limit = np.array(labels.shape)[:, None] - 1
+    best, best_error = exact, np.inf
     for amplitude in np.geomspace(0.25, max(_FARTHEST * height, 0.5), _AMPLITUDES):
-        y, x = np.clip(np.round(grid + amplitude * shift).astype(np.int64), 0, limit)
-        moved = np.where(foreground, full[y, x], labels)
-        error = abs(float((moved != labels)[foreground].mean()) - share)
+        y, x = np.clip(np.round(pixels + amplitude * shift).astype(np.int64), 0, limit)
+        moved = full[y, x]
+        error = abs(float((moved != exact).mean()) - share)
         if error < best_error:
             best, best_error = moved, error
-    return best
+    out = labels.copy()
+    out[foreground] = best
+    return out
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, ...], scale: float) -> Float[np.ndarray, "H W"]:

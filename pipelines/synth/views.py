@@ -8,6 +8,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 
+from pipelines.synth.atlas import Atlas
 from pipelines.synth.person import PART_NAMES, Person
 from pipelines.synth.soft_light import bounced
 from smplxpp.core.camera import Camera
@@ -66,8 +67,13 @@ def hidden_faces(person: Person, vertices: Float[np.ndarray, "V 3"]) -> Bool[np.
     return hidden
 
 
-def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersampling: int) -> RenderedView:
-    """Average colours over `supersampling`^2 samples a pixel in linear light; labels are those at its centre."""
+def render_view(
+    person: Person, frame: LitFrame, camera: Camera, *, supersampling: int, atlas: Atlas | None = None
+) -> RenderedView:
+    """Average colours over `supersampling`^2 samples a pixel in linear light; labels are those at its centre.
+
+    Colours are looked up in `atlas`, or computed at every sample.
+    """
     s = supersampling
     K = camera.K.copy()
     K[:2] *= s
@@ -75,7 +81,7 @@ def render_view(person: Person, frame: LitFrame, camera: Camera, *, supersamplin
     maps = rasterize_mesh(frame.mesh, fine)
     hit = np.flatnonzero(maps.face_id.ravel() >= 0)
     color = np.zeros((fine.height * fine.width, 3), np.float32)
-    color[hit] = _shaded(person, frame, fine, maps, hit)
+    color[hit] = _shaded(person, frame, fine, maps, hit, atlas)
     count = _pooled(maps.mask[..., None].astype(np.float32), s)
     linear = _pooled(color.reshape(fine.height, fine.width, 3), s) / np.maximum(count, 1)
     alpha = count[..., 0] / s**2
@@ -122,9 +128,16 @@ def _surface(
 
 
 def _shaded(
-    person: Person, frame: LitFrame, camera: Camera, maps: MeshMaps, pixels: Int[np.ndarray, " P"]
-) -> Float64[np.ndarray, "P 3"]:
+    person: Person,
+    frame: LitFrame,
+    camera: Camera,
+    maps: MeshMaps,
+    pixels: Int[np.ndarray, " P"],
+    atlas: Atlas | None,
+) -> Float32[np.ndarray, "P 3"] | Float64[np.ndarray, "P 3"]:
     """Return the linear colours at flat pixel indices."""
+    if atlas is not None:
+        return _looked_up(frame, camera, maps, pixels, atlas)
     corners, bary, part, label = _surface(person, frame, maps, pixels)
     # Single precision: textures are sums of many sines.
     canonical = np.einsum("pk,pkx->px", bary, person.tpose.vertices[corners]).astype(np.float32)
@@ -135,6 +148,20 @@ def _shaded(
         np.einsum("pk,pk->p", bary, frame.light[1][corners]),
         np.einsum("pk,pk->p", bary, frame.light[0][corners]),
     )
+    return bounced(light, albedo)
+
+
+def _looked_up(
+    frame: LitFrame, camera: Camera, maps: MeshMaps, pixels: Int[np.ndarray, " P"], atlas: Atlas
+) -> Float32[np.ndarray, "P 3"]:
+    """Return the linear colours at flat pixel indices, in single precision, from an atlas."""
+    shown = maps.face_id.ravel().take(pixels)
+    bary = maps.barycentric.reshape(-1, 3).take(pixels, axis=0)
+    albedo = linear_from_srgb(atlas.colors(frame.face.take(shown), bary))
+    # The side that the camera sees is one and the same all over a face.
+    back = _back_faces(frame.mesh, camera)
+    corner_light = np.where(back[:, None], frame.light[1][frame.mesh.faces], frame.light[0][frame.mesh.faces])
+    light = np.einsum("pk,pk->p", bary, corner_light.astype(np.float32).take(shown, axis=0))
     return bounced(light, albedo)
 
 
