@@ -16,60 +16,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
+from pipelines.synth.gestures import GESTURES, arms_pose, rounds
 from pipelines.synth.motion import JAW_DEGREES, relaxed_pose, wander
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_positive
 
-
-@dataclass(frozen=True)
-class _Arm:
-    """A shape of the left arm in degrees, from the T-pose; the right one is its mirror image.
-
-    Attributes:
-        down: how far the upper arm is lowered.
-        forward: how far it then swings to the front.
-        inward: turn about its own axis: a bent forearm goes before the body, below 0 to the outside.
-        bend: of the elbow.
-        palm: turn of the hand about the forearm.
-        fingers: degrees a joint bends, of the index finger and of the others.
-    """
-
-    down: float
-    forward: float
-    inward: float
-    bend: float
-    palm: float = 0.0
-    fingers: tuple[float, float] = (12.0, 16.0)
-
-
-_ARMS = {
-    "hanging": _Arm(66, 3, 0, 14),
-    "belly": _Arm(68, 12, 20, 76, 10, (16.0, 22.0)),
-    "front": _Arm(68, 16, 4, 80, 20, (6.0, 8.0)),
-    "offered": _Arm(62, 12, -22, 68, -60, (4.0, 6.0)),
-    "raised": _Arm(60, 24, 6, 108, -10, (8.0, 14.0)),
-    "chest": _Arm(60, 25, 38, 110, 0, (10.0, 12.0)),
-    "low": _Arm(62, 12, 2, 44, 15, (14.0, 20.0)),
-    "wide": _Arm(46, 14, -10, 54, -35, (3.0, 4.0)),
-    "counting": _Arm(60, 26, 14, 100, 30, (2.0, 48.0)),
-}
-# The vocabulary: the left arm's shape and the right one's.
-_GESTURES = (
-    ("hanging", "hanging"),
-    ("belly", "belly"),
-    ("front", "front"),
-    ("offered", "offered"),
-    ("wide", "wide"),
-    ("raised", "low"),
-    ("low", "raised"),
-    ("belly", "offered"),
-    ("front", "belly"),
-    ("counting", "belly"),
-    ("hanging", "chest"),
-    ("wide", "hanging"),
-)
 # Shapes of the mouth.
 _VISEMES: tuple[dict[str, float], ...] = (
     {"jawOpen": 0.34, "mouthLowerDownLeft": 0.25, "mouthLowerDownRight": 0.25},
@@ -158,17 +110,17 @@ class Talking:
     def _order(self) -> list[int]:
         rng = np.random.default_rng([self.seed, 0])
         shortest = _MOVE[0] + _HOLD[0]
-        return _rounds(rng, len(_GESTURES), int(self.seconds / shortest) + 2)
+        return rounds(rng, len(GESTURES), int(self.seconds / shortest) + 2)
 
     @cached_property
     def _arms(self) -> _Track:
         """Poses (T, 55, 3) in radians: the relaxed pose with the arms and hands of the gestures."""
         rng = np.random.default_rng([self.seed, 1])
         keys, moves, time = [relaxed_pose()], [], 0.0
-        moving = (_arms_pose("hanging", "hanging", size=1.0) != 0).any(axis=1)[:, None]
+        moving = (arms_pose("hanging", "hanging", size=1.0) != 0).any(axis=1)[:, None]
         for number in self._order:
             # Of another size each time, and each joint a little elsewhere.
-            target = _arms_pose(*_GESTURES[number], size=rng.uniform(*_SIZE))
+            target = arms_pose(*GESTURES[number], size=rng.uniform(*_SIZE))
             target += moving * np.radians(2.0) * np.clip(rng.normal(size=target.shape), -2, 2)
             way = np.degrees(np.linalg.norm(target - keys[-1], axis=1).max())
             move = max(rng.uniform(*_MOVE), way / _PACE * rng.uniform(0.95, 1.15))
@@ -233,7 +185,7 @@ class Talking:
             end = time + rng.uniform(*_PHRASE)
             while time < end:
                 time += rng.uniform(*_SYLLABLE)
-                order = order or _rounds(rng, len(_VISEMES), len(_VISEMES))
+                order = order or rounds(rng, len(_VISEMES), len(_VISEMES))
                 times.append(time)
                 keys.append(self._expression(_VISEMES[order.pop()], rng.uniform(0.75, 1.1)))
             time += rng.uniform(*_SYLLABLE)
@@ -248,7 +200,7 @@ class Talking:
         rng = np.random.default_rng([self.seed, 6])
         keys, moves, time = [np.zeros(len(self.expression_names))], [], 0.0
         while time < self.seconds:
-            for number in _rounds(rng, len(_LOOKS), len(_LOOKS)):
+            for number in rounds(rng, len(_LOOKS), len(_LOOKS)):
                 start = time + rng.uniform(0.6, 1.8)
                 time = start + rng.uniform(0.25, 0.6)
                 keys.append(self._expression(_LOOKS[number], rng.uniform(0.6, 1.1)))
@@ -287,48 +239,6 @@ class _Track:
         u = np.clip((t - start[k]) / (end[k] - start[k]), 0.0, 1.0)
         s = (u**3 * (10.0 - 15.0 * u + 6.0 * u**2)).reshape(-1, *[1] * (self.keys.ndim - 1))
         return (1.0 - s) * self.keys[k] + s * self.keys[k + 1]
-
-
-def _rounds(rng: np.random.Generator, count: int, least: int) -> list[int]:
-    """Shuffled rounds of 0 .. count - 1, at least `least` numbers, none twice in succession."""
-    out: list[int] = []
-    while len(out) < least:
-        some = rng.permutation(count).tolist()
-        if out and some[0] == out[-1]:
-            some = some[1:] + some[:1]
-        out += some
-    return out
-
-
-def _arms_pose(left: str, right: str, *, size: float) -> Float[np.ndarray, "55 3"]:
-    """The relaxed pose with arms of the named shapes; of another `size` they go as much farther from hanging."""
-    pose = relaxed_pose()
-    for side, name in (("left", left), ("right", right)):
-        for joint, turn in _arm_turns(_ARMS[name], _ARMS["hanging"], size).items():
-            pose[SMPLX_JOINTS.index(f"{side}_{joint}")] = turn if side == "left" else turn * [1.0, -1.0, -1.0]
-    return pose
-
-
-def _arm_turns(arm: _Arm, hanging: _Arm, size: float) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Axis-angle turns of the left arm's joints, radians, by name without the side."""
-
-    def sized(name: str) -> float:
-        at_rest = float(getattr(hanging, name))
-        return float(np.radians(at_rest + size * (getattr(arm, name) - at_rest)))
-
-    def turn(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
-        return matrix_from_rotvec(angle * np.eye(3)[axis])
-
-    shoulder = turn(0, -sized("forward")) @ turn(2, -sized("down")) @ turn(0, sized("inward"))
-    out = {
-        "shoulder": rotvec_from_matrix(shoulder),
-        "elbow": np.array([0.0, -sized("bend"), 0.0]),
-        "wrist": np.array([sized("palm"), 0.0, 0.0]),
-    }
-    for finger in ("index", "middle", "ring", "pinky"):
-        bend = np.radians(arm.fingers[0 if finger == "index" else 1])
-        out |= {f"{finger}{k}": np.array([0.0, 0.0, -bend]) for k in (1, 2, 3)}
-    return out
 
 
 def _stance(side: Float[np.ndarray, " T"], turn: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T 55 3"]:
