@@ -17,7 +17,7 @@ from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.capture_readme import capture_readme
 from pipelines.synth.checks import scan_checks, take_checks
 from pipelines.synth.motions import motion_kind
-from pipelines.synth.outfits import CLOTHES, Clothes
+from pipelines.synth.outfits import CLOTHES
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
 from pipelines.synth.person_file import person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
@@ -78,7 +78,7 @@ class SynthConfig:
     normals_step: int = 1
     scan_faces: int = 80_000
     motion: str = "turning"
-    clothes: Clothes = "skirt"
+    clothes: str = "skirt"
     aspect: float = 0.8
     texel: float = 0.0
     simulation: SimulationConfig = field(default_factory=SimulationConfig)

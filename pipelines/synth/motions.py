@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pipelines.synth.motion import Motion, Performance
-from pipelines.synth.outfits import Clothes
 from pipelines.synth.talking import Talking
 from smplxpp.core.validation import require_choice
 
@@ -25,7 +24,7 @@ class MotionKind:
     """
 
     make: Callable[..., Motion]
-    clothes: Clothes = "skirt"
+    clothes: str = "skirt"
     cameras: int = 12
     aspect: float = 0.8
     truth_step: int = 1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from jaxtyping import Float
 
@@ -11,8 +9,7 @@ from pipelines.synth.cloth_mesh import ClothMesh, clip, loop_subdivide, push_out
 from smplxpp.body import BodyModel
 from smplxpp.core.mesh import TriangleMesh
 
-Clothes = Literal["skirt", "trousers"]
-CLOTHES: tuple[Clothes, ...] = ("skirt", "trousers")
+CLOTHES = ("skirt", "trousers")
 
 # Where trousers end: metres above the pelvis joint and above the ankles'.
 _WAIST, _ANKLE = 0.012, 0.035

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
-from pipelines.synth.outfits import Clothes
 from smplxpp.body import BodyModel
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -46,7 +45,7 @@ class Person:
     betas: Float[np.ndarray, " 20"]
     body: BodyModel
     face: textures.FaceMarks
-    clothes: Clothes = "skirt"
+    clothes: str = "skirt"
 
     def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""

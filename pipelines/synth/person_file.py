@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.outfits import Clothes, with_trousers
+from pipelines.synth.outfits import with_trousers
 from pipelines.synth.person import PART_NAMES, PERSON_BETAS, Person, face_marks
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
@@ -18,7 +18,7 @@ from smplxpp.core.mesh import TriangleMesh
 _NEEDED = ("v_tpose", "faces", "face_part", "vertex_part", "vertex_label", "weights", "betas", "part_names")
 
 
-def load_person(topology_file: Path, clothes: Clothes = "skirt") -> Person:
+def load_person(topology_file: Path, clothes: str = "skirt") -> Person:
     """Read `geometry/topology.npz` of the fixture, and dress her.
 
     Raises:
@@ -27,7 +27,7 @@ def load_person(topology_file: Path, clothes: Clothes = "skirt") -> Person:
     return person_of(read_layers(topology_file, clothes), clothes)
 
 
-def read_layers(topology_file: Path, clothes: Clothes = "skirt") -> dict[str, np.ndarray]:
+def read_layers(topology_file: Path, clothes: str = "skirt") -> dict[str, np.ndarray]:
     """Read the arrays of `geometry/topology.npz`, with the clothes that she wears.
 
     Raises:
@@ -50,7 +50,7 @@ def read_layers(topology_file: Path, clothes: Clothes = "skirt") -> dict[str, np
     return arrays if clothes == "skirt" else with_trousers(arrays, load_body())
 
 
-def person_of(arrays: dict[str, np.ndarray], clothes: Clothes = "skirt") -> Person:
+def person_of(arrays: dict[str, np.ndarray], clothes: str = "skirt") -> Person:
     """Make the person of the arrays of `read_layers`."""
     return Person(
         tpose=TriangleMesh(arrays["v_tpose"], arrays["faces"]),
