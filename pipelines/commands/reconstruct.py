@@ -43,7 +43,8 @@ class ReconstructCommand:
     cell: OptionalFloat = None
     """Size of the grid's cells in mm; by default two pixels, within 3 to 6 mm."""
     dissent: int = 0
-    """Views that may say of a point that it is outside: 1 for masks with holes. The surface grows with it."""
+    """Views that may say of a point that it is outside: the surface grows by a centimetre with each, which is more than
+    holes in masks cost."""
     hull_only: bool = False
     """Take the silhouettes' surface and do not compare the photographs."""
     mesh: OptionalPath = None

@@ -35,6 +35,9 @@ class Register:
     """Folder of a capture in any layout of docs/captures.md: cameras with keypoints, masks, label maps; scans."""
     scan: OptionalPath = None
     """Scan of the frame --frame, in the place of the capture's, or alone with --params."""
+    scans: OptionalPath = None
+    """Folder of scans, scan_FFFFFF.ply a frame, in the place of the capture's own: what `smplxpp reconstruct --frame
+    all` wrote."""
     params: OptionalPath = None
     """Body parameters to start from, in the place of the capture's own."""
     keypoints: OptionalPath = None
@@ -127,6 +130,9 @@ class Register:
         for name in ("keypoints", "masks"):
             if getattr(self, name) is not None and self.capture is None:
                 raise InputError(f"option {name}", expected="a --capture whose cameras they are of", received="none")
+        if self.scans is not None and (self.capture is None or self.scan is not None):
+            received = "none" if self.capture is None else "--scan beside it"
+            raise InputError("option scans", expected="a --capture whose frames they are of", received=received)
         if self.initial == "none" and self.params is not None:
             raise InputError("option initial", expected="none without --params", received="both")
         if self.frames is not None and self.capture is None:
@@ -151,6 +157,7 @@ class Register:
             seed=self.seed,
             keypoints=self.keypoints,
             masks=self.masks,
+            scans=self.scans,
         )
 
     def _report(self, record: StageRecord) -> Path:

@@ -15,7 +15,7 @@ from pipelines.stages.located import LOCATED_FILES, read_located
 from pipelines.stages.observed_scans import observed_scans
 from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import BodyModel, load_params
-from smplxpp.capture import Capture, find_scans, open_capture
+from smplxpp.capture import Capture, find_scans, open_capture, scans_in
 from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
@@ -100,7 +100,7 @@ def observe(
         return _observe_scan(inputs, body, landmarks)
     capture = open_inputs(inputs, body)
     cameras = _training_cameras(capture, inputs)
-    files = find_scans(inputs.capture) if inputs.scan is None else {inputs.frame: inputs.scan}
+    files = _scan_files(inputs.capture, inputs)
     frames = _frames(capture, files, inputs)
     # A held-out frame's scan shows what held-out cameras saw.
     held_out = set(capture.splits.novel_pose_frames)
@@ -240,6 +240,24 @@ def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ..
     if capture.cameras and not cameras:
         raise InputError("cameras", expected="at least one that is not held out", received="all held out")
     return cameras
+
+
+def _scan_files(capture: Path, inputs: RegisterInputs) -> dict[int, Path]:
+    """Scans by frame: the one that is named, those of the folder that is named, or the capture's own.
+
+    Raises:
+        InputError: a folder without scans.
+    """
+    if inputs.scan is not None:
+        return {inputs.frame: inputs.scan}
+    if inputs.scans is None:
+        return find_scans(capture)
+    found = scans_in(inputs.scans)
+    if not found:
+        raise InputError(
+            "option scans", expected="a folder of scan_FFFFFF.ply (or .obj, .glb)", received=f"none in {inputs.scans}"
+        )
+    return found
 
 
 def _frames(capture: Capture, scans: dict[int, Path], inputs: RegisterInputs) -> tuple[int, ...]:

@@ -26,7 +26,8 @@ class RegisterInputs:
 
     Attributes:
         capture: folder of any known layout.
-        keypoints, masks: folders of the cameras' keypoints and masks, in the place of the capture's own.
+        keypoints, masks: folders of the cameras' keypoints and masks, in the place of the capture's own. scans: folder
+            of a scan a frame, likewise.
         params: the fit to start from, in the place of the capture's own.
         start: False: no fit is looked at, keypoints are where it begins.
         protocol: name of the capture's files that are read, None without one.
@@ -55,6 +56,7 @@ class RegisterInputs:
     seed: int = 0
     keypoints: Path | None = None
     masks: Path | None = None
+    scans: Path | None = None
 
 
 def named_params(capture: Path | None, params: Path | None) -> Path | None:
@@ -62,7 +64,7 @@ def named_params(capture: Path | None, params: Path | None) -> Path | None:
     return stacked_params(capture, params) if params is not None and capture is not None else params
 
 
-_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks")
+_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans")
 
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:

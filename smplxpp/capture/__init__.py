@@ -5,7 +5,7 @@ from smplxpp.capture.capture import Capture
 from smplxpp.capture.matting import MattingConfig, MattingModel, write_mattes
 from smplxpp.capture.problems import find_problems
 from smplxpp.capture.recording import Problem
-from smplxpp.capture.reference import ReferenceFrame, find_reference, find_scans
+from smplxpp.capture.reference import ReferenceFrame, find_reference, find_scans, scans_in
 from smplxpp.capture.registry import FORMATS, detect_format, open_capture
 from smplxpp.capture.splits import Splits
 
@@ -23,5 +23,6 @@ __all__ = [
     "find_scans",
     "open_capture",
     "read_cameras",
+    "scans_in",
     "write_mattes",
 ]

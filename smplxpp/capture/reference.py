@@ -139,5 +139,10 @@ def _first(folder: Path, names: list[str]) -> Path | None:
 
 def find_scans(capture: str | Path) -> dict[int, Path]:
     """Find the scans of a capture folder of our simple layout, `scans/scan_FFFFFF.ply` (`.obj`, `.glb`), by frame."""
-    series = FileSeries.find(Path(capture) / "scans", r"scan_(?P<frame>\d{6})\.(ply|obj|glb)")
+    return scans_in(Path(capture) / "scans")
+
+
+def scans_in(folder: str | Path) -> dict[int, Path]:
+    """Find the scans `scan_FFFFFF.ply` (`.obj`, `.glb`) of a folder, by frame."""
+    series = FileSeries.find(Path(folder), r"scan_(?P<frame>\d{6})\.(ply|obj|glb)")
     return {int(frame): series.required(int(frame)) for frame in series.numbers}

@@ -41,7 +41,7 @@ class ReconstructConfig:
 
     Attributes:
         cell: of the grid that the surface is taken from; None: two pixels, within 3 to 6 mm.
-        dissent: views that may say of a point that it is outside, for masks with holes: the hull grows with it.
+        dissent: views that may say of a point that it is outside; the hull grows with it.
         refine: search along the normals; False: the hull alone.
         levels: of the search, from coarse to fine.
         smoothness: of displacements, against the views' agreement.

@@ -161,3 +161,29 @@ def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp
     assert load_register(tmp_path / "run") == inputs
     with pytest.raises(InputError, match="option keypoints"):
         Register(out=tmp_path, scan=FIXTURE / "scans/scan_000000.ply", keypoints=apart).inputs()
+
+
+def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
+    """Reconstructions of all frames are scans like any others; what is no folder of scans is refused."""
+    from pipelines.stages.observe import observe
+    from smplxpp.body import load_body
+
+    folder = tmp_path / "02_reconstruct"
+    folder.mkdir()
+    for frame in (0, 2):
+        shutil.copy(FIXTURE / "scans" / "scan_000000.ply", folder / f"scan_{frame:06d}.ply")
+    inputs = Register(out=tmp_path / "run", capture=FIXTURE, frames="0:4", scans=folder).inputs()
+    body = load_body()
+    seen = observe(inputs, body)
+    assert set(seen.observations.scans) == {0, 2} and "scan of frame 2" in seen.digests
+    (tmp_path / "run").mkdir()
+    save_register(tmp_path / "run", inputs)
+    assert load_register(tmp_path / "run") == inputs
+    for options, words in (
+        ({"capture": FIXTURE, "scan": folder / "scan_000000.ply"}, "--scan beside it"),
+        ({"scan": folder / "scan_000000.ply"}, "option scans"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Register(out=tmp_path, scans=folder, **options).inputs()
+    with pytest.raises(InputError, match="option scans"):
+        observe(Register(out=tmp_path, capture=FIXTURE, frames="0:4", scans=tmp_path / "run").inputs(), body)
