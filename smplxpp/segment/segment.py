@@ -18,6 +18,10 @@ from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weig
 _LOOKS_DOWN = -0.3
 """Height of a unit normal below which a face looks down; +Y is up."""
 _SURE_PRIOR = 0.6
+# Share of the area whose votes weigh as much as the prior's own word for what it labels.
+_OWN_WORD = 0.01
+# Share of the votes on what a prior labels alike, above which a label is one of several that it may mean.
+_ALIKE = 0.15
 # Share of the area without a vote from which the prior's doubts are those of the labels.
 _MUCH_LEFT = 0.05
 
@@ -91,7 +95,9 @@ def segment_scan(
     Args:
         votes: (M, L) of `vote_on_faces`. vertex_labels: (N,). face_labels: (M,). In our ids.
         colors: sRGB of the vertices, bytes or 0..1: borders then settle on edges of colour, too.
-        prior: of the same mesh (`label_by_body`): what holds where no vote fell or votes are few.
+        prior: of the same mesh (`label_by_body`): what holds where no vote fell or votes are few. What it means by a
+            label is what the votes call it where both speak: of a dress that views call a lower garment, the rest is
+            lower, too.
 
     Raises:
         InputError: none or several of the three, other lengths, unknown ids, or not a single label.
@@ -114,9 +120,11 @@ def segment_scan(
     if not votes.any():
         raise InputError("labels", expected="at least one labelled face", received="none")
 
+    likely = None
     if prior is not None:
         _check_prior(mesh, prior)
         votes = _votes_with_outer(votes, prior)
+        likely = _prior_as_voted(prior, votes, mesh.face_areas)
     lab = None if colors is None else face_colors(mesh, colors)
     total = votes.sum(axis=1)
     share = (votes + config.pseudo_votes) / (total + config.pseudo_votes * len(LABELS))[:, None]
@@ -124,10 +132,10 @@ def segment_scan(
     pairs, ends = face_adjacency(mesh.faces)
     weights = edge_weights(mesh, pairs, ends, config, lab=lab)
     # A label that nobody voted for anywhere cannot win, but for what the prior knows.
-    candidates = np.flatnonzero(votes.any(axis=0) | _known_to(prior))
+    candidates = np.flatnonzero(votes.any(axis=0) | _known_to(likely))
     unary = -np.log(share) * (trust * certainty)[:, None]
-    if prior is not None:
-        unary += (1.0 - (1.0 - config.prior_weight) * certainty)[:, None] * _prior_costs(prior)
+    if likely is not None:
+        unary += (1.0 - (1.0 - config.prior_weight) * certainty)[:, None] * -np.log(likely)
     below = (total == 0) & (mesh.face_normals[:, 1] < _LOOKS_DOWN)
     # Borders have about sqrt(faces) edges: so that a finer scan is cut in the same place.
     unary[below] += config.underside / np.sqrt(mesh.face_count) * (np.arange(len(LABELS)) != SKIN.id)
@@ -138,9 +146,8 @@ def segment_scan(
     cut = candidates[index]
     labels = absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config)
     confidence = _confidence(votes, labels, pairs, config)
-    if prior is not None:
-        agrees = np.where(labels == prior.face_labels, prior.confidence, 1.0 - prior.confidence)
-        confidence = np.where(total > 0, confidence, agrees)
+    if likely is not None:
+        confidence = np.where(total > 0, confidence, likely[np.arange(len(labels)), labels])
     return SegmentedScan(
         labels,
         confidence,
@@ -164,24 +171,34 @@ def _left_to_prior(mesh: TriangleMesh, votes: np.ndarray) -> float:
     return float(mesh.face_areas @ (votes == 0) / mesh.face_areas.sum())
 
 
-def _known_to(prior: SegmentedScan | None) -> Bool[np.ndarray, " L"]:
-    named = np.zeros(len(LABELS), dtype=bool)
-    if prior is not None:
-        named[prior.face_labels[prior.confidence > _SURE_PRIOR]] = True
-    return named
+def _known_to(likely: np.ndarray | None) -> Bool[np.ndarray, " L"]:
+    """Labels of which a prior is sure somewhere."""
+    return np.zeros(len(LABELS), dtype=bool) if likely is None else (likely > _SURE_PRIOR).any(axis=0)
 
 
-def _prior_costs(prior: SegmentedScan) -> Float64[np.ndarray, "M L"]:
-    """-log of a distribution that gives the label its confidence and all others equal parts of the rest."""
-    share = np.clip(prior.confidence, 1.0 / len(LABELS), 0.99)
-    out = np.repeat(-np.log((1.0 - share) / (len(LABELS) - 1))[:, None], len(LABELS), axis=1)
-    out[np.arange(len(share)), prior.face_labels] = -np.log(share)
-    return out
+def _prior_as_voted(
+    prior: SegmentedScan, votes: Float64[np.ndarray, "M L"], area: Float64[np.ndarray, " M"]
+) -> Float64[np.ndarray, "M L"]:
+    """P(label) of every face: the prior's confidence goes to what voted faces that it labels alike are called."""
+    own, rows = prior.face_labels, np.arange(len(area))
+    # A tie is no objection.
+    called = np.where(votes[rows, own] >= votes.max(axis=1), own, votes.argmax(axis=1))
+    voted = votes.any(axis=1)
+    meaning = _OWN_WORD * area.sum() * np.eye(len(LABELS))
+    np.add.at(meaning, (own[voted], called[voted]), area[voted])
+    meaning /= meaning.sum(axis=1, keepdims=True)
+    # What views call now one and now the other, the prior does not tell apart.
+    alike = meaning > _ALIKE
+    meaning = np.where(alike, (meaning * alike).sum(axis=1, keepdims=True) / alike.sum(axis=1, keepdims=True), meaning)
+    share = np.clip(prior.confidence, 1.0 / len(LABELS), 0.99)[:, None]
+    rest = (1.0 - share) / (len(LABELS) - 1)
+    return rest + (share - rest) * meaning[own]
 
 
 def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan) -> np.ndarray:
     """Where votes never name outer clothes, their set may not tell coats from shirts: the prior does."""
-    if votes[:, OUTER.id].any() or not _known_to(prior)[OUTER.id]:
+    sure = (prior.face_labels == OUTER.id) & (prior.confidence > _SURE_PRIOR)
+    if votes[:, OUTER.id].any() or not sure.any():
         return votes
     votes = votes.copy()
     votes[:, OUTER.id] = votes[:, UPPER.id]

@@ -229,6 +229,23 @@ def test_a_parser_without_coats_leaves_them_to_the_prior(ball):
     assert (segment_scan(ball, votes=votes).face_labels == UPPER.id).all()
 
 
+def test_a_prior_is_read_as_the_views_call_its_labels(ball):
+    """A dress that the prior calls upper and the views lower; a prior that calls two garments one tells nothing of them."""
+    dress = np.full(ball.face_count, UPPER.id)
+    seen = segment_scan(ball, face_labels=dress)
+    prior = SegmentedScan(dress, np.full(ball.face_count, 0.95), seen.seen, 0, 0.0, 0.0)
+    front, upper = ball.face_centers[:, 2] > 0, ball.face_centers[:, 1] > 0
+
+    def found(truth: np.ndarray, **given) -> np.ndarray:
+        votes = np.zeros((ball.face_count, 6))
+        votes[np.flatnonzero(front), truth[front]] = 3.0
+        return segment_scan(ball, votes=votes, **given).face_labels
+
+    assert (found(np.full(ball.face_count, LOWER.id), prior=prior) == LOWER.id).all()
+    two = np.where(upper, UPPER.id, LOWER.id)
+    assert (found(two, prior=prior) == found(two)).mean() > 0.98
+
+
 def test_borders_settle_on_edges_of_colour(ball):
     """Votes that wander about the true border; on a sphere no fold says where it is."""
     truth = halves(ball)
