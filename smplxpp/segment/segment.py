@@ -173,7 +173,9 @@ def _left_to_prior(mesh: TriangleMesh, votes: np.ndarray) -> float:
 
 def _known_to(likely: np.ndarray | None) -> Bool[np.ndarray, " L"]:
     """Labels of which a prior is sure somewhere."""
-    return np.zeros(len(LABELS), dtype=bool) if likely is None else (likely > _SURE_PRIOR).any(axis=0)
+    if likely is None:
+        return np.zeros(len(LABELS), dtype=bool)
+    return np.asarray((likely > _SURE_PRIOR).any(axis=0))
 
 
 def _prior_as_voted(

@@ -230,7 +230,7 @@ def test_a_parser_without_coats_leaves_them_to_the_prior(ball):
 
 
 def test_a_prior_is_read_as_the_views_call_its_labels(ball):
-    """A dress that the prior calls upper and the views lower; a prior that calls two garments one tells nothing of them."""
+    """A dress that the prior calls upper and the views lower; of two garments that it calls one it tells nothing."""
     dress = np.full(ball.face_count, UPPER.id)
     seen = segment_scan(ball, face_labels=dress)
     prior = SegmentedScan(dress, np.full(ball.face_count, 0.95), seen.seen, 0, 0.0, 0.0)
