@@ -1,6 +1,6 @@
 """How near a body found in a scan alone comes to the truth, and the labels that follow from it.
 
-    python -m benchmarks.scan_alone [--people 12] [--seed 0] [--variants "as it is" "3 mm noise"]
+    python -m benchmarks.scan_alone [--people 12] [--who NAME ...] [--seed 0] [--variants "as it is" "3 mm noise"]
 
 Scans are the fixture's, the captures' that are there, and procedural people (`benchmarks.people`); each is read as a
 file without parameters, labels, units and axis would be. The truth is looked at in measuring alone. Wrong facing: the
@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from benchmarks.machine import store_results
-from benchmarks.people import VARIANTS, PersonScan, captured, captured_names, people, variant
+from benchmarks.people import VARIANTS, PersonScan, captured, captured_names, people, person, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import convert_points, find_scan_frame
 from smplxpp.core.errors import InputError
@@ -35,6 +35,8 @@ class ScanAlone:
 
     people: int = 12
     """How many procedural people; 0: none."""
+    who: tuple[str, ...] = ()
+    """These of them by name (`benchmarks.people.cast`), in place of the first ones."""
     seed: int = 0
     """Of the people."""
     captured: bool = True
@@ -66,9 +68,9 @@ class ScanAlone:
         if self.captured:
             for name in captured_names():
                 yield from (variant(captured(name), one) for one in names)
-        if self.people:
-            for scan in people(count=self.people, seed=self.seed):
-                yield from (variant(scan, one) for one in names)
+        named = (person(name, seed=self.seed) for name in self.who)
+        for scan in named if self.who else people(count=self.people, seed=self.seed):
+            yield from (variant(scan, one) for one in names)
 
 
 def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, float | str | bool | list[str]]:
