@@ -294,14 +294,14 @@ PARTS = (
     Part(
         "scan_alone_people",
         "Bodies found in scans of procedural people",
-        "The first 12 of the cast of procedural people, in clothes of other cuts, poses and builds, as they are; errors as "
-        "above. Constants were chosen on five of them and three others, among these the second cape below.",
+        "The first 12 of the cast of procedural people, in clothes of other cuts, poses and builds, as they are; "
+        "errors as above. Constants were chosen on five of them and three others, among these the second cape below.",
     ),
     Part(
         "scan_alone_capes",
         "Bodies found in scans of procedural people in capes",
-        "The two of the cast that are found worst: a cape hides an arm and the trunk of one, cape and hood arms, trunk and "
-        "head of the other. Confidences of 0.5 and less say so.",
+        "The worst that were seen: a cape hides an arm and the trunk of one, cape and hood arms, trunk and head of the "
+        "other. Confidences of 0.5 and less say so.",
     ),
     Part(
         "registration_icp",
