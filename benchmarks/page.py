@@ -324,7 +324,7 @@ PARTS = (
         "Visible vertices of templates built from a scan with nothing beside it, with exact parameters, and with "
         "everything true; driven in four hard poses, against the true surface driven by its authored weights. Mean, "
         "95th and 99th percentile in mm by true part. Vertices farther than 20 mm from the true surface are counted, "
-        "not measured.",
+        "not measured. The rows of what was found alone are of later builds than the two beside them.",
     ),
     Part(
         "photographs_alone_woman_casual",
