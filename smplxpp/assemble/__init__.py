@@ -2,12 +2,11 @@
 
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
-from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
+from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
 from smplxpp.assemble.left_inside import LeftInside
 from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
 
 __all__ = [
-    "LAYER_ORDER",
     "AssemblyConfig",
     "AssemblyReport",
     "CanonicalPart",

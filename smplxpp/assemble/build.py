@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
-from smplxpp.assemble.layers import LAYER_ORDER, Obstacle, Penetration, measure_penetration
+from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
 from smplxpp.assemble.left_inside import LeftInside, find_left_inside, joints_near
 from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
 from smplxpp.body.model import BodyModel

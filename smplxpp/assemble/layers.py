@@ -7,12 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from smplxpp.core.labels import HAIR, LOWER, OUTER, SHOE, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
-
-# From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything.
-LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
 
 # Metres; two parts of one scan touch at their seam to within rounding.
 TOUCHING = 1e-6

@@ -37,6 +37,8 @@ OUTER = Label(5, "outer", (0, 128, 255), (255, 0, 0), 20_000)
 LABELS: tuple[Label, ...] = (SKIN, HAIR, SHOE, UPPER, LOWER, OUTER)
 BACKGROUND = -1
 CLOTH_LABELS: tuple[Label, ...] = (UPPER, LOWER, OUTER)
+LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
+"""From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything."""
 LABEL_BY_NAME: dict[str, Label] = {label.name: label for label in LABELS}
 
 

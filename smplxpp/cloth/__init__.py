@@ -1,0 +1,16 @@
+"""Loose cloth simulated: garments of a template as particles, moved by gravity, air and the body (XPBD)."""
+
+from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
+from smplxpp.cloth.fabric import Fabric, SolverConfig
+from smplxpp.cloth.garment import Garment, GarmentConfig, cut_garment
+
+__all__ = [
+    "ClothDriver",
+    "ClothShape",
+    "DriverConfig",
+    "Fabric",
+    "Garment",
+    "GarmentConfig",
+    "SolverConfig",
+    "cut_garment",
+]

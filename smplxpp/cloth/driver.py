@@ -1,0 +1,202 @@
+"""Cloth along a motion, pose after pose: what a player, a film and an evaluation step through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from smplxpp.cloth.poses import pose_between, reference_facing_as
+from smplxpp.body.model import PosedBody
+from smplxpp.cloth.fabric import SolverConfig
+from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.thread import GarmentThread
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.template.template import Template
+
+# Longest step that is simulated; a longer one is a cut.
+LONGEST_STEP = 0.26
+# Step of the ramp of a cold start.
+_RAMP_STEP = 1.0 / 30.0
+# Of a blend of rotations; below, its inverse blows up what the cloth did.
+_LEAST_DETERMINANT = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverConfig:
+    """How motions are followed.
+
+    Attributes:
+        ramp: seconds in which a cold start goes from the reference pose, where the cloth is at rest, to the first one.
+        hold: seconds for which it then stays there.
+        teleport: metres a second of what holds the cloth; faster motion is a cut, and starts anew.
+        most_stretch: length of the longest edge over that at rest from which the cloth is taken to have exploded.
+        solver: how time is stepped.
+    """
+
+    ramp: float = 0.7
+    hold: float = 0.2
+    teleport: float = 12.0
+    most_stretch: float = 4.0
+    solver: SolverConfig = field(default_factory=SolverConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("ramp", "hold"):
+            require_at_least(f"cloth driver: {name}", getattr(self, name), 0.0)
+        for name in ("teleport", "most_stretch"):
+            require_positive(f"cloth driver: {name}", getattr(self, name))
+
+
+@dataclass(frozen=True, eq=False)
+class ClothShape:
+    """What cloth does in one pose.
+
+    Attributes:
+        vertices: L of the template's.
+        displacements: metres along the axes of the T-pose, to be added before skinning.
+        share: in [0, 1]: how much of a vertex's displacement this is; the rest stays what it would be without.
+    """
+
+    vertices: Int64[np.ndarray, " L"]
+    displacements: Float32[np.ndarray, "L 3"]
+    share: Float32[np.ndarray, " L"]
+
+
+class ClothDriver:
+    """Steps garments of one template, the inner ones first; each touches the body and what it lies over.
+
+    Args:
+        template: the person. garments: cut from it.
+        config: how motions are followed.
+
+    Attributes:
+        said: what went otherwise than asked for, a sentence each, in order.
+
+    Raises:
+        InputError: no garment, or one of another template.
+    """
+
+    def __init__(
+        self, template: Template, garments: Sequence[Garment], config: DriverConfig | None = None
+    ) -> None:
+        if not garments:
+            raise InputError("loose parts to simulate", expected="at least one garment", received="none")
+        self.template, self.config = template, config or DriverConfig()
+        parts = list(template.part_names)
+        unknown = [g.part for g in garments if g.part not in parts or g.vertices.max() >= template.vertex_count]
+        if unknown:
+            raise InputError(
+                f"garment {unknown[0]!r}", expected="one that was cut from this template", received="another's"
+            )
+        self.said: list[str] = []
+        # Vertices of the template that steps need; the others are not posed.
+        self._rows = np.unique(np.concatenate([np.r_[g.collider.vertices, g.particles] for g in garments]))
+        self._fine = np.concatenate([g.vertices for g in garments])
+        weights = template.weights.dense().astype(np.float32)
+        self._row_weights, self._fine_weights = weights[self._rows], weights[self._fine]
+        self._rest = template.vertices.astype(np.float32)
+        self._threads = [GarmentThread(g, self._rows, self.config) for g in garments]
+        self._time = 0.0
+        self._last: BodyParams | None = None
+        share = np.concatenate([g.share() for g in garments])
+        self._shape = ClothShape(self._fine, np.zeros((len(self._fine), 3), np.float32), share)
+
+    @property
+    def garments(self) -> tuple[Garment, ...]:
+        """What is simulated."""
+        return tuple(thread.garment for thread in self._threads)
+
+    def restart(self) -> None:
+        """Forget the state: the next step starts cold."""
+        self._last = None
+
+    def step(self, params: BodyParams | None, seconds: float, *, posed: PosedBody | None = None) -> ClothShape:
+        """Go on to a pose.
+
+        The first one, one that lies `LONGEST_STEP` or more after the last, and one that what holds the cloth could not
+        have reached start cold: a ramp leads there from the reference pose.
+
+        Args:
+            params: one frame; None: the pose is not known at this time, and the cloth stays as it is on the body.
+            seconds: since the last step; of the first step it does not matter.
+            posed: `template.posed_body(params)`, where the caller has it already.
+
+        Raises:
+            InputError: several frames, no positive time, parameters that the body refuses.
+        """
+        if params is None:
+            self.said.append(f"no pose after {self._time:.2f} s: the clothes stay as they are")
+            return self._shape
+        if len(params) != 1:
+            raise InputError("pose of a step", expected="one frame", received=f"{len(params)} frames")
+        posed = self.template.posed_body(params) if posed is None else posed
+        if self._last is None:
+            self._start(params, posed)
+            return self._shaped(posed)
+        require_positive("seconds of a step", seconds)
+        self._time += seconds
+        if seconds > LONGEST_STEP:
+            self.said.append(f"{seconds:.2f} s without a pose before {self._time:.2f} s: the clothes start anew")
+            self._start(params, posed)
+        elif not self._advance(posed, seconds):
+            self.said.append(f"a leap at {self._time:.2f} s: the clothes start anew")
+            self._start(params, posed)
+        self._last = params
+        return self._shaped(posed)
+
+    def _start(self, params: BodyParams, posed: PosedBody) -> None:
+        """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
+        start = reference_facing_as(self._threads[0].garment.reference, params)
+        steps, still = (round(t / _RAMP_STEP) for t in (self.config.ramp, self.config.hold))
+        places = self._places(self.template.posed_body(start) if steps else posed)
+        for thread in self._threads:
+            thread.reset(places)
+        for k in range(1, steps):
+            t = k / steps
+            between = pose_between(start, params, t * t * (3.0 - 2.0 * t))
+            self._advance(self.template.posed_body(between), _RAMP_STEP, at_any_speed=True)
+        for _ in range(still + min(steps, 1)):
+            self._advance(posed, _RAMP_STEP, at_any_speed=True)
+        self._last = params
+
+    def _advance(self, posed: PosedBody, seconds: float, *, at_any_speed: bool = False) -> bool:
+        """Move all garments on to a pose; False, and nothing moved, where what holds them went too fast."""
+        places = self._places(posed)
+        farthest = max(thread.way_to(places) for thread in self._threads)
+        if farthest > self.config.teleport * seconds and not at_any_speed:
+            return False
+        for thread in self._threads:
+            said = thread.advance(places, seconds, self._threads)
+            if said:
+                self.said.append(f"{thread.garment.part} at {self._time:.2f} s: {said}")
+        return True
+
+    def _places(self, posed: PosedBody) -> Float32[np.ndarray, "R 3"]:
+        """Return where skinning has the vertices that steps need, metres."""
+        rest, count = self._rest[self._rows], self.template.body.vertex_count
+        skin = self._rows < count
+        rest[skin] = posed.rest_vertices[0][self._rows[skin]]
+        blended = _blended(self._row_weights, posed)
+        return np.einsum("nij,nj->ni", blended[:, :, :3], rest) + blended[:, :, 3]
+
+    def _shaped(self, posed: PosedBody) -> ClothShape:
+        """Take the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`."""
+        world = np.concatenate([thread.carried() for thread in self._threads])
+        blended = _blended(self._fine_weights, posed)
+        turned, moved = blended[:, :, :3], world - blended[:, :, 3]
+        # Joints that turn against each other flatten a blend; such a vertex stays with skinning.
+        sound = np.linalg.det(turned) > _LEAST_DETERMINANT
+        displacements = np.zeros((len(self._fine), 3), dtype=np.float32)
+        back = np.linalg.solve(turned[sound], moved[sound][:, :, None])[:, :, 0]
+        displacements[sound] = back - self._rest[self._fine[sound]]
+        self._shape = ClothShape(self._fine, displacements, self._shape.share)
+        return self._shape
+
+
+def _blended(weights: Float32[np.ndarray, "N J"], posed: PosedBody) -> Float32[np.ndarray, "N 3 4"]:
+    transforms = posed.posed_from_rest[0, :, :3].reshape(-1, 12).astype(np.float32)
+    return (weights @ transforms).reshape(-1, 3, 4)

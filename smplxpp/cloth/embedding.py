@@ -1,0 +1,84 @@
+"""A fine mesh carried by a coarse one: every vertex keeps its place in the frame of its nearest coarse triangle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import barycentric_coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """N fine vertices in the frames of m coarse triangles.
+
+    Attributes:
+        corners: of each vertex's triangle. weights: barycentric.
+        offset: metres along the triangle's first edge, along the second direction in its plane, and along the coarse
+            mesh's smooth normal.
+    """
+
+    corners: Int32[np.ndarray, "N 3"]
+    weights: Float32[np.ndarray, "N 3"]
+    offset: Float32[np.ndarray, "N 3"]
+
+    def carried(self, coarse: TriangleMesh) -> Float[np.ndarray, "N 3"]:
+        """Return the fine vertices where the coarse mesh takes them, metres."""
+        x, normals = coarse.vertices, _smooth_normals(coarse)
+        place = sum(self.weights[:, k : k + 1] * x[self.corners[:, k]] for k in range(3))
+        normal = _unit(sum(self.weights[:, k : k + 1] * normals[self.corners[:, k]] for k in range(3)))
+        first, second = _tangents(x, self.corners)
+        return (
+            place + self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
+        )
+
+
+def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
+    """Bind points to the nearest triangles of a mesh; `carried` by that mesh they stay where they are."""
+    face, near = igl.point_mesh_squared_distance(np.ascontiguousarray(points), coarse.vertices, coarse.faces)[1:3]
+    corners = coarse.faces[face]
+    weights = np.clip(np.nan_to_num(barycentric_coordinates(near, coarse.vertices[corners]), nan=1 / 3), 0.0, 1.0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    zero = Embedding(
+        corners.astype(np.int32), weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32)
+    )
+    missing = points - zero.carried(coarse)
+    normals = _smooth_normals(coarse)
+    normal = _unit(sum(weights[:, k : k + 1] * normals[corners[:, k]] for k in range(3)))
+    along = np.einsum("ni,ni->n", missing, normal)
+    left = missing - along[:, None] * normal
+    first, second = _tangents(coarse.vertices, corners)
+    # What is left may lean out of the triangle's plane by as much as the smooth normal does: solved exactly.
+    frame = np.stack([first, second, normal], axis=2)
+    exact = np.linalg.det(frame) > 0.1
+    offset = np.stack([np.einsum("ni,ni->n", left, first), np.einsum("ni,ni->n", left, second), along], axis=1)
+    offset[exact] = np.linalg.solve(frame[exact], missing[exact][:, :, None])[:, :, 0]
+    return Embedding(zero.corners, zero.weights, offset.astype(np.float32))
+
+
+def _smooth_normals(mesh: TriangleMesh) -> Float[np.ndarray, "n 3"]:
+    """Unit normals of the vertices, faces weighted by their area; cheaper than by their angles."""
+    x, f = mesh.vertices, mesh.faces
+    cross = np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]])
+    total = np.stack(
+        [sum(np.bincount(f[:, k], cross[:, axis], minlength=len(x)) for k in range(3)) for axis in range(3)], axis=1
+    )
+    return _unit(total)
+
+
+def _tangents(
+    x: Float[np.ndarray, "n 3"], corners: Int32[np.ndarray, "N 3"]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+    """Unit directions in the plane of each triangle: its first edge, and the one a quarter turn on."""
+    edge = x[corners[:, 1]] - x[corners[:, 0]]
+    normal = _unit(np.cross(edge, x[corners[:, 2]] - x[corners[:, 0]]))
+    edge = _unit(edge)
+    return edge, np.cross(normal, edge)
+
+
+def _unit(rows: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    return rows / np.maximum(np.sqrt(np.einsum("ni,ni->n", rows, rows)), 1e-12)[:, None]

@@ -1,0 +1,145 @@
+"""A template's loose part as something to simulate: particles, what holds them, what they touch, what they carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64
+
+from smplxpp.cloth.carriers import find_carriers
+from smplxpp.cloth.cloth_mesh import coarsen, find_opening_webs, geodesics, largest_piece, lengths_along
+from smplxpp.cloth.collider import ColliderMesh, collider_of
+from smplxpp.cloth.embedding import Embedding, embed
+from smplxpp.cloth.fabric import Fabric
+from smplxpp.cloth.model import ClothModel, build_model
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.template.template import BODY_PART, Template
+
+
+@dataclass(frozen=True, kw_only=True)
+class GarmentConfig:
+    """Choices of a garment.
+
+    Attributes:
+        spacing: of its particles, metres. collider_spacing: of the collider's vertices.
+        pin_depth: metres along the cloth from where the body carries it up to which it follows the body exactly.
+        band: metres beyond, over which simulated displacements take over from skinning's.
+        skin_margin, sheet_margin: metres that cloth keeps from the skin and from other clothes.
+        fabric: material.
+    """
+
+    spacing: float = 0.035
+    collider_spacing: float = 0.03
+    pin_depth: float = 0.014
+    band: float = 0.03
+    skin_margin: float = 0.0045
+    sheet_margin: float = 0.003
+    fabric: Fabric = field(default_factory=Fabric)
+
+    def __post_init__(self) -> None:
+        for name in ("spacing", "collider_spacing", "pin_depth", "band"):
+            require_positive(f"garment: {name}", getattr(self, name))
+        for name in ("skin_margin", "sheet_margin"):
+            require_at_least(f"garment: {name}", getattr(self, name), 0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Garment:
+    """A part of a template over n particles, carrying N of the template's vertices.
+
+    Attributes:
+        part: its name in the template.
+        config: choices. reference: one frame, the pose that it was scanned in; its shape there is its shape at rest.
+        particles: vertices of the template that the particles are.
+        rest: the simulated mesh in the reference pose, metres.
+        lengths: of `rest.edges`, along the cloth, metres.
+        depth: of particles along the cloth from what the body carries, metres; inf where no way leads there.
+        vertices: of the template that it carries. vertex_depth: theirs. embedding: theirs.
+        collider: what it may touch.
+    """
+
+    part: str
+    config: GarmentConfig
+    reference: BodyParams
+    particles: Int64[np.ndarray, " n"]
+    rest: TriangleMesh
+    lengths: Float[np.ndarray, " e"]
+    depth: Float[np.ndarray, " n"]
+    vertices: Int64[np.ndarray, " N"]
+    vertex_depth: Float[np.ndarray, " N"]
+    embedding: Embedding
+    collider: ColliderMesh
+
+    @property
+    def pinned(self) -> Bool[np.ndarray, " n"]:
+        """The particles that follow the body exactly."""
+        return self.depth <= self.config.pin_depth
+
+    def model(self) -> ClothModel:
+        """Return the solver's constraints."""
+        return build_model(self.rest, self.pinned * 1.0, self.config.fabric, lengths=self.lengths)
+
+    def share(self) -> Float32[np.ndarray, " N"]:
+        """Return how much of a carried vertex's displacement is the simulation's, 0 at the pins and 1 beyond the band."""
+        t = np.clip((self.vertex_depth - self.config.pin_depth) / self.config.band, 0.0, 1.0)
+        return np.where(np.isfinite(self.vertex_depth), t * t * (3.0 - 2.0 * t), 0.0).astype(np.float32)
+
+    def with_config(self, config: GarmentConfig) -> Garment:
+        """Return the garment with another material or pin depth; spacings stay what they were cut with."""
+        return replace(self, config=config)
+
+
+def cut_garment(
+    template: Template, part: str, reference: BodyParams, config: GarmentConfig | None = None
+) -> Garment:
+    """Make a part of a template ready to be simulated.
+
+    Args:
+        part: its name. reference: one frame: the pose in which the template's surface is the scan's.
+
+    Raises:
+        InputError: no such part, the body itself, a part without area, or one that nothing carries.
+    """
+    config = config or GarmentConfig()
+    require_choice("loose part", part, [name for name in template.part_names if name != BODY_PART])
+    posed = TriangleMesh(template.pose(reference)[0], template.faces)
+    cloth, index = posed.submesh(template.part_faces(part))
+    kept = largest_piece(cloth, ~find_opening_webs(cloth))
+    if not cloth.face_areas[kept].sum() > 0:
+        raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside webs")
+    sheet, of_cloth = cloth.submesh(kept)
+    body = TriangleMesh(posed.vertices, template.faces[template.part_faces(BODY_PART)])
+    carriers = np.flatnonzero(find_carriers(sheet, body))
+    if not len(carriers):
+        raise InputError(
+            f"loose part {part!r}",
+            expected="cloth that is tight at an opening or lies on the body, to hang from",
+            received="none in the pose of the scan",
+            remedy="leave the part to skinning (--cloth field or skin), or name other parts",
+        )
+    depth = geodesics(sheet, carriers)[0]
+    seeds, faces = coarsen(sheet, config.spacing)
+    rest = TriangleMesh(sheet.vertices[seeds], faces)
+    # Vertices of the web ride on the nearest triangle; how deep they hang is what the nearest particle says.
+    all_depth = np.full(cloth.vertex_count, np.inf)
+    all_depth[of_cloth] = depth
+    embedding = embed(cloth.vertices, rest)
+    nearest = depth[seeds][embedding.corners[np.arange(cloth.vertex_count), embedding.weights.argmax(axis=1)]]
+    all_depth = np.where(np.isfinite(all_depth), all_depth, nearest)
+    return Garment(
+        part=part,
+        config=config,
+        reference=reference,
+        particles=index[of_cloth[seeds]],
+        rest=rest,
+        lengths=lengths_along(sheet, seeds[rest.edges]),
+        depth=depth[seeds],
+        vertices=index,
+        vertex_depth=all_depth,
+        embedding=embedding,
+        collider=collider_of(template, part, posed, config),
+    )

@@ -1,0 +1,180 @@
+"""Constraints of cloth for the solver: masses, edges, hinges, tethers, springs, and what it may touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32
+
+from smplxpp.cloth.cloth_mesh import edge_graph
+from smplxpp.cloth.fabric import Fabric
+from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.topology import paired_half_edges
+
+
+@dataclass(frozen=True, eq=False)
+class ClothModel:
+    """Constraints over n particles, as `smplxpp/native/cloth/xpbd.cpp` reads them.
+
+    Attributes:
+        faces: of the simulated mesh.
+        inverse_mass: 1/kg; 0 where the particle follows its place exactly.
+        edges, lengths: pairs of particles, and their distance at rest along the cloth, metres.
+        stretch, compress: compliances of the edges, m/N.
+        hinges: the two ends of an inner edge, then the corners across it. curvature: weights of the four corners.
+        rest_curvature: along the hinge's normal. bend: compliance of a hinge.
+        spring: m/N to the particle's place, inf where there is none; None: nowhere.
+        anchor, tether: the particle that holds this one, -1 where none does, and the longest distance to it, metres.
+    """
+
+    faces: Int32[np.ndarray, "m 3"]
+    inverse_mass: Float32[np.ndarray, " n"]
+    edges: Int32[np.ndarray, "e 2"]
+    lengths: Float32[np.ndarray, " e"]
+    stretch: Float32[np.ndarray, " e"]
+    compress: Float32[np.ndarray, " e"]
+    hinges: Int32[np.ndarray, "b 4"]
+    curvature: Float32[np.ndarray, "b 4"]
+    rest_curvature: Float32[np.ndarray, " b"]
+    bend: Float32[np.ndarray, " b"]
+    anchor: Int32[np.ndarray, " n"]
+    tether: Float32[np.ndarray, " n"]
+    spring: Float32[np.ndarray, " n"] | None = None
+
+    @property
+    def particle_count(self) -> int:
+        return len(self.inverse_mass)
+
+
+def build_model(
+    rest: TriangleMesh,
+    attachment: Float[np.ndarray, " n"],
+    fabric: Fabric,
+    *,
+    lengths: Float[np.ndarray, " e"] | None = None,
+    attach_stiffness: float = 0.0,
+) -> ClothModel:
+    """Derive the constraints of a garment from its shape at rest.
+
+    Args:
+        rest: lengths and curvatures of this shape are the garment's own, metres.
+        attachment: in [0, 1]: 1 follows its place exactly, 0 is free; between it is a spring, of `attach_stiffness`
+            N/m for a wholly attached particle.
+        fabric: material.
+        lengths: of `rest.edges`, metres; None: the chords.
+    """
+    n, (a, b) = rest.vertex_count, rest.edges.T
+    area = sum(np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=n) for k in range(3))
+    fixed = attachment >= 1.0
+    inverse_mass = np.where(fixed, 0.0, 1.0 / (fabric.density * np.maximum(area, 1e-7)))
+    chord = row_lengths(rest.vertices[a] - rest.vertices[b])
+    lengths = chord if lengths is None else lengths
+    stiffness = fabric.stretch_stiffness * np.maximum(_edge_areas(rest), 1e-9) / np.maximum(chord, 1e-6) ** 2
+    # From what holds the cloth downwards: corrections then travel far within a substep.
+    anchor, tether, depth = _tethers(rest, lengths, fixed, fabric.slack)
+    moves = np.flatnonzero(~(fixed[a] & fixed[b]))
+    order = moves[np.argsort((depth[a] + depth[b])[moves], kind="stable")]
+    hinges, curvature, rest_curvature, bend = _hinges(rest, fixed, fabric.bend_stiffness)
+    spring = None
+    if attach_stiffness > 0 and ((attachment > 0) & ~fixed).any():
+        with np.errstate(divide="ignore"):
+            spring = ((1.0 - attachment) / (attach_stiffness * attachment**2)).astype(np.float32)
+    return ClothModel(
+        faces=rest.faces.astype(np.int32),
+        inverse_mass=inverse_mass.astype(np.float32),
+        edges=np.ascontiguousarray(rest.edges[order], dtype=np.int32),
+        lengths=lengths[order].astype(np.float32),
+        stretch=(1.0 / stiffness)[order].astype(np.float32),
+        compress=(1.0 / (fabric.compression * stiffness))[order].astype(np.float32),
+        hinges=hinges,
+        curvature=curvature,
+        rest_curvature=rest_curvature,
+        bend=bend,
+        anchor=anchor,
+        tether=tether,
+        spring=spring,
+    )
+
+
+def with_pins(model: ClothModel, rest: TriangleMesh, fabric: Fabric) -> ClothModel:
+    """Return the same constraints with the masses of another density."""
+    return replace(model, inverse_mass=build_model(rest, (model.inverse_mass == 0.0) * 1.0, fabric).inverse_mass)
+
+
+def _edge_areas(rest: TriangleMesh) -> Float[np.ndarray, " e"]:
+    """Areas of the faces at each edge together, in the order of `rest.edges`, square metres."""
+    n = max(rest.vertex_count, 1)
+    key = rest.edges[:, 0] * n + rest.edges[:, 1]
+    total = np.zeros(len(key))
+    for k in range(3):
+        ends = np.sort(np.stack([rest.faces[:, k], rest.faces[:, (k + 1) % 3]], axis=1), axis=1)
+        np.add.at(total, np.searchsorted(key, ends[:, 0] * n + ends[:, 1]), rest.face_areas)
+    return total
+
+
+def _hinges(
+    rest: TriangleMesh, fixed: np.ndarray, stiffness: float
+) -> tuple[
+    Int32[np.ndarray, "b 4"], Float32[np.ndarray, "b 4"], Float32[np.ndarray, " b"], Float32[np.ndarray, " b"]
+]:
+    """Pairs of triangles that resist bending (the quadratic model of Bergou et al. 2006, with curvature at rest).
+
+    With `c` the cotangent weights of an inner edge, `sum_i c_i x_i` is the curvature of the hinge as a vector; its part
+    along the hinge's normal is held at its value at rest.
+    """
+    # Edge k of a face runs from corner k to k + 1; corner k + 2 lies opposite.
+    half = paired_half_edges(rest.faces)
+    if stiffness == 0.0:
+        half = half[:0]
+    face, corner = half // 3, half % 3
+    a, b = (rest.faces[face[:, 0], (corner[:, 0] + k) % 3] for k in (0, 1))
+    c, d = (rest.faces[face[:, k], (corner[:, k] + 2) % 3] for k in (0, 1))
+    moves = (~fixed[np.stack([a, b, c, d])]).any(axis=0)
+    a, b, c, d, face = a[moves], b[moves], c[moves], d[moves], face[moves]
+    x = rest.vertices
+    # Needles would give weights without bound.
+    ac, ad, bc, bd = (np.clip(_cotangents(x, *way), -3.0, 3.0) for way in ((a, b, c), (a, b, d), (b, a, c), (b, a, d)))
+    weights = np.stack([bc + bd, ac + ad, -ac - bc, -ad - bd], axis=1)
+    corners = np.stack([a, b, c, d], axis=1)
+    normal = np.cross(x[b] - x[a], x[c] - x[a]) + np.cross(x[d] - x[a], x[b] - x[a])
+    normal /= np.maximum(row_lengths(normal), 1e-12)[:, None]
+    at_rest = np.einsum("hk,hki,hi->h", weights, x[corners], normal)
+    areas = rest.face_areas[face].sum(axis=1)
+    compliance = areas / (3.0 * stiffness) if stiffness else areas
+    return (
+        np.ascontiguousarray(corners, dtype=np.int32),
+        np.ascontiguousarray(weights, dtype=np.float32),
+        at_rest.astype(np.float32),
+        compliance.astype(np.float32),
+    )
+
+
+def _cotangents(
+    x: Float[np.ndarray, "N 3"], at: Int[np.ndarray, " b"], p: Int[np.ndarray, " b"], q: Int[np.ndarray, " b"]
+) -> Float[np.ndarray, " b"]:
+    u, v = x[p] - x[at], x[q] - x[at]
+    return np.einsum("hi,hi->h", u, v) / np.maximum(row_lengths(np.cross(u, v)), 1e-12)
+
+
+def _tethers(
+    rest: TriangleMesh, lengths: Float[np.ndarray, " e"], fixed: np.ndarray, slack: float
+) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Long-range attachments (Kim et al. 2012): the nearest fixed particle along the cloth, and the longest way to it.
+
+    A way along edges zigzags: where the straight one is much shorter, that and a little more is what holds.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    n = rest.vertex_count
+    if not fixed.any():
+        return np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n)
+    distance, _, source = dijkstra(
+        edge_graph(rest, lengths), directed=False, indices=np.flatnonzero(fixed), min_only=True, return_predecessors=True
+    )
+    held = np.isfinite(distance) & ~fixed
+    anchor = np.where(held, source, -1)
+    straight = row_lengths(rest.vertices - rest.vertices[np.maximum(source, 0)])
+    way = np.minimum(distance, 1.01 * straight + 1e-3) * (1.0 + slack)
+    depth = np.where(np.isfinite(distance), distance, 0.0)
+    return anchor.astype(np.int32), np.where(held, way, 0.0).astype(np.float32), depth

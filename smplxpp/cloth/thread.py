@@ -1,0 +1,105 @@
+"""One garment through time: its particles, and where skinning had it at the last moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.solver import ClothSolver, ClothState
+from smplxpp.core.mesh import row_lengths
+
+if TYPE_CHECKING:
+    from smplxpp.cloth.driver import DriverConfig
+
+
+class GarmentThread:
+    """A garment that is stepped.
+
+    Args:
+        garment: what it is. rows: (R,) vertices of the template whose places it is given, increasing.
+    """
+
+    def __init__(self, garment: Garment, rows: Int64[np.ndarray, " R"], config: DriverConfig) -> None:
+        self.garment, self._most_stretch = garment, config.most_stretch
+        self._model = garment.model()
+        collider = garment.collider
+        self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
+        self._particles = np.searchsorted(rows, garment.particles)
+        self._skin = np.searchsorted(rows, collider.vertices)
+        self._pinned = np.flatnonzero(garment.pinned)
+        self._state = ClothState.at_rest(garment.rest.vertices)
+        self._places: list[Float32[np.ndarray, "n 3"]] = []
+        self._surfaces: list[Float32[np.ndarray, "c 3"]] = []
+
+    def reset(self, places: Float32[np.ndarray, "R 3"]) -> None:
+        """Put the particles where skinning has them, at rest."""
+        self._state = ClothState.at_rest(places[self._particles])
+        self._places, self._surfaces = [places[self._particles]], [places[self._skin]]
+
+    def way_to(self, places: Float32[np.ndarray, "R 3"]) -> float:
+        """Return the longest way, metres, of what holds the garment from the last moment to these places."""
+        ways = row_lengths(places[self._particles[self._pinned]] - self._places[-1][self._pinned])
+        return float(ways.max(initial=0.0))
+
+    def advance(
+        self, places: Float32[np.ndarray, "R 3"], seconds: float, threads: Sequence[GarmentThread]
+    ) -> str | None:
+        """Go on to new places; returns what went wrong, if anything did.
+
+        Args:
+            threads: all garments, the inner ones moved on already: where one is under this one it counts as it is.
+        """
+        surface = places[self._skin]
+        for other in threads:
+            if other is self:
+                break
+            surface = other.laid_over(self.garment.collider.vertices, surface)
+        own = places[self._particles]
+        try:
+            self._solver.advance(
+                self._state, seconds, _four_moments(self._places, own), _four_moments(self._surfaces, surface)
+            )
+        finally:
+            self._places, self._surfaces = [self._places[-1], own], [self._surfaces[-1], surface]
+        if self._sound():
+            return None
+        self._state = ClothState.at_rest(own)
+        return "the simulation broke down; the cloth is on the body again and goes on from there"
+
+    def carried(self) -> Float[np.ndarray, "N 3"]:
+        """Return the vertices that the garment carries, world, metres."""
+        return self.garment.embedding.carried(self.garment.rest.with_vertices(self._state.position))
+
+    def laid_over(
+        self, vertices: Int64[np.ndarray, " c"], surface: Float32[np.ndarray, "c 3"]
+    ) -> Float32[np.ndarray, "c 3"]:
+        """Return the places of an outer garment's collider, those of this garment where the simulation has them."""
+        at = np.searchsorted(self.garment.vertices, vertices)
+        mine = np.isin(vertices, self.garment.vertices)
+        if not mine.any():
+            return surface
+        out = surface.copy()
+        share = self.garment.share()[at[mine], None]
+        out[mine] += share * (self.carried()[at[mine]].astype(np.float32) - out[mine])
+        return out
+
+    def _sound(self) -> bool:
+        x = self._state.position
+        if not (np.isfinite(x).all() and np.isfinite(self._state.velocity).all()):
+            return False
+        edges = self._model.edges
+        lengths = row_lengths(x[edges[:, 0]] - x[edges[:, 1]])
+        return bool((lengths <= self._most_stretch * self._model.lengths + 0.01).all())
+
+
+def _four_moments(
+    past: Sequence[Float32[np.ndarray, "k 3"]], now: Float32[np.ndarray, "k 3"]
+) -> list[Float32[np.ndarray, "k 3"]]:
+    """The moment before the last, the last, this one, and the next one as it would come without acceleration."""
+    last = past[-1]
+    before = past[-2] if len(past) > 1 else 2.0 * last - now
+    return [before, last, now, 2.0 * now - last]
