@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Int64
+from scipy.sparse import csr_matrix
 
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.body.model import PosedBody
@@ -15,7 +16,7 @@ from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.thread import GarmentThread
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.core.validation import require_at_least, require_choice, require_positive
 from smplxpp.template.template import Template
 
 # Longest step that is simulated; a longer one is a cut.
@@ -96,7 +97,7 @@ class ClothDriver:
         # Vertices of the template that steps need; the others are not posed.
         self._rows = np.unique(np.concatenate([np.r_[g.collider.vertices, g.particles] for g in garments]))
         self._fine = np.concatenate([g.vertices for g in garments])
-        weights = template.weights.dense().astype(np.float32)
+        weights = csr_matrix(template.weights.dense(), dtype=np.float32)
         self._row_weights, self._fine_weights = weights[self._rows], weights[self._fine]
         self._rest = template.vertices.astype(np.float32)
         self._threads = [GarmentThread(g, self._rows, self.config) for g in garments]
@@ -109,6 +110,16 @@ class ClothDriver:
     def garments(self) -> tuple[Garment, ...]:
         """What is simulated."""
         return tuple(thread.garment for thread in self._threads)
+
+    def particles(self, part: str) -> Float32[np.ndarray, "n 3"]:
+        """Return where the particles of a part are, world, metres.
+
+        Raises:
+            InputError: no such part is simulated.
+        """
+        names = [garment.part for garment in self.garments]
+        require_choice("simulated part", part, names)
+        return self._threads[names.index(part)].particles()
 
     def restart(self) -> None:
         """Forget the state: the next step starts cold."""
@@ -185,18 +196,31 @@ class ClothDriver:
 
     def _shaped(self, posed: PosedBody) -> ClothShape:
         """Take the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`."""
-        world = np.concatenate([thread.carried() for thread in self._threads])
+        world = np.concatenate([thread.carried() for thread in self._threads]).astype(np.float32)
         blended = _blended(self._fine_weights, posed)
-        turned, moved = blended[:, :, :3], world - blended[:, :, 3]
+        back, volume = _solved(blended[:, :, :3], world - blended[:, :, 3])
         # Joints that turn against each other flatten a blend; such a vertex stays with skinning.
-        sound = np.linalg.det(turned) > _LEAST_DETERMINANT
-        displacements = np.zeros((len(self._fine), 3), dtype=np.float32)
-        back = np.linalg.solve(turned[sound], moved[sound][:, :, None])[:, :, 0]
-        displacements[sound] = back - self._rest[self._fine[sound]]
+        displacements = np.where(volume > _LEAST_DETERMINANT, back - self._rest[self._fine], np.float32(0.0))
         self._shape = ClothShape(self._fine, displacements, self._shape.share)
         return self._shape
 
 
-def _blended(weights: Float32[np.ndarray, "N J"], posed: PosedBody) -> Float32[np.ndarray, "N 3 4"]:
+def _blended(weights: csr_matrix, posed: PosedBody) -> Float32[np.ndarray, "N 3 4"]:
     transforms = posed.posed_from_rest[0, :, :3].reshape(-1, 12).astype(np.float32)
     return (weights @ transforms).reshape(-1, 3, 4)
+
+
+def _solved(
+    matrices: Float32[np.ndarray, "N 3 3"], right: Float32[np.ndarray, "N 3"]
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 1"]]:
+    """The solutions of `A x = b` by Cramer's rule, and the determinants; LAPACK takes ten times as long for so small A."""
+    columns = np.ascontiguousarray(matrices.transpose(2, 1, 0))
+    b = np.ascontiguousarray(right.T)
+    across = [_cross(columns[1], columns[2]), _cross(columns[2], columns[0]), _cross(columns[0], columns[1])]
+    volume = (columns[0] * across[0]).sum(axis=0)
+    over = 1.0 / np.where(np.abs(volume) > _LEAST_DETERMINANT, volume, 1.0)
+    return np.stack([(b * one).sum(axis=0) * over for one in across], axis=1), volume[:, None]
+
+
+def _cross(a: Float32[np.ndarray, "3 N"], b: Float32[np.ndarray, "3 N"]) -> Float32[np.ndarray, "3 N"]:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

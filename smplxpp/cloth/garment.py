@@ -32,7 +32,7 @@ class GarmentConfig:
         fabric: material.
     """
 
-    spacing: float = 0.035
+    spacing: float = 0.03
     collider_spacing: float = 0.03
     pin_depth: float = 0.014
     band: float = 0.03

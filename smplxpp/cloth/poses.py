@@ -21,7 +21,7 @@ def pose_between(start: BodyParams, end: BodyParams, t: float) -> BodyParams:
     for name in (*_ROTATIONS, "expression", "transl"):
         a, b = getattr(start, name), getattr(end, name)
         if _turns(name, a, b):
-            first, second = Rotation.from_rotvec(a.reshape(-1, 3)), Rotation.from_rotvec(b.reshape(-1, 3))
+            first, second = _rotation(a), _rotation(b)
             step = Rotation.from_rotvec(t * (first.inv() * second).as_rotvec())
             changes[name] = (first * step).as_rotvec().reshape(a.shape)
         elif a.shape == b.shape:
@@ -33,7 +33,7 @@ def pose_between(start: BodyParams, end: BodyParams, t: float) -> BodyParams:
 
 def reference_facing_as(reference: BodyParams, params: BodyParams) -> BodyParams:
     """Return the reference pose where another pose stands and looks: its place, turned about the vertical alone."""
-    own, its = (Rotation.from_rotvec(p.global_orient[0]) for p in (reference, params))
+    own, its = (_rotation(p.global_orient)[0] for p in (reference, params))
     turn = Rotation.from_rotvec([0.0, _heading(its) - _heading(own), 0.0])
     return replace(reference, global_orient=(turn * own).as_rotvec()[None], transl=params.transl)
 
@@ -121,14 +121,14 @@ def _step(
     """The way from rows to other rows: rotation vectors in the start's frame, or differences."""
     if not turning:
         return value[end] - value[start]
-    first, second = (Rotation.from_rotvec(value[rows].reshape(-1, 3)) for rows in (start, end))
+    first, second = (_rotation(value[rows]) for rows in (start, end))
     return (first.inv() * second).as_rotvec().reshape(len(start), -1)
 
 
 def _moved(value: Float[np.ndarray, "T D"], step: Float[np.ndarray, "T D"], turning: bool) -> Float[np.ndarray, "T D"]:
     if not turning:
         return value + step
-    turned = Rotation.from_rotvec(value.reshape(-1, 3)) * Rotation.from_rotvec(step.reshape(-1, 3))
+    turned = _rotation(value) * _rotation(step)
     return turned.as_rotvec().reshape(value.shape)
 
 
@@ -136,3 +136,8 @@ def _heading(rotation: Rotation) -> float:
     """The angle about +Y by which a rotation turns where +Z looks, radians."""
     ahead = rotation.apply([0.0, 0.0, 1.0])
     return float(np.arctan2(ahead[0], ahead[2]))
+
+
+def _rotation(vectors: Float[np.ndarray, "K D"]) -> Rotation:
+    # A copy: scipy refuses to look at arrays that nobody may write to.
+    return Rotation.from_rotvec(np.array(vectors, dtype=np.float64).reshape(-1, 3))

@@ -70,6 +70,10 @@ class GarmentThread:
         self._state = ClothState.at_rest(own)
         return "the simulation broke down; the cloth is on the body again and goes on from there"
 
+    def particles(self) -> Float32[np.ndarray, "n 3"]:
+        """Return where the particles are, world, metres."""
+        return self._state.position.copy()
+
     def carried(self) -> Float[np.ndarray, "N 3"]:
         """Return the vertices that the garment carries, world, metres."""
         return self.garment.embedding.carried(self.garment.rest.with_vertices(self._state.position))

@@ -1,0 +1,218 @@
+"""Drag and pin depth of a garment, found on the surface that was followed through training frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+from smplxpp.cloth.driver import ClothDriver, DriverConfig
+from smplxpp.cloth.garment import Garment, GarmentConfig
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.template.template import Template
+
+# Farther than this from the followed surface a particle says no more: it hangs in another fold.
+MOST = 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationConfig:
+    """What is searched, and when a simulation is worth its while.
+
+    Attributes:
+        drags: 1/s. pin_depths: metres. All pairs are tried, then drags between the best one's neighbours.
+        least_motion: metres by which the followed surface leaves skinning, on average over a part, for it to be loose.
+        most_share: of skinning's distance to the followed surface that the simulation's may have; a part that the
+            simulation does not bring nearer than that stays with the field.
+        blocks: of consecutive frames; each is left out once for the uncertainty.
+    """
+
+    drags: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    pin_depths: tuple[float, ...] = (0.008, 0.014, 0.03)
+    least_motion: float = 0.006
+    most_share: float = 0.85
+    blocks: int = 4
+
+    def __post_init__(self) -> None:
+        for name in ("drags", "pin_depths"):
+            values = getattr(self, name)
+            if not values or min(values) <= 0:
+                raise InputError(f"calibration: {name}", expected="one or more above 0", received=str(values))
+        require_at_least("calibration: least_motion", self.least_motion, 0.0)
+        require_between("calibration: most_share", self.most_share, 0.0, 1.0)
+        require_at_least("calibration: blocks", self.blocks, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What was found for one part.
+
+    Attributes:
+        part: its name. loose: whether it is to be simulated. why: one sentence.
+        drag, pin_depth: 1/s and metres. drag_spread, pin_spread: standard deviations by leaving blocks of frames out
+            (jackknife).
+        skinned, simulated: mean distance of particles to the followed surface, metres, by skinning alone and with
+            these values.
+        frames: how many were looked at.
+    """
+
+    part: str
+    loose: bool
+    why: str
+    drag: float
+    drag_spread: float
+    pin_depth: float
+    pin_spread: float
+    skinned: float
+    simulated: float
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A motion and the surface that was followed along it.
+
+    Attributes:
+        params: T frames, evenly spaced. fps: of them.
+        world: where the particles of a garment were found, metres; NaN rows are not looked at.
+    """
+
+    params: BodyParams
+    fps: float
+    world: Float[np.ndarray, "T n 3"]
+
+
+def calibrate(
+    template: Template,
+    garment: Garment,
+    followed: Followed,
+    *,
+    config: CalibrationConfig | None = None,
+    driver: DriverConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Garment, Calibration]:
+    """Fit drag and pin depth to a followed surface; decide whether the part is loose.
+
+    The distance is the mean over particles that move and frames, cut off at `MOST`. Chaos sets its noise: a start moved
+    by half a millimetre moves folds by several, so more parameters would be fitted to noise.
+
+    Args:
+        followed: of training frames; nothing of frames that are held out.
+
+    Returns:
+        The garment with the values, and what was found.
+
+    Raises:
+        InputError: a surface of another number of particles or frames.
+    """
+    config = config or CalibrationConfig()
+    expected = (len(followed.params), len(garment.particles), 3)
+    if followed.world.shape != expected:
+        raise InputError("followed surface", expected=f"shape {expected}", received=str(followed.world.shape))
+    bodies = [template.posed_body(followed.params.frame(k)) for k in range(len(followed.params))]
+    area = _particle_areas(garment) * (garment.depth > max(config.pin_depths))
+    if not area.sum() > 0:
+        area = _particle_areas(garment)
+
+    def errors(positions: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, " T"]:
+        apart = np.linalg.norm(np.stack(positions) - followed.world, axis=2)
+        weight = area * np.isfinite(apart)
+        return (np.minimum(np.nan_to_num(apart, nan=0.0), MOST) * weight).sum(1) / np.maximum(weight.sum(1), 1e-12)
+
+    def simulated(drag: float, pin: float) -> Float[np.ndarray, " T"]:
+        trial = with_values(garment, drag=drag, pin_depth=pin)
+        player = ClothDriver(template, [trial], driver)
+        positions = []
+        for k, body in enumerate(bodies):
+            player.step(followed.params.frame(k), 1.0 / followed.fps, posed=body)
+            positions.append(player.particles(trial.part))
+        return errors(positions)
+
+    weights = template.weights.dense()[garment.particles]
+    blends = [np.einsum("nj,jab->nab", weights, body.posed_from_rest[0, :, :3]) for body in bodies]
+    rest = template.vertices[garment.particles]
+    skinned = errors([np.einsum("nab,nb->na", b[:, :, :3], rest) + b[:, :, 3] for b in blends])
+    if skinned.mean() < config.least_motion:
+        why = f"the followed surface is {1e3 * skinned.mean():.1f} mm from skinning: nothing to simulate"
+        return garment, _found(garment, False, why, skinned, skinned)
+
+    pairs = list(product(config.drags, config.pin_depths))
+    table: dict[tuple[float, float], Float[np.ndarray, " T"]] = {}
+    for done, pair in enumerate(pairs):
+        progress(done, len(pairs) + 2)
+        table[pair] = simulated(*pair)
+    drag, pin = min(table, key=lambda pair: table[pair].mean())
+    for finer in _between_neighbours(drag, config.drags):
+        table[finer, pin] = simulated(finer, pin)
+    progress(len(pairs) + 2, len(pairs) + 2)
+    best = min(table, key=lambda pair: table[pair].mean())
+    loose = bool(table[best].mean() < config.most_share * skinned.mean())
+    why = (
+        f"the simulation is {1e3 * table[best].mean():.1f} mm from the followed surface, skinning "
+        f"{1e3 * skinned.mean():.1f} mm"
+    )
+    left_out = [_best_without(table, block) for block in np.array_split(np.arange(len(bodies)), config.blocks)]
+    spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
+    found = with_values(garment, drag=best[0], pin_depth=best[1])
+    return found, _found(found, loose, why, skinned, table[best], spread=(spread[0], spread[1]))
+
+
+def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
+    """Return the garment with another drag, 1/s, and pin depth, metres."""
+    fabric = replace(garment.config.fabric, drag=drag)
+    config: GarmentConfig = replace(garment.config, fabric=fabric, pin_depth=pin_depth)
+    return garment.with_config(config)
+
+
+def _found(
+    garment: Garment,
+    loose: bool,
+    why: str,
+    skinned: Float[np.ndarray, " T"],
+    simulated: Float[np.ndarray, " T"],
+    *,
+    spread: tuple[float, float] = (float("nan"), float("nan")),
+) -> Calibration:
+    return Calibration(
+        part=garment.part,
+        loose=loose,
+        why=why,
+        drag=garment.config.fabric.drag,
+        drag_spread=spread[0],
+        pin_depth=garment.config.pin_depth,
+        pin_spread=spread[1],
+        skinned=float(skinned.mean()),
+        simulated=float(simulated.mean()),
+        frames=len(skinned),
+    )
+
+
+def _particle_areas(garment: Garment) -> Float[np.ndarray, " n"]:
+    rest = garment.rest
+    return sum(
+        np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=rest.vertex_count) for k in range(3)
+    )
+
+
+def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:
+    """Return the geometric means of a value and its neighbours."""
+    ordered = sorted(values)
+    at = ordered.index(value)
+    return [float(np.sqrt(value * ordered[k])) for k in (at - 1, at + 1) if 0 <= k < len(ordered)]
+
+
+def _best_without(
+    table: dict[tuple[float, float], Float[np.ndarray, " T"]], block: np.ndarray
+) -> tuple[float, float]:
+    return min(table, key=lambda pair: np.delete(table[pair], block).mean())
+
+
+def _jackknife(values: Sequence[float]) -> float:
+    """The standard deviation of an estimate from its values with one block left out each time."""
+    n = len(values)
+    return float(np.sqrt((n - 1) / n * np.square(np.array(values) - np.mean(values)).sum()))
