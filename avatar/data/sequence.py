@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.cloth_motion import ClothMotions
 from avatar.data.views import View, read_view
 from avatar.rig.rig import Motion, Rig
 from smplxpp.capture import Capture
@@ -114,19 +115,27 @@ class AvatarSequence:
         template: of the person.
         config: how it is read.
         device: of all tensors.
+        cloth: what is simulated along frames that training does not see; None: nothing is.
 
     Raises:
         InputError: no training camera or frame, or a training frame without parameters.
     """
 
     def __init__(
-        self, capture: Capture, template: Template, config: SequenceConfig | None = None, *, device: str = "cpu"
+        self,
+        capture: Capture,
+        template: Template,
+        config: SequenceConfig | None = None,
+        *,
+        device: str = "cpu",
+        cloth: ClothMotions | None = None,
     ) -> None:
         self.capture, self.config, self.device = capture, config or SequenceConfig(), device
         self.rig = Rig(template, device)
         self.train_cameras, self.train_frames = _training_part(capture)
         behind = capture.recording.background or (0.0, 0.0, 0.0)
         self.background = torch.tensor(behind, dtype=torch.float32, device=device)
+        self.cloth = cloth
         self._motions: OrderedDict[int, Motion] = OrderedDict()
         self._expected: dict[tuple[str, int], Future[View]] = {}
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
@@ -142,6 +151,8 @@ class AvatarSequence:
 
     def motion(self, frame: int) -> Motion:
         """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.
+
+        Frames that training does not see have their clothes simulated, where there are some to simulate.
 
         Raises:
             InputError: no parameters of it.
@@ -237,7 +248,24 @@ class AvatarSequence:
         return params
 
     def _read_motion(self, frame: int) -> Motion:
-        return self.rig.motion(self.params(frame), frame=frame if frame in self.train_frames else None)
+        if frame in self.train_frames:
+            return self.rig.motion(self.params(frame), frame=frame)
+        motion = self.rig.motion(self.params(frame))
+        if self.cloth is None:
+            return motion
+        self.cloth.simulate(self._run_of(frame))
+        return self.rig.with_cloth(motion, self.cloth.shape(frame), time=self.cloth.time(frame))
+
+    def _run_of(self, frame: int) -> list[int]:
+        """Return the frames about one that training does not see either and that have parameters."""
+        frames, seen = self.capture.frames, set(self.train_frames)
+        at = first = last = frames.index(frame)
+        while first > 0 and frames[first - 1] not in seen:
+            first -= 1
+        while last + 1 < len(frames) and frames[last + 1] not in seen:
+            last += 1
+        run = frames[first : last + 1]
+        return [one for one in run if one == frames[at] or self.capture.params(one) is not None]
 
     def _read_view(self, camera: str, frame: int) -> View:
         whole = read_view(self.capture, camera, frame, normals=self.config.normals)

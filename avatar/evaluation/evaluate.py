@@ -33,6 +33,7 @@ from avatar.metrics.view_quality import (
     head_vertices,
     view_quality,
 )
+from avatar.models.student import Student
 from avatar.render.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
 from avatar.rig.rig import Motion, Rig
@@ -175,7 +176,7 @@ class _Run:
         sequence = self.sequence
         cameras = list(dict.fromkeys(c for one in self.sets.values() for c, f in one.views if f == frame))
         views = [sequence.whole_view(camera, frame) for camera in cameras]
-        skinned = sequence.rig.pose(sequence.motion(frame))
+        skinned = sequence.rig.pose(sequence.motion(frame).without_cloth())
         corners = skinned[self._head].double().cpu().numpy()
         heads = [head_box(corners, view.camera) for view in views]
         truth = alone = None
@@ -294,10 +295,10 @@ def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
 
 
 def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
-    """Pose a frame for a model's own template."""
+    """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
     motion = sequence.motion(frame)
     if model.rig is sequence.rig:
-        return motion
+        return motion if isinstance(model, Student) else motion.without_cloth()
     return model.rig.motion(_params(sequence, frame), frame=motion.frame)
 
 

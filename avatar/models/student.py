@@ -97,8 +97,8 @@ class Student(nn.Module):
 
     def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the student as cameras with these centres, metres, see it."""
-        displacements = self.displacements(motion)
-        vertices = self.rig.pose(motion, displacements)
+        displacements = self.rig.displaced(motion, self.displacements(motion))
+        vertices = self.rig.pose(motion.without_cloth(), displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.compensated(motion)
         world = world_from_frames(bound, frames)

@@ -13,12 +13,26 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from smplxpp.cloth.driver import ClothShape
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 
 THETA = 63
 """Length of theta: 21 body joints, axis-angle."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClothMotion:
+    """Where simulated cloth is in one pose.
+
+    Attributes:
+        displacements: metres along the axes of the T-pose, to be added before skinning.
+        share: in [0, 1]: how much of a vertex's displacement this is; a model's own is the rest.
+    """
+
+    displacements: Float32[Tensor, "V 3"]
+    share: Float32[Tensor, "V 1"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +45,8 @@ class Motion:
         rest: T-pose with this frame's expression and pose correctives, metres.
         world_from_rest: blended transforms of the vertices.
         root_from_world: takes the root's motion away.
+        cloth: where the loose clothes are, if they are simulated.
+        time: seconds since the motion began; None where nobody knows.
     """
 
     frame: int | None
@@ -40,6 +56,12 @@ class Motion:
     rest: Float32[Tensor, "V 3"]
     world_from_rest: Float32[Tensor, "V 3 4"]
     root_from_world: Float32[Tensor, "4 4"]
+    cloth: ClothMotion | None = None
+    time: float | None = None
+
+    def without_cloth(self) -> Motion:
+        """Return the same pose, its clothes moved by nothing but the model."""
+        return replace(self, cloth=None)
 
     def without_code(self) -> Motion:
         """Return the same pose, driven by the null code."""
@@ -118,12 +140,32 @@ class Rig:
             root_from_world=torch.eye(4, device=self.device),
         )
 
+    def with_cloth(self, motion: Motion, shape: ClothShape, *, time: float | None = None) -> Motion:
+        """Return a pose with the clothes where a simulation has them."""
+        at = torch.as_tensor(shape.vertices, device=self.device)
+        displacements = torch.zeros(len(self.vertices), 3, device=self.device)
+        share = torch.zeros(len(self.vertices), 1, device=self.device)
+        displacements[at] = self._tensor(shape.displacements)
+        share[at, 0] = self._tensor(shape.share)
+        return replace(motion, cloth=ClothMotion(displacements, share), time=time)
+
+    def displaced(
+        self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None
+    ) -> Float[Tensor, "V 3"] | None:
+        """Return a model's displacements, metres, with those of simulated clothes in their place; None for none."""
+        if motion.cloth is None:
+            return displacements
+        simulated = motion.cloth.share * motion.cloth.displacements
+        return simulated if displacements is None else simulated + (1.0 - motion.cloth.share) * displacements
+
     def pose(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"]:
         """Return the vertices in the world, metres, `x = (sum_j w_j G_j) (v + dv)`.
 
         Args:
-            displacements: dv, metres along the axes of the T-pose; gradients reach them.
+            displacements: dv, metres along the axes of the T-pose; gradients reach them. Where the motion has
+                simulated clothes, theirs take over.
         """
+        displacements = self.displaced(motion, displacements)
         rest = motion.rest if displacements is None else motion.rest + displacements
         return _Skinning.apply(rest, motion.world_from_rest)
 

@@ -1,0 +1,111 @@
+"""Simulated clothes along the frames of a capture: every run of frames in order, from a cold start before it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
+from smplxpp.cloth.poses import smoothed
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.template.template import Template
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClothMotionConfig:
+    """How clothes are simulated along a capture.
+
+    Attributes:
+        pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
+        smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
+            seconds; trackers shake waistbands. The body that is drawn is not smoothed.
+        driver: how motions are followed.
+    """
+
+    pre_roll: float = 0.7
+    smoothing: float = 0.03
+    driver: DriverConfig = field(default_factory=DriverConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("pre_roll", "smoothing"):
+            require_at_least(f"simulated clothes: {name}", getattr(self, name), 0.0)
+
+
+class ClothMotions:
+    """Shapes of clothes in frames of a motion, simulated when the first of a run is asked for, then kept.
+
+    Args:
+        template: the person. garments: cut from it.
+        params: pose of a frame, None where nobody knows it.
+        frames: all frames of the motion, ascending. fps: of their numbers.
+
+    Raises:
+        InputError: no frames a second.
+    """
+
+    def __init__(
+        self,
+        template: Template,
+        garments: Sequence[Garment],
+        *,
+        params: Callable[[int], BodyParams | None],
+        frames: Sequence[int],
+        fps: float,
+        config: ClothMotionConfig | None = None,
+    ) -> None:
+        require_positive("frames a second of a motion with simulated clothes", fps)
+        self.template, self.garments, self.config = template, tuple(garments), config or ClothMotionConfig()
+        self._params, self._frames, self._fps = params, np.array(sorted(frames), dtype=np.int64), fps
+        self._shapes: dict[int, ClothShape] = {}
+
+    def simulate(self, run: Sequence[int]) -> None:
+        """Simulate frames that follow each other, with what comes before them as their pre-roll; none twice.
+
+        Raises:
+            InputError: a frame that is not among the motion's.
+        """
+        run = sorted(set(run) - set(self._shapes))
+        if not run:
+            return
+        unknown = sorted(set(run) - set(self._frames.tolist()))
+        if unknown:
+            raise InputError("frames to simulate", expected="some of the motion's", received=str(unknown[:8]))
+        first = run[0] - self.config.pre_roll * self._fps
+        span = self._frames[(self._frames >= first) & (self._frames <= run[-1])].tolist()
+        known = [frame for frame in span if self._params(frame) is not None]
+        poses = self._smoothed(known)
+        driver = ClothDriver(self.template, self.garments, self.config.driver)
+        last: int | None = None
+        wanted = set(run)
+        for frame in span:
+            seconds = 1.0 if last is None else (frame - last) / self._fps
+            shape = driver.step(poses.get(frame), seconds) if frame in poses or last is not None else None
+            last = frame if frame in poses else last
+            if frame in wanted and shape is not None:
+                self._shapes[frame] = shape
+        for said in driver.said:
+            warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
+
+    def shape(self, frame: int) -> ClothShape:
+        """Return what the clothes do in a frame that was simulated."""
+        return self._shapes[frame]
+
+    def time(self, frame: int) -> float:
+        """Return the seconds since the motion's first frame."""
+        return float(frame - self._frames[0]) / self._fps
+
+    def _smoothed(self, frames: Sequence[int]) -> dict[int, BodyParams]:
+        """Poses by frame, smoothed within stretches of frames that follow each other evenly."""
+        out: dict[int, BodyParams] = {}
+        cuts = np.flatnonzero(np.diff(frames) != 1) + 1
+        for stretch in np.split(np.array(frames), cuts):
+            found = [self._params(int(frame)) for frame in stretch]
+            poses = BodyParams.concatenate([one for one in found if one is not None])
+            soft = smoothed(poses, radius=self.config.smoothing * self._fps)
+            out |= {int(frame): soft.frame(k) for k, frame in enumerate(stretch)}
+        return out
