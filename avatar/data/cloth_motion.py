@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -24,11 +25,13 @@ class ClothMotionConfig:
         pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
         smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
             seconds; trackers shake waistbands. The body that is drawn is not smoothed.
+        mode: "simulate", or "skin": the clothes stay where skinning has them.
         driver: how motions are followed.
     """
 
     pre_roll: float = 0.7
     smoothing: float = 0.03
+    mode: Literal["simulate", "skin"] = "simulate"
     driver: DriverConfig = field(default_factory=DriverConfig)
 
     def __post_init__(self) -> None:
@@ -75,6 +78,9 @@ class ClothMotions:
         unknown = sorted(set(run) - set(self._frames.tolist()))
         if unknown:
             raise InputError("frames to simulate", expected="some of the motion's", received=str(unknown[:8]))
+        if self.config.mode == "skin":
+            self._shapes |= dict.fromkeys(run, self._skinned())
+            return
         first = run[0] - self.config.pre_roll * self._fps
         span = self._frames[(self._frames >= first) & (self._frames <= run[-1])].tolist()
         known = [frame for frame in span if self._params(frame) is not None]
@@ -90,6 +96,11 @@ class ClothMotions:
                 self._shapes[frame] = shape
         for said in driver.said:
             warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
+
+    def _skinned(self) -> ClothShape:
+        vertices = np.concatenate([garment.vertices for garment in self.garments])
+        share = np.concatenate([garment.share() for garment in self.garments])
+        return ClothShape(vertices, np.zeros((len(vertices), 3), np.float32), share)
 
     def shape(self, frame: int) -> ClothShape:
         """Return what the clothes do in a frame that was simulated."""

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
 from avatar.gaussians.spherical_harmonics import coefficient_count
+from smplxpp.cloth.opening_webs import find_opening_webs
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
@@ -63,7 +64,8 @@ class SamplingConfig:
 def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> BoundGaussians:
     """Place Gaussians on the faces of a template, float32, lying flat, coloured as it is.
 
-    Every region (head, rest) gets its count in proportion to area or faces, hidden faces less. Samples are stratified
+    Every region (head, rest) gets its count in proportion to area or faces, hidden faces less, and faces that close an
+    opening of the clothes none: they are no cloth, and would hang in the air when it swings. Samples are stratified
     along the faces' order and follow a low-discrepancy sequence inside each face. Tangential scales start at
     `touch / sqrt(density)`, so that neighbours overlap.
 
@@ -73,6 +75,7 @@ def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> 
     config = config or SamplingConfig()
     mesh = template.mesh
     weights = mesh.face_areas * 1.0 if config.spread_by == "area" else (mesh.face_areas > 0).astype(float)
+    weights[find_opening_webs(template)] = 0.0
     head = np.zeros(mesh.face_count, dtype=bool) if config.head_share is None else head_faces(template)
     if config.hidden_density < 1.0:
         weights *= np.where(seen_faces(mesh), 1.0, config.hidden_density)

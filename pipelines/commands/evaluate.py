@@ -44,6 +44,9 @@ class Evaluate:
     held_out_poses: Literal["tracked", "both"] = "both"
     """Poses of held-out frames: as tracked, or beside them those that the run refined on the training cameras, where it
     has any."""
+    cloth: Literal["simulate", "field", "skin"] = "simulate"
+    """What moves the loose clothes of a student in held-out poses: a simulation, where the run has found loose parts;
+    its field; or skinning alone."""
     params: OptionalPath = None
     """Stacked body parameters to take instead of the capture's own, the same as for the training."""
     body: OptionalPath = None
@@ -111,6 +114,7 @@ class Evaluate:
                 config,
                 models=self.models,
                 refined=self.held_out_poses == "both",
+                cloth=self.cloth,
                 device=choose_device(self.device),
                 force=self.force,
                 progress=progress,

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from pipelines.stages.train import TrainConfig
 
 log = logging.getLogger(__name__)
-STAGES = ("refine", "fit", "teacher", "bake", "compensate")
+STAGES = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
+# Those that take steps, whose number options change.
+_STEPPED = ("fit", "teacher", "bake", "compensate")
 
 
 @dataclass(frozen=True)
@@ -35,19 +37,19 @@ class Train:
     """Options of `smplxpp train`. It trains what a run lacks; the same command goes on with what was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
-    """Folder that `smplxpp build` wrote; 66_refine, 70_bind, 80_teacher, 85_bake and 90_compensate go into it. Write
-    --run-folder with torchrun, which takes --run for an option of its own."""
+    """Folder that `smplxpp build` wrote; 66_refine, 70_bind, 80_teacher, 83_cloth, 85_bake and 90_compensate go into
+    it. Write --run-folder with torchrun, which takes --run for an option of its own."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
     """paper: the numbers that the paper states (docs/training.md lists the others), for a GPU; gpu: smaller and some
     hours; cpu: two cores, half an hour; demo: minutes, to see whether all fits together."""
     stage: Annotated[
-        Literal["refine", "teacher", "bake", "compensate"] | None,
-        tyro.conf.arg(metavar="{refine,teacher,bake,compensate}", help_behavior_hint="(optional)"),
+        Literal["refine", "teacher", "cloth", "bake", "compensate"] | None,
+        tyro.conf.arg(metavar="{refine,teacher,cloth,bake,compensate}", help_behavior_hint="(optional)"),
     ] = None
     """Train this stage alone; those before it must stand."""
-    until: Literal["refine", "fit", "teacher", "bake", "compensate"] = "compensate"
+    until: Literal["refine", "fit", "teacher", "cloth", "bake", "compensate"] = "compensate"
     """The last stage to train."""
     refine_poses: Literal["auto", "on", "off"] = "auto"
     """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where
@@ -79,6 +81,11 @@ class Train:
     """Size of the compact file with pruned blend shapes."""
     no_teacher: bool = False
     """Bake from the photographs alone, without stage 80."""
+    cloth: Literal["auto", "none"] = "auto"
+    """Clothes that are simulated in new motion. auto: those that leave skinning in the photographs and that a
+    simulation brings nearer to them; none: the field moves all."""
+    loose_parts: tuple[str, ...] = ()
+    """Simulate these parts, in the place of what --cloth auto finds: names as `smplxpp inspect` lists them."""
     perceptual: Literal["auto", "lpips", "st-lpips", "none"] = "auto"
     """Metric of the perceptual term. auto: LPIPS or else ST-LPIPS where the preset has the term and the package is
     installed; a name gives the term to any preset."""
@@ -162,6 +169,9 @@ class Train:
         """
         if self.no_teacher and "teacher" in (self.stage, self.until):
             raise InputError("option no-teacher", expected="another last stage than the teacher", received="teacher")
+        if self.cloth == "none" and (self.loose_parts or "cloth" in (self.stage, self.until)):
+            asked = f"loose parts {' '.join(self.loose_parts)}" if self.loose_parts else "the stage cloth"
+            raise InputError("option cloth", expected="auto", received=f"none, with {asked}")
         if self.stage is not None:
             return (self.stage,)
         return STAGES[: STAGES.index(self.until) + 1]
@@ -173,9 +183,10 @@ class Train:
             InputError: numbers out of range. MissingExtraError: a perceptual metric that is not installed.
         """
         from avatar.training.presets import training_preset
+        from pipelines.stages.cloth import ClothConfig
         from pipelines.stages.train import TrainConfig, with_batch, with_perceptual
 
-        given = {stage: getattr(self, f"{stage}_iterations") for stage in STAGES[1:]}
+        given = {stage: getattr(self, f"{stage}_iterations") for stage in _STEPPED}
         for name, value, least in (
             ("gaussians", self.gaussians, 1),
             ("batch", self.batch, 1),
@@ -199,6 +210,7 @@ class Train:
             perceptual=_perceptual(self.perceptual, preset),
             blend_shapes=self.blend_shapes,
             max_megabytes=self.max_megabytes,
+            cloth=None if self.cloth == "none" else ClothConfig(parts=self.loose_parts or None),
         )
 
     def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:

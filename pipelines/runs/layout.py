@@ -16,6 +16,7 @@ VALIDATE_STAGE = "65_validate"
 REFINE_STAGE = "66_refine"
 BIND_STAGE = "70_bind"
 TEACHER_STAGE = "80_teacher"
+CLOTH_STAGE = "83_cloth"
 BAKE_STAGE = "85_bake"
 COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
@@ -35,7 +36,7 @@ TEMPLATE_STAGES = (
 BUILD_STAGES = (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE, *TEMPLATE_STAGES)
 """The stages of `smplxpp build` in their order. Parameters that are not given come from a registration, or from the
 body found in a scan that comes alone, which a registration may start from."""
-TRAIN_STAGES = (TEACHER_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
+TRAIN_STAGES = (TEACHER_STAGE, CLOTH_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
 ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
@@ -60,6 +61,7 @@ TEMPLATE_ERRORS = f"{VALIDATE_STAGE}/errors.npz"
 GAUSSIANS = f"{BIND_STAGE}/gaussians.safetensors"
 SPLATS = f"{BIND_STAGE}/splats.ply"
 TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
+GARMENTS = f"{CLOTH_STAGE}/garments.npz"
 BAKED = f"{BAKE_STAGE}/student.safetensors"
 STUDENT = f"{COMPENSATE_STAGE}/student.safetensors"
 COMPACT_STUDENT = f"{COMPENSATE_STAGE}/student_compact.safetensors"

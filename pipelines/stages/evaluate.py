@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.protocol import (
@@ -31,9 +32,10 @@ from pipelines.figures.evaluation import surface_picture, write_tiles
 from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.digests import TRAINING, sha256_file
-from pipelines.runs.layout import EVALUATE_STAGE, REFINED_HELD_OUT_PARAMS
+from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
+from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
 from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.evaluate_poses import exact_params, pose_errors, refined_poses
@@ -48,6 +50,7 @@ from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.validation import require_known
 from smplxpp.metrics.distance import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
+from smplxpp.template.template import Template
 
 SEEN_OF_A_PIXEL = 0.05
 """How finely photographs place a surface, pixels; points of a clear pattern are found to 0.05 to 0.1.
@@ -65,6 +68,7 @@ def evaluate(
     *,
     models: tuple[str, ...] = (),
     refined: bool = True,
+    cloth: ClothMode = "simulate",
     device: str = "cpu",
     force: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -73,6 +77,7 @@ def evaluate(
 
     Args:
         models: names among `MODEL_FILES`; empty: `MEASURED`, as far as there are files.
+        cloth: what moves loose clothes of students in held-out poses, where the run has found some.
         refined: measure held-out poses that the run refined on training cameras too, where it has any.
         force: measure anew even if the stage stands.
         progress: called with frames done and all frames.
@@ -88,7 +93,8 @@ def evaluate(
     body = load_body(inputs.body)
     exact = exact_params(scene.capture, inputs.body, body)
     again = refined_poses(run, scene.capture) if refined else None
-    sequence = AvatarSequence(scene.capture, scene.template, device=device)
+    clothes = _Clothes(run, scene.template, cloth)
+    sequence = clothes.sequence(scene.capture, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
     refuse_seen(
         run,
@@ -97,11 +103,12 @@ def evaluate(
     )
     stage = Stage(
         name=EVALUATE_STAGE,
-        config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device},
+        config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device, "cloth": clothes.mode},
         inputs={
             **scene.digests,
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
             "capture/surfaces": surface_digest(scene.capture, config.protocol),
+            **clothes.digests,
             **({} if again is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}),
             **({} if exact is None else {"capture/exact parameters": params_digest(exact)}),
         },
@@ -115,7 +122,7 @@ def evaluate(
         if not sets:
             return {}
         held_out = replace(config, protocol=replace(config.protocol, sets=sets), speed_pictures=0, shown=0)
-        there = AvatarSequence(capture, scene.template, device=device)
+        there = clothes.sequence(capture, device=device)
         return evaluate_models(loaded, there, held_out, progress=progress).report.models
 
     def work(folder: Path) -> StageOutput:
@@ -139,6 +146,38 @@ def evaluate(
 
     with own_run_folder(run, (EVALUATE_STAGE, "report")):
         return run_stage(run, stage, work, force=force)
+
+
+class _Clothes:
+    """The loose clothes of a run, as an evaluation moves them."""
+
+    def __init__(self, run: Path, template: Template, mode: ClothMode) -> None:
+        self.template = template
+        self.garments = [] if mode == "field" else simulated_parts(run, template)
+        self.mode = mode if self.garments else "field"
+        self.digests = {GARMENTS: sha256_file(run / GARMENTS)} if self.garments else {}
+
+    def sequence(self, capture: Capture, *, device: str) -> AvatarSequence:
+        """Open a capture whose held-out frames have their clothes moved so."""
+        motions = None
+        if self.garments:
+            fps = capture.fps
+            if fps is None:
+                raise InputError(
+                    f"capture {capture.name}",
+                    expected="its frames a second, to simulate clothes",
+                    received="none",
+                    remedy="evaluate with --cloth field",
+                )
+            motions = ClothMotions(
+                self.template,
+                self.garments,
+                params=capture.params,
+                frames=capture.frames,
+                fps=fps,
+                config=ClothMotionConfig(mode="skin" if self.mode == "skin" else "simulate"),
+            )
+        return AvatarSequence(capture, self.template, device=device, cloth=motions)
 
 
 def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,10 +17,19 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
-from pipelines.runs.layout import BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, REFINE_STAGE, TEACHER_STAGE, TEMPLATE
+from pipelines.runs.layout import (
+    BAKE_STAGE,
+    BIND_STAGE,
+    CLOTH_STAGE,
+    COMPENSATE_STAGE,
+    REFINE_STAGE,
+    TEACHER_STAGE,
+    TEMPLATE,
+)
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
+from pipelines.stages.cloth import ClothConfig, ClothStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
@@ -33,7 +42,7 @@ from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
 Shapes = Literal["full", "local", "pruned"]
-STEPS = ("refine", "fit", "teacher", "bake", "compensate")
+STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
 """The steps of a training in their order, as the command line calls them."""
 
 
@@ -49,6 +58,7 @@ class TrainConfig:
         blend_shapes: "full": every Gaussian has its own columns (the paper); "local": 256 parts of the Gaussians have
             coefficients of their own, and 16 columns; "pruned": full, and the compact file keeps those that fit.
         max_megabytes: of the compact file of a pruned student.
+        cloth: which clothes are simulated in new motion; None: none is.
     """
 
     preset: TrainingPreset
@@ -57,6 +67,7 @@ class TrainConfig:
     perceptual: str = "none"
     blend_shapes: Shapes = "full"
     max_megabytes: float = 20.0
+    cloth: ClothConfig | None = field(default_factory=ClothConfig)
 
     @property
     def shapes(self) -> BlendShapeConfig:
@@ -86,8 +97,12 @@ def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
         config=preset.compensate,
         max_bytes=config.max_bytes,
     )
-    stages: dict[str, ModelStage] = {"fit": fit, "teacher": teacher, "bake": bake, "compensate": compensate}
-    return stages if config.teacher else {name: stage for name, stage in stages.items() if name != "teacher"}
+    stages: dict[str, ModelStage] = {"fit": fit}
+    if config.teacher:
+        stages["teacher"] = teacher
+        if config.cloth is not None:
+            stages["cloth"] = ClothStage(name=CLOTH_STAGE, teacher=teacher, config=config.cloth)
+    return {**stages, "bake": bake, "compensate": compensate}
 
 
 def train(

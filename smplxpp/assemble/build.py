@@ -16,7 +16,7 @@ from smplxpp.assemble.left_inside import LeftInside, find_left_inside, joints_ne
 from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.labels import SKIN
+from smplxpp.core.labels import LAYER_ORDER, SKIN
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights

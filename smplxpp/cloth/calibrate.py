@@ -194,9 +194,7 @@ def _found(
 
 def _particle_areas(garment: Garment) -> Float[np.ndarray, " n"]:
     rest = garment.rest
-    return sum(
-        np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=rest.vertex_count) for k in range(3)
-    )
+    return sum(np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=rest.vertex_count) for k in range(3))
 
 
 def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:
@@ -206,9 +204,7 @@ def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:
     return [float(np.sqrt(value * ordered[k])) for k in (at - 1, at + 1) if 0 <= k < len(ordered)]
 
 
-def _best_without(
-    table: dict[tuple[float, float], Float[np.ndarray, " T"]], block: np.ndarray
-) -> tuple[float, float]:
+def _best_without(table: dict[tuple[float, float], Float[np.ndarray, " T"]], block: np.ndarray) -> tuple[float, float]:
     return min(table, key=lambda pair: np.delete(table[pair], block).mean())
 
 

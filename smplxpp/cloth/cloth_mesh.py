@@ -1,4 +1,4 @@
-"""The mesh that is simulated: the webs of a scan's openings left out, few particles, lengths along the cloth."""
+"""The mesh that is simulated: openings, few particles, lengths along the cloth."""
 
 from __future__ import annotations
 
@@ -9,14 +9,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
-from smplxpp.core.topology import border_loops, face_components
+from smplxpp.core.topology import face_components
 
-# A web is as wide as the gap between a hem and what it hangs over, and no scanner sees farther in than that.
-WEB_REACH = 0.035
-# Cosine to the opening's axis from which a surface closes the opening instead of going on to it.
-WEB_VERTEX, WEB_FACE = 0.35, 0.2
-# Cosine of its axis to the vertical from which an opening looks up.
-UPWARDS = 0.3
 # Metres: shorter borders are holes.
 SHORTEST_OPENING = 0.15
 
@@ -38,7 +32,10 @@ def loop_length(mesh: TriangleMesh, loop: Int[np.ndarray, " n"]) -> float:
 def geodesics(
     mesh: TriangleMesh, sources: Int[np.ndarray, " S"]
 ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Return the length of the shortest way along edges from the nearest source, metres, and that source; inf and -1."""
+    """Return the length of the shortest way along edges from the nearest source, metres, and that source.
+
+    inf and -1 where no way leads there.
+    """
     distance, _, source = dijkstra(
         edge_graph(mesh), directed=False, indices=sources, min_only=True, return_predecessors=True
     )
@@ -51,28 +48,6 @@ def edge_graph(mesh: TriangleMesh, lengths: Float[np.ndarray, " E"] | None = Non
     if lengths is None:
         lengths = row_lengths(mesh.vertices[a] - mesh.vertices[b])
     return csr_matrix((np.maximum(lengths, 1e-9), (a, b)), shape=(n, n))
-
-
-def find_opening_webs(mesh: TriangleMesh) -> Bool[np.ndarray, " M"]:
-    """Find the faces of a scanned garment that close an opening: a scan has no depth under a hem or in a sleeve.
-
-    A scan runs from a hem's edge inwards to the leg. Such faces lie within `WEB_REACH` of the border and look along
-    the opening's axis, which cloth that goes on to the border does not. Openings that look up have none: shoulders lie
-    about a neckline and look up as well.
-    """
-    web = np.zeros(mesh.face_count, dtype=bool)
-    for loop in border_loops(mesh.faces):
-        if loop_length(mesh, loop) < SHORTEST_OPENING:
-            continue
-        axis = opening_axis(mesh, loop)
-        if axis[1] > UPWARDS:
-            continue
-        near = geodesics(mesh, loop)[0] < WEB_REACH
-        looks = near & (mesh.vertex_normals @ axis > WEB_VERTEX)
-        corners = looks[mesh.faces]
-        along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > WEB_FACE)
-        web |= corners.all(axis=1) | (corners.any(axis=1) & along)
-    return web
 
 
 def largest_piece(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
@@ -117,9 +92,7 @@ def coarsen(mesh: TriangleMesh, spacing: float) -> tuple[Int[np.ndarray, " n"], 
     return seeds[kept], place[faces]
 
 
-def lengths_along(
-    mesh: TriangleMesh, ends: Int[np.ndarray, "E 2"], *, samples: int = 24
-) -> Float[np.ndarray, " E"]:
+def lengths_along(mesh: TriangleMesh, ends: Int[np.ndarray, "E 2"], *, samples: int = 24) -> Float[np.ndarray, " E"]:
     """Return how long the chords between vertices are when they are laid onto the mesh, metres.
 
     A chord cuts the corners of every fold; cloth that was given its length would shrink.
@@ -132,9 +105,7 @@ def lengths_along(
     return np.linalg.norm(np.diff(way, axis=1), axis=2).sum(axis=1)
 
 
-def _farthest(
-    points: Float[np.ndarray, "N 3"], used: Int[np.ndarray, " U"], count: int
-) -> Int[np.ndarray, " count"]:
+def _farthest(points: Float[np.ndarray, "N 3"], used: Int[np.ndarray, " U"], count: int) -> Int[np.ndarray, " count"]:
     """Farthest-point sampling of the used points, from the first one on."""
     at = points[used]
     chosen, distance = [0], row_lengths(at - at[0])

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from scipy.sparse import csr_matrix
 
-from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.body.model import PosedBody
 from smplxpp.cloth.fabric import SolverConfig
 from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.thread import GarmentThread
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -81,9 +81,7 @@ class ClothDriver:
         InputError: no garment, or one of another template.
     """
 
-    def __init__(
-        self, template: Template, garments: Sequence[Garment], config: DriverConfig | None = None
-    ) -> None:
+    def __init__(self, template: Template, garments: Sequence[Garment], config: DriverConfig | None = None) -> None:
         if not garments:
             raise InputError("loose parts to simulate", expected="at least one garment", received="none")
         self.template, self.config = template, config or DriverConfig()
@@ -213,7 +211,7 @@ def _blended(weights: csr_matrix, posed: PosedBody) -> Float32[np.ndarray, "N 3 
 def _solved(
     matrices: Float32[np.ndarray, "N 3 3"], right: Float32[np.ndarray, "N 3"]
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 1"]]:
-    """The solutions of `A x = b` by Cramer's rule, and the determinants; LAPACK takes ten times as long for so small A."""
+    """The solutions of `A x = b` by Cramer's rule, and the determinants: ten times as fast as LAPACK for so small A."""
     columns = np.ascontiguousarray(matrices.transpose(2, 1, 0))
     b = np.ascontiguousarray(right.T)
     across = [_cross(columns[1], columns[2]), _cross(columns[2], columns[0]), _cross(columns[0], columns[1])]

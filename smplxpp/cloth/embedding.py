@@ -32,9 +32,7 @@ class Embedding:
         place = sum(self.weights[:, k : k + 1] * x[self.corners[:, k]] for k in range(3))
         normal = _unit(sum(self.weights[:, k : k + 1] * normals[self.corners[:, k]] for k in range(3)))
         first, second = _tangents(x, self.corners)
-        return (
-            place + self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
-        )
+        return place + self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
 
 
 def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
@@ -43,9 +41,7 @@ def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     corners = coarse.faces[face]
     weights = np.clip(np.nan_to_num(barycentric_coordinates(near, coarse.vertices[corners]), nan=1 / 3), 0.0, 1.0)
     weights /= weights.sum(axis=1, keepdims=True)
-    zero = Embedding(
-        corners.astype(np.int32), weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32)
-    )
+    zero = Embedding(corners.astype(np.int32), weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32))
     missing = points - zero.carried(coarse)
     normals = _smooth_normals(coarse)
     normal = _unit(sum(weights[:, k : k + 1] * normals[corners[:, k]] for k in range(3)))

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from smplxpp.cloth.carriers import find_carriers
-from smplxpp.cloth.cloth_mesh import coarsen, find_opening_webs, geodesics, largest_piece, lengths_along
+from smplxpp.cloth.cloth_mesh import coarsen, geodesics, largest_piece, lengths_along
 from smplxpp.cloth.collider import ColliderMesh, collider_of
 from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import ClothModel, build_model
+from smplxpp.cloth.opening_webs import find_opening_webs
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -84,7 +85,7 @@ class Garment:
         return build_model(self.rest, self.pinned * 1.0, self.config.fabric, lengths=self.lengths)
 
     def share(self) -> Float32[np.ndarray, " N"]:
-        """Return how much of a carried vertex's displacement is the simulation's, 0 at the pins and 1 beyond the band."""
+        """Return how much of each vertex's displacement is the simulation's: 0 at the pins, 1 beyond the band."""
         t = np.clip((self.vertex_depth - self.config.pin_depth) / self.config.band, 0.0, 1.0)
         return np.where(np.isfinite(self.vertex_depth), t * t * (3.0 - 2.0 * t), 0.0).astype(np.float32)
 
@@ -93,9 +94,7 @@ class Garment:
         return replace(self, config=config)
 
 
-def cut_garment(
-    template: Template, part: str, reference: BodyParams, config: GarmentConfig | None = None
-) -> Garment:
+def cut_garment(template: Template, part: str, reference: BodyParams, config: GarmentConfig | None = None) -> Garment:
     """Make a part of a template ready to be simulated.
 
     Args:
@@ -108,7 +107,7 @@ def cut_garment(
     require_choice("loose part", part, [name for name in template.part_names if name != BODY_PART])
     posed = TriangleMesh(template.pose(reference)[0], template.faces)
     cloth, index = posed.submesh(template.part_faces(part))
-    kept = largest_piece(cloth, ~find_opening_webs(cloth))
+    kept = largest_piece(cloth, ~find_opening_webs(template)[template.part_faces(part)])
     if not cloth.face_areas[kept].sum() > 0:
         raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside webs")
     sheet, of_cloth = cloth.submesh(kept)

@@ -115,9 +115,7 @@ def _edge_areas(rest: TriangleMesh) -> Float[np.ndarray, " e"]:
 
 def _hinges(
     rest: TriangleMesh, fixed: np.ndarray, stiffness: float
-) -> tuple[
-    Int32[np.ndarray, "b 4"], Float32[np.ndarray, "b 4"], Float32[np.ndarray, " b"], Float32[np.ndarray, " b"]
-]:
+) -> tuple[Int32[np.ndarray, "b 4"], Float32[np.ndarray, "b 4"], Float32[np.ndarray, " b"], Float32[np.ndarray, " b"]]:
     """Pairs of triangles that resist bending (the quadratic model of Bergou et al. 2006, with curvature at rest).
 
     With `c` the cotangent weights of an inner edge, `sum_i c_i x_i` is the curvature of the hinge as a vector; its part
@@ -170,7 +168,11 @@ def _tethers(
     if not fixed.any():
         return np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n)
     distance, _, source = dijkstra(
-        edge_graph(rest, lengths), directed=False, indices=np.flatnonzero(fixed), min_only=True, return_predecessors=True
+        edge_graph(rest, lengths),
+        directed=False,
+        indices=np.flatnonzero(fixed),
+        min_only=True,
+        return_predecessors=True,
     )
     held = np.isfinite(distance) & ~fixed
     anchor = np.where(held, source, -1)

@@ -11,6 +11,7 @@ from pipelines.figures import (
     render_shaded,
 )
 from pipelines.report import CheckRow, KeyNumber, Picture, Report, Section, write_report
+from pipelines.report.sections.cloth import cloth_section
 from pipelines.report.sections.evaluation import (
     evaluation_figures,
     evaluation_key_numbers,
@@ -38,6 +39,7 @@ from pipelines.runs.layout import (
     ASSEMBLE_STAGE,
     BIND_STAGE,
     BUILD_STAGES,
+    CLOTH_STAGE,
     EVALUATE_STAGE,
     LOCATE_STAGE,
     RECONSTRUCT_STAGE,
@@ -103,7 +105,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         poses_section(run, template, reference, inputs),
         *_optional(poses, "Poses", refine_section),
         *_optional(fit, "Gaussians", fit_section),
-        *(section for record in trainings.values() for section in _optional(record, "Training", training_section)),
+        *(section for record in trainings.values() for section in _optional(record, "Training", _trained)),
         *_optional(evaluation, "Avatar: figures", evaluation_figures),
         *_optional(evaluation, "Avatar: side by side", evaluation_views),
     )
@@ -144,6 +146,10 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         },
     )
     return write_report(run / "report.html", report)
+
+
+def _trained(record: StageRecord) -> Section:
+    return (cloth_section if record.folder.name == CLOTH_STAGE else training_section)(record)
 
 
 def _optional(record: StageRecord | None, title: str, make: Callable[[StageRecord], Section]) -> tuple[Section, ...]:

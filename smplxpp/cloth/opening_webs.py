@@ -1,0 +1,58 @@
+"""Webs of openings: faces with which a scan closes the gap under a hem or in a sleeve, where it has no depth."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool
+
+from smplxpp.cloth.cloth_mesh import SHORTEST_OPENING, geodesics, loop_length, opening_axis
+from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.topology import border_loops
+from smplxpp.template.template import BODY_PART, Template
+
+# Metres from an opening's border: a web is as wide as the gap between a hem and what it hangs over.
+REACH = 0.035
+# Cosine to the opening's axis from which a surface closes the opening instead of going on to it.
+_VERTEX, _FACE = 0.35, 0.2
+# Cosine of its axis to the vertical from which an opening looks up: shoulders lie about a neckline and look up as well.
+_UPWARDS = 0.3
+# Metres behind a web at which there is nothing but the inside of the garment; behind cloth that lies on the body there
+# is the body.
+_HOLLOW = (0.03, 0.06)
+
+
+def find_opening_webs(template: Template) -> Bool[np.ndarray, " F"]:
+    """Find the faces of a template's clothes that close an opening, in the T-pose.
+
+    A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
+    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them.
+    """
+    out = np.zeros(len(template.faces), dtype=bool)
+    body = SignedDistanceField(template.part_mesh(BODY_PART), solid=True)
+    for part in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
+        faces = template.part_faces(part)
+        out[faces] = _webs_of(template.mesh.submesh(faces)[0], body)
+    return out
+
+
+def _webs_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
+    web = np.zeros(mesh.face_count, dtype=bool)
+    for loop in border_loops(mesh.faces):
+        if loop_length(mesh, loop) < SHORTEST_OPENING:
+            continue
+        axis = opening_axis(mesh, loop)
+        if axis[1] > _UPWARDS:
+            continue
+        near = geodesics(mesh, loop)[0] < REACH
+        looks = (near & (mesh.vertex_normals @ axis > _VERTEX))[mesh.faces]
+        along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > _FACE)
+        web |= looks.all(axis=1) | (looks.any(axis=1) & along)
+    found = np.flatnonzero(web)
+    for depth in _HOLLOW:
+        behind = mesh.face_centers[found] - depth * mesh.face_normals[found]
+        found = found[body.query(behind).distance > 0] if len(found) else found
+    web[:] = False
+    web[found] = True
+    return web
