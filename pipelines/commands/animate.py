@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +18,11 @@ from pipelines.commands.options import OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import GARMENTS
+from smplxpp.cloth import Garment, cut_garment
+from smplxpp.cloth.garment_file import load_garments
+from smplxpp.cloth.play import play
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
@@ -27,6 +33,7 @@ from smplxpp.template.template import Template
 
 DEFAULT_FPS = 20.0
 _FRAMING_POSES = 24  # poses that the camera is fitted to
+_PRE_ROLL = 0.7  # seconds of the motion before the first frame that loose clothes follow
 _BLOCK = 16  # frames posed at a time
 _SMALLEST = 16  # pixels of a picture
 
@@ -47,6 +54,11 @@ class Animate:
     """Where the camera stands; turntable: once around over the whole film."""
     colors: Literal["scan", "labels", "semantic", "weights", "none"] = "scan"
     """Colours of the surface (pictures only; a GLB has those of the scan)."""
+    cloth: Literal["simulate", "skin"] = "simulate"
+    """What moves the loose clothes that the run has found (83_cloth), or that --loose-parts names: a simulation, or the
+    joints alone. A GLB's clothes always follow the joints."""
+    loose_parts: tuple[str, ...] = ()
+    """Simulate these parts of the template, in the place of those that training found."""
     height: int = 720
     """Height of the picture in pixels."""
     width: OptionalInt = None
@@ -59,27 +71,33 @@ class Animate:
     """Take every step-th frame."""
     json: bool = False
     """Print what was written as JSON."""
+    _said: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
 
     def run(self) -> dict:
         """Pose the template frame by frame and write the result, whole or not at all."""
         suffix = self.out.suffix.lower()
         self._check_options(suffix)
         template = load_run_template(self.run_folder)
-        params, fps = self._load_params(template)
+        params, fps, before = self._load_params(template)
+        garments = [] if self.cloth == "skin" or suffix == ".glb" else self._garments(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
 
             write_glb(self.out, template, animation=params)
         else:
-            posed = _pose_blocks(template, params)
-            # The first block is posed before any file is touched: parameters of another body are refused here.
+            posed = self._posed(template, garments, before, params, fps)
+            # The first frame is posed before any file is touched: parameters of another body are refused here.
             first = next(posed)
             cameras = self._cameras(template, params)
-            frames = self._frames(template, _chain(first, posed), cameras)
+            frames = self._frames(template, chain([first], posed), cameras)
             write_film(self.out, frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         if not self.json:
-            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second", markup=False)
-        return {"out": str(self.out), "frames": len(params), "fps": fps}
+            moved = f", simulated: {', '.join(garment.part for garment in garments)}" if garments else ""
+            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second{moved}", markup=False)
+            for sentence in self._said:
+                Console(stderr=True).print(sentence, markup=False)
+        simulated = [garment.part for garment in garments]
+        return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "said": self._said}
 
     def _check_options(self, suffix: str) -> None:
         if suffix not in (*SUFFIXES, ".glb"):
@@ -105,8 +123,11 @@ class Animate:
                     received=f"{foreign[0]} in it" if self.out.is_dir() else "a file",
                 )
 
-    def _load_params(self, template: Template) -> tuple[BodyParams, float]:
-        """Read the chosen frames, and how many of them a second shows."""
+    def _load_params(self, template: Template) -> tuple[BodyParams, float, BodyParams]:
+        """Read the chosen frames, how many of them a second shows, and the motion up to the last of them.
+
+        That has all frames, begins a moment before the first one, and is what loose clothes follow.
+        """
         params = load_params_for(template, self.params)
         count = len(params)
         chosen = range(count)[self.start : self.stop : self.step]
@@ -117,7 +138,30 @@ class Animate:
                 received=f"--start {self.start} --stop {self.stop} --step {self.step}",
             )
         fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
-        return replace(params.select(list(chosen)), fps=fps), fps
+        begin = max(0, chosen[0] - round(_PRE_ROLL * fps * self.step))
+        whole = params.select(slice(begin, chosen[-1] + 1))
+        return replace(params.select(list(chosen)), fps=fps), fps, whole
+
+    def _garments(self, template: Template) -> list[Garment]:
+        """Read the loose parts of the run, or cut those that were asked for."""
+        if not self.loose_parts:
+            path = self.run_folder / GARMENTS
+            return load_garments(path, template) if path.is_file() else []
+        reference = load_params_of_run(self.run_folder).frame(0).without_shape()
+        return [cut_garment(template, part, reference) for part in self.loose_parts]
+
+    def _posed(
+        self, template: Template, garments: list[Garment], whole: BodyParams, chosen: BodyParams, fps: float
+    ) -> Iterator[Float[np.ndarray, "V 3"]]:
+        """Pose the chosen frames one by one."""
+        if not garments:
+            yield from _pose_blocks(template, chosen)
+            return
+        surfaces = play(template, garments, whole, fps=fps * self.step, said=self._said)
+        first = len(whole) - 1 - (len(chosen) - 1) * self.step
+        for k, vertices in enumerate(surfaces):
+            if k >= first and (k - first) % self.step == 0:
+                yield vertices
 
     def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
         """Place a camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
@@ -147,15 +191,7 @@ class Animate:
             yield render_shaded(template.mesh.with_vertices(vertices), camera, vertex_colors=colors)
 
 
-def _pose_blocks(template: Template, params: BodyParams) -> Iterator[Float[np.ndarray, "t V 3"]]:
-    """Pose blocks of at most `_BLOCK` frames, so that long motions fit in memory."""
+def _pose_blocks(template: Template, params: BodyParams) -> Iterator[Float[np.ndarray, "V 3"]]:
+    """Pose frames in blocks of at most `_BLOCK`, so that long motions fit in memory."""
     for begin in range(0, len(params), _BLOCK):
-        yield template.pose(params.select(slice(begin, begin + _BLOCK)))
-
-
-def _chain(
-    first: Float[np.ndarray, "t V 3"], rest: Iterator[Float[np.ndarray, "_ V 3"]]
-) -> Iterator[Float[np.ndarray, "V 3"]]:
-    yield from first
-    for block in rest:
-        yield from block
+        yield from template.pose(params.select(slice(begin, begin + _BLOCK)))

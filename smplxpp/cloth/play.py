@@ -1,0 +1,46 @@
+"""A template's surface along a motion, its loose clothes simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from smplxpp.cloth.driver import ClothDriver, DriverConfig
+from smplxpp.cloth.garment import Garment
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
+from smplxpp.template.template import Template
+
+
+def play(
+    template: Template,
+    garments: Sequence[Garment],
+    params: BodyParams,
+    *,
+    fps: float,
+    config: DriverConfig | None = None,
+    said: list[str] | None = None,
+) -> Iterator[Float[np.ndarray, "V 3"]]:
+    """Yield the posed surface of every frame, metres; the clothes start cold before the first one.
+
+    Args:
+        params: T frames, evenly spaced. fps: of them.
+        said: takes the sentences of the driver on what went otherwise than asked for.
+    """
+    require_positive("frames a second", fps)
+    driver = ClothDriver(template, garments, config)
+    weights = template.weights.dense()
+    count = template.body.vertex_count
+    for k in range(len(params)):
+        frame = params.frame(k)
+        posed = template.posed_body(frame)
+        shape = driver.step(frame, 1.0 / fps, posed=posed)
+        rest = template.vertices.copy()
+        rest[:count] = posed.rest_vertices[0]
+        rest[shape.vertices] += shape.share[:, None] * shape.displacements
+        blended = (weights @ posed.posed_from_rest[0, :, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+        if said is not None:
+            said += driver.said[len(said) :]
+        yield np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]
