@@ -28,11 +28,16 @@ class Embedding:
 
     def carried(self, coarse: TriangleMesh) -> Float[np.ndarray, "N 3"]:
         """Return the fine vertices where the coarse mesh takes them, metres."""
+        return self.carried_with_normals(coarse)[0]
+
+    def carried_with_normals(self, coarse: TriangleMesh) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """Return the fine vertices, metres, and the coarse mesh's smooth unit normals at them."""
         x, normals = coarse.vertices, _smooth_normals(coarse)
         place = sum(self.weights[:, k : k + 1] * x[self.corners[:, k]] for k in range(3))
         normal = _unit(sum(self.weights[:, k : k + 1] * normals[self.corners[:, k]] for k in range(3)))
         first, second = _tangents(x, self.corners)
-        return place + self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
+        moved = self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
+        return place + moved, normal
 
 
 def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:

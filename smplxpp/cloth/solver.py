@@ -116,3 +116,26 @@ class ClothSolver:
             ctypes.c_int32(self.config.contacts_every),
             *(address(state.position), address(state.velocity)),
         )
+
+
+def push_out(
+    points: Float32[np.ndarray, "N 3"],
+    normals: Float32[np.ndarray, "N 3"],
+    surface: Float32[np.ndarray, "c 3"],
+    collider: Collider,
+    *,
+    margin: float,
+) -> Float32[np.ndarray, "N 3"]:
+    """Return points that lie behind a surface moved to `margin` metres before it, along its smooth normal.
+
+    Args:
+        normals: of the cloth at the points; skin that faces its outer side is not looked at.
+        surface: the collider's vertices now, metres.
+    """
+    out = np.array(points, dtype=np.float32)
+    native_library().smplxpp_cloth_push_out(
+        *(ctypes.c_int64(len(out)), address(out), address(np.ascontiguousarray(normals, dtype=np.float32))),
+        *(ctypes.c_int64(len(surface)), address(surface), address(collider.faces, "int32")),
+        *(ctypes.c_int64(len(collider.faces)), ctypes.c_float(margin), address(collider.deepest)),
+    )
+    return out

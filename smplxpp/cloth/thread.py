@@ -9,11 +9,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from smplxpp.cloth.garment import Garment
-from smplxpp.cloth.solver import ClothSolver, ClothState
+from smplxpp.cloth.solver import ClothSolver, ClothState, push_out
 from smplxpp.core.mesh import row_lengths
 
 if TYPE_CHECKING:
     from smplxpp.cloth.driver import DriverConfig
+
+# Metres that what is carried keeps from the skin.
+_FINE_MARGIN = 0.002
 
 
 class GarmentThread:
@@ -75,8 +78,16 @@ class GarmentThread:
         return self._state.position.copy()
 
     def carried(self) -> Float[np.ndarray, "N 3"]:
-        """Return the vertices that the garment carries, world, metres."""
-        return self.garment.embedding.carried(self.garment.rest.with_vertices(self._state.position))
+        """Return the vertices that the garment carries, world, metres, `_FINE_MARGIN` outside of what it touches.
+
+        Between particles that keep their margin a limb's curve can come through.
+        """
+        coarse = self.garment.rest.with_vertices(self._state.position)
+        points, normals = self.garment.embedding.carried_with_normals(coarse)
+        if not self._surfaces or not len(self._skin):
+            return points
+        collider = self._solver.collider
+        return push_out(points.astype(np.float32), normals, self._surfaces[-1], collider, margin=_FINE_MARGIN)
 
     def laid_over(
         self, vertices: Int64[np.ndarray, " c"], surface: Float32[np.ndarray, "c 3"]

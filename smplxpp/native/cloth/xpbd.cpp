@@ -110,17 +110,65 @@ void normals(const Vec3* x, const int32_t* face, int64_t faces, std::vector<Vec3
     for (Vec3& n : out) n = n * (1.0f / std::max(length(n), 1e-12f));
 }
 
+// A moving surface that cloth may touch: where a point's nearest vertex is, and the nearest place on that vertex's faces.
+class Surface {
+public:
+    Surface(int64_t vertices, const int32_t* face, int64_t faces)
+        : face_(face), faces_(faces), normal_(size_t(vertices)), first_(size_t(vertices) + 1, 0), at_(3 * size_t(faces)) {
+        for (size_t i = 0; i < at_.size(); ++i) ++first_[size_t(face[i]) + 1];
+        for (size_t i = 0; i + 1 < first_.size(); ++i) first_[i + 1] += first_[i];
+        std::vector<int32_t> next(first_.begin(), first_.end() - 1);
+        for (size_t i = 0; i < at_.size(); ++i) at_[size_t(next[size_t(face[i])]++)] = int32_t(i / 3);
+    }
+    // Take the vertices as they are now; find() looks among these.
+    void look(const Vec3* vertex) {
+        vertex_ = vertex;
+        normals(vertex, face_, faces_, normal_);
+        grid_.fill(vertex, int64_t(normal_.size()), kReach);
+    }
+    Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
+
+    Contact find(Vec3 p, Vec3 cloth_normal) const {
+        Contact found = {-1, {0, 0, 0}};
+        int32_t near = -1;
+        float best = kReach * kReach;
+        grid_.around(p, [&](int32_t j) {
+            const Vec3 d = p - vertex_[j];
+            const float squared = dot(d, d);
+            // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
+            if (squared < best && dot(normal_[size_t(j)], cloth_normal) > kCovers) best = squared, near = j;
+        });
+        if (near < 0) return found;
+        best = 1e9f;
+        for (int32_t k = first_[size_t(near)]; k < first_[size_t(near) + 1]; ++k) {
+            const int32_t* q = face_ + 3 * int64_t(at_[size_t(k)]);
+            float weight[3];
+            const Vec3 d = p - smplxpp::closest_on_triangle(p, vertex_[q[0]], vertex_[q[1]], vertex_[q[2]], weight);
+            if (!(dot(d, d) < best)) continue;  // nor a triangle without area
+            best = dot(d, d);
+            found.face = at_[size_t(k)];
+            std::copy(weight, weight + 3, found.weight);
+        }
+        return found;
+    }
+
+private:
+    static constexpr float kReach = 0.035f;   // metres within which a vertex is found
+    static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
+    const int32_t* face_;
+    int64_t faces_;
+    const Vec3* vertex_ = nullptr;
+    std::vector<Vec3> normal_;
+    std::vector<int32_t> first_, at_;
+    Grid grid_;
+};
+
 class Solver {
 public:
     Solver(const Model& m, const Forces& f, Vec3* position, Vec3* velocity)
         : m_(m), f_(f), x_(position), v_(velocity), n_(size_t(m.particles)), before_(n_), place_(n_), normal_(n_),
-          skin_(size_t(m.collider_vertices)), skin_before_(skin_.size()), skin_normal_(skin_.size()),
-          contact_(n_, Contact{-1, {0, 0, 0}}), first_(skin_.size() + 1, 0), faces_(3 * size_t(m.collider_faces)) {
-        for (size_t i = 0; i < faces_.size(); ++i) ++first_[size_t(m.collider_face[i]) + 1];
-        for (size_t i = 0; i < skin_.size(); ++i) first_[i + 1] += first_[i];
-        std::vector<int32_t> at(first_.begin(), first_.end() - 1);
-        for (size_t i = 0; i < faces_.size(); ++i) faces_[size_t(at[size_t(m.collider_face[i])]++)] = int32_t(i / 3);
-    }
+          skin_(size_t(m.collider_vertices)), skin_before_(skin_.size()),
+          surface_(m.collider_vertices, m.collider_face, m.collider_faces), contact_(n_, Contact{-1, {0, 0, 0}}) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
         const float h = seconds / float(substeps);
@@ -219,35 +267,10 @@ private:
         }
     }
 
-    // The nearest collider vertex's faces, the nearest point on them.
     void find_contacts() {
-        normals(skin_.data(), m_.collider_face, m_.collider_faces, skin_normal_);
-        grid_.fill(skin_.data(), m_.collider_vertices, kReach);
-        for (size_t i = 0; i < n_; ++i) {
-            contact_[i].face = -1;
-            if (w(int64_t(i)) == 0) continue;
-            const Vec3 p = x_[i];
-            int32_t near = -1;
-            float best = kReach * kReach;
-            grid_.around(p, [&](int32_t j) {
-                const Vec3 d = p - skin_[size_t(j)];
-                const float squared = dot(d, d);
-                // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
-                if (squared < best && dot(skin_normal_[size_t(j)], normal_[i]) > kCovers) best = squared, near = j;
-            });
-            if (near < 0) continue;
-            best = 1e9f;
-            for (int32_t k = first_[size_t(near)]; k < first_[size_t(near) + 1]; ++k) {
-                const int32_t* q = m_.collider_face + 3 * int64_t(faces_[size_t(k)]);
-                float weight[3];
-                const Vec3 d = p - smplxpp::closest_on_triangle(p, skin_[size_t(q[0])], skin_[size_t(q[1])],
-                                                               skin_[size_t(q[2])], weight);
-                    if (!(dot(d, d) < best)) continue;  // nor a triangle without area
-                best = dot(d, d);
-                contact_[i].face = faces_[size_t(k)];
-                std::copy(weight, weight + 3, contact_[i].weight);
-            }
-        }
+        surface_.look(skin_.data());
+        for (size_t i = 0; i < n_; ++i)
+            contact_[i] = w(int64_t(i)) == 0 ? Contact{-1, {0, 0, 0}} : surface_.find(x_[i], normal_[i]);
     }
 
     // Out of the collider along its smooth normal; Coulomb's friction against its own motion.
@@ -262,7 +285,7 @@ private:
             for (int j = 0; j < 3; ++j) {
                 p = p + skin_[size_t(q[j])] * b[j];
                 was = was + skin_before_[size_t(q[j])] * b[j];
-                n = n + skin_normal_[size_t(q[j])] * b[j];
+                n = n + surface_.normal(q[j]) * b[j];
                 margin += m_.margin[q[j]] * b[j];
                 deepest += m_.deepest[q[j]] * b[j];
             }
@@ -335,9 +358,6 @@ private:
         }
     }
 
-    static constexpr float kReach = 0.035f;   // metres within which a collider vertex is found
-    static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
-
     struct Pair {
         int32_t i, j;
     };
@@ -345,12 +365,12 @@ private:
     const Forces& f_;
     Vec3 *x_, *v_;
     size_t n_;
-    std::vector<Vec3> before_, place_, normal_, skin_, skin_before_, skin_normal_;
+    std::vector<Vec3> before_, place_, normal_, skin_, skin_before_;
+    Surface surface_;
     std::vector<Contact> contact_;
-    std::vector<int32_t> first_, faces_;
     std::vector<Pair> pairs_;
     std::vector<int64_t> linked_;
-    Grid grid_, own_;
+    Grid own_;
 };
 
 void check(const Model& m) {
@@ -372,5 +392,35 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_advance(const Model* model, const Forces* f
         check(*model);
         if (substeps < 1 || contacts_every < 1) throw std::out_of_range("substeps");
         Solver(*model, *forces, (Vec3*)position, (Vec3*)velocity).advance(*moments, seconds, substeps, contacts_every);
+    });
+}
+
+// Moves n points (3 n metres, in place) with outward normals to `margin` metres outside a surface of c vertices and d faces,
+// where they lie less than `deepest` metres behind it.
+SMPLXPP_EXPORT int32_t smplxpp_cloth_push_out(int64_t n, float* points, const float* normals, int64_t c, const float* vertices,
+                                              const int32_t* faces, int64_t d, float margin, const float* deepest) {
+    return smplxpp::guarded([&] {
+        smplxpp::check_indices(faces, 3 * d, c);
+        Surface surface(c, faces, d);
+        const Vec3* skin = (const Vec3*)vertices;
+        surface.look(skin);
+        for (int64_t i = 0; i < n; ++i) {
+            Vec3& p = ((Vec3*)points)[i];
+            const Contact contact = surface.find(p, ((const Vec3*)normals)[i]);
+            if (contact.face < 0) continue;
+            const int32_t* q = faces + 3 * int64_t(contact.face);
+            Vec3 foot = {0, 0, 0}, normal = {0, 0, 0};
+            float most = 0;
+            for (int j = 0; j < 3; ++j) {
+                foot = foot + skin[q[j]] * contact.weight[j];
+                normal = normal + surface.normal(q[j]) * contact.weight[j];
+                most += deepest[q[j]] * contact.weight[j];
+            }
+            const float l = length(normal);
+            if (l < 1e-6f) continue;
+            normal = normal * (1.0f / l);
+            const float height = dot(p - foot, normal);
+            if (height < margin && height > -most) p = p + normal * (margin - height);
+        }
     });
 }
