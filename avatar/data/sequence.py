@@ -140,6 +140,10 @@ class AvatarSequence:
         self._expected: dict[tuple[str, int], Future[View]] = {}
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
 
+    def with_cloth(self, cloth: ClothMotions) -> AvatarSequence:
+        """Return the same capture with clothes simulated; it shares the images."""
+        return AvatarSequence(self.capture, self.rig.template, self.config, device=self.device, cloth=cloth)
+
     @cached_property
     def normal_maps(self) -> int:
         """The number of training views that have a normal map, none where they are not read."""
@@ -163,6 +167,17 @@ class AvatarSequence:
                 self._motions.popitem(last=False)
         self._motions.move_to_end(frame)
         return self._motions[frame]
+
+    def as_new_motion(self, frame: int) -> Motion:
+        """Return the pose of a training frame as if it were new: without its code, its clothes simulated.
+
+        All training frames are simulated when the first one is asked for, in order and from one cold start.
+        """
+        motion = self.motion(frame).as_new()
+        if self.cloth is None:
+            return motion
+        self.cloth.simulate(self.train_frames)
+        return self.rig.with_cloth(motion, self.cloth.shape(frame), time=self.cloth.time(frame))
 
     def view(self, camera: str, frame: int) -> View:
         """Return a training view, cut to the silhouette."""

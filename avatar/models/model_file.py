@@ -150,7 +150,8 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         shapes = BlendShapes(shapes_config, len(gaussians), **extra)
     control_points = as_integer(stored.about.get("control_points"), subject="control_points", least=0)
     config = StudentConfig(field, shapes_config, control_points)
-    student = Student(config, rig, gaussians, frames, blend_shapes=shapes)
+    known = None if "pose_gate.poses" not in stored.tensors else stored.poses("pose_gate.poses")
+    student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known)
     if stored.about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
         show_null_code(student)
     return student

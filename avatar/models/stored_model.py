@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from avatar.gaussians.tensor_file import require_like
 from avatar.models.config_dict import config_from_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.rig.rig import THETA
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_object
 
@@ -80,6 +81,14 @@ class StoredModel:
         if len(set(frames)) != len(frames):
             raise InputError("track_frames", expected="each frame once", received="one of them again")
         return frames, controls
+
+    def poses(self, name: str) -> Tensor:
+        """Read poses (T, 63) of at least one frame, radians."""
+        value = self.tensors[name]
+        rows = len(value) if value.ndim == 2 else 0
+        if not rows:
+            raise InputError(name, expected="shape (T, 63)", received=f"shape {tuple(value.shape)}")
+        return self.require(name, (rows, THETA))
 
     def blended(self, config: BlendShapeConfig, count: int) -> dict[str, Tensor | None]:
         """Return what blend shapes of so many Gaussians are made from beside their sizes, as their arguments."""

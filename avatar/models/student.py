@@ -18,6 +18,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points, template_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.networks.local_pose import seen_joints
+from avatar.models.networks.pose_gate import PoseGate
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
 from smplxpp.core.validation import require_at_least
@@ -52,6 +53,7 @@ class Student(nn.Module):
         rig: that of the template. gaussians: those on it.
         frames: the frames that have a code.
         blend_shapes: fitted to these Gaussians; None makes new ones where the configuration has them.
+        known_poses: theta of the training frames, radians: far from them the body's blend shapes fade; None: nowhere.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Student(nn.Module):
         frames: tuple[int, ...],
         *,
         blend_shapes: BlendShapes | None = None,
+        known_poses: Float[Tensor, "T 63"] | None = None,
     ) -> None:
         super().__init__()
         gaussians.check_topology(rig.faces, "template of the student")
@@ -72,6 +75,7 @@ class Student(nn.Module):
         if blend_shapes is None and config.blend_shapes is not None:
             blend_shapes = make_blend_shapes(config.blend_shapes, rig, gaussians)
         self.blend_shapes = blend_shapes
+        self.pose_gate = None if known_poses is None else PoseGate(known_poses)
         self.to(rig.device)
 
     @property
@@ -92,8 +96,19 @@ class Student(nn.Module):
         if self.blend_shapes is None:
             return bound
         jaw = motion.jaw[None] if self.blend_shapes.config.jaw else None
-        du, dc = self.blend_shapes(self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw))
+        z = self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw)
+        head = self.blend_shapes.config.head_shapes
+        z = torch.cat([z[..., :head], self._known(motion) * z[..., head:]], dim=-1)
+        du, dc = self.blend_shapes(z)
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
+
+    def _known(self, motion: Motion) -> float | Tensor:
+        """Return how much a pose counts as one that training saw."""
+        if motion.known is not None:
+            return motion.known
+        if self.pose_gate is None or motion.frame in self.frames:
+            return 1.0
+        return self.pose_gate(motion.pose)
 
     def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the student as cameras with these centres, metres, see it."""
@@ -106,8 +121,17 @@ class Student(nn.Module):
         colors = view_colors(bound, frames, world.means.detach(), camera_centers)
         return PosedAvatar(vertices, world, colors, bound, displacements)
 
-    def with_blend_shapes(self, blend_shapes: BlendShapes | BlendShapeConfig | None) -> Student:
-        """Make the same student with other blend shapes; a configuration makes new ones, which start at zero."""
+    def with_blend_shapes(
+        self,
+        blend_shapes: BlendShapes | BlendShapeConfig | None,
+        *,
+        known_poses: Float[Tensor, "T 63"] | None = None,
+    ) -> Student:
+        """Make the same student with other blend shapes; a configuration makes new ones, which start at zero.
+
+        Args:
+            known_poses: where the body's blend shapes act; None: where they did.
+        """
         given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
         shapes_config = blend_shapes.config if isinstance(blend_shapes, BlendShapes) else blend_shapes
         other = Student(
@@ -116,6 +140,7 @@ class Student(nn.Module):
             self.gaussians(),
             self.frames,
             blend_shapes=given,
+            known_poses=self.pose_gate.poses if known_poses is None and self.pose_gate is not None else known_poses,
         )
         for mine, its in ((self.field, other.field), (self.codes, other.codes)):
             if mine is not None and its is not None:

@@ -47,6 +47,7 @@ class Motion:
         root_from_world: takes the root's motion away.
         cloth: where the loose clothes are, if they are simulated.
         time: seconds since the motion began; None where nobody knows.
+        known: in [0, 1]: how much the pose counts as one that training saw; None: models judge it.
     """
 
     frame: int | None
@@ -58,6 +59,7 @@ class Motion:
     root_from_world: Float32[Tensor, "4 4"]
     cloth: ClothMotion | None = None
     time: float | None = None
+    known: float | None = None
 
     def without_cloth(self) -> Motion:
         """Return the same pose, its clothes moved by nothing but the model."""
@@ -66,6 +68,10 @@ class Motion:
     def without_code(self) -> Motion:
         """Return the same pose, driven by the null code."""
         return replace(self, frame=None)
+
+    def as_new(self) -> Motion:
+        """Return the same pose as if training had not seen it."""
+        return replace(self, frame=None, known=0.0)
 
 
 class Rig:

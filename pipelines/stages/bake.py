@@ -12,6 +12,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.session import Session
 from avatar.training.student.bake import BakeConfig, bake
 from pipelines.runs.stage import StageOutput
+from pipelines.stages.cloth import clothed_sequence
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_results import training_output, write_model
 
@@ -21,18 +22,20 @@ class BakeStage(ModelStage):
     """A student before its blend shapes: field and attributes from a teacher, or from photographs.
 
     Attributes:
+        cloth: the loose clothes, which poses that count as new are shown simulated; None: nothing is.
         source: a teacher, whose Gaussians it starts from too; or a reference fit, to learn from photographs alone.
     """
 
     file = "student.safetensors"
 
     source: ModelStage
+    cloth: ModelStage | None = None
     student: StudentConfig
     config: BakeConfig
 
     @property
     def needs(self) -> Mapping[str, ModelStage]:
-        return {"source": self.source}
+        return {"source": self.source, **({} if self.cloth is None else {"cloth": self.cloth})}
 
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
@@ -42,7 +45,7 @@ class BakeStage(ModelStage):
         }
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
-        sequence = trainer.sequence(self.ground)
+        sequence = clothed_sequence(trainer, self.ground, self.cloth)
         source = self.source.read(trainer.path(self.source), sequence.rig)
         teacher = source if isinstance(source, TeacherAvatar) else None
         gaussians = source if teacher is None else teacher.gaussians.snapshot()

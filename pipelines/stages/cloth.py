@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from avatar.data.cloth_motion import ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
@@ -165,6 +166,20 @@ def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment,
         assert last is not None  # the first frame is a training frame, which has parameters
         poses.append(last.without_shape())
     return Followed(BodyParams.concatenate(poses), fps, world)
+
+
+def clothed_sequence(trainer: Trainer, ground: str, cloth: ModelStage | None) -> AvatarSequence:
+    """The capture, with the garments of a finished stage simulated in poses that are new or count as new."""
+    sequence = trainer.sequence(ground)
+    garments = [] if cloth is None else trainer.model(cloth)
+    fps = sequence.capture.fps
+    if not garments or fps is None:
+        return sequence
+    return sequence.with_cloth(
+        ClothMotions(
+            sequence.rig.template, garments, params=sequence.capture.params, frames=sequence.capture.frames, fps=fps
+        )
+    )
 
 
 def simulated_parts(run: Path, template: Template) -> list[Garment]:

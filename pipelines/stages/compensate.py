@@ -17,6 +17,7 @@ from avatar.training.student.compensate import CompensateConfig, CompensateTask,
 from avatar.training.student.prune import pruned_to
 from pipelines.runs.layout import COMPACT_STUDENT, STUDENT
 from pipelines.runs.stage import StageOutput
+from pipelines.stages.cloth import clothed_sequence
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_names import KINDS
 from pipelines.stages.train_results import training_output
@@ -28,6 +29,7 @@ class CompensateStage(ModelStage):
 
     Attributes:
         student: the bake. teacher: whose followed surface the blend shapes start from; None: from zero.
+        cloth: the loose clothes, which poses that count as new are shown simulated; None: nothing is.
         shapes: as many as the expressions of the body are driven, whatever it says itself.
         max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
     """
@@ -36,13 +38,15 @@ class CompensateStage(ModelStage):
 
     student: ModelStage
     teacher: ModelStage | None = None
+    cloth: ModelStage | None = None
     shapes: BlendShapeConfig
     config: CompensateConfig
     max_bytes: float | None = None
 
     @property
     def needs(self) -> Mapping[str, ModelStage]:
-        return {"student": self.student, **({} if self.teacher is None else {"teacher": self.teacher})}
+        others = {"teacher": self.teacher, "cloth": self.cloth}
+        return {"student": self.student, **{part: stage for part, stage in others.items() if stage is not None}}
 
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
@@ -53,7 +57,7 @@ class CompensateStage(ModelStage):
         }
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
-        sequence = trainer.sequence(self.ground)
+        sequence = clothed_sequence(trainer, self.ground, self.cloth)
         teacher = None if self.teacher is None else trainer.model(self.teacher)
         student = self.student.read(trainer.path(self.student), sequence.rig)
         model, done = compensate(sequence, student, self._fitting(trainer), self.config, session, teacher=teacher)

@@ -86,13 +86,21 @@ def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
     preset = config.preset
     fit = BindStage(name=BIND_STAGE, config=preset.fit)
     teacher = TeacherStage(name=TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher)
+    cloth = None
+    if config.teacher and config.cloth is not None:
+        cloth = ClothStage(name=CLOTH_STAGE, teacher=teacher, config=config.cloth)
     bake = BakeStage(
-        name=BAKE_STAGE, source=teacher if config.teacher else fit, student=preset.student(), config=preset.bake
+        name=BAKE_STAGE,
+        source=teacher if config.teacher else fit,
+        cloth=cloth,
+        student=preset.student(),
+        config=preset.bake,
     )
     compensate = CompensateStage(
         name=COMPENSATE_STAGE,
         student=bake,
         teacher=teacher if config.teacher and preset.compensate.init_from_track else None,
+        cloth=cloth,
         shapes=config.shapes,
         config=preset.compensate,
         max_bytes=config.max_bytes,
@@ -100,8 +108,8 @@ def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
     stages: dict[str, ModelStage] = {"fit": fit}
     if config.teacher:
         stages["teacher"] = teacher
-        if config.cloth is not None:
-            stages["cloth"] = ClothStage(name=CLOTH_STAGE, teacher=teacher, config=config.cloth)
+        if cloth is not None:
+            stages["cloth"] = cloth
     return {**stages, "bake": bake, "compensate": compensate}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,7 @@ _ROTATIONS = tuple(name for name, _ in POSE_BLOCKS)
 
 def pose_between(start: BodyParams, end: BodyParams, t: float) -> BodyParams:
     """Return the pose at t in [0, 1] of the way from one frame to another, every joint along its shortest turn."""
-    changes = {}
+    changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
         a, b = getattr(start, name), getattr(end, name)
         if _turns(name, a, b):
@@ -51,7 +52,7 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
     offsets = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (offsets / radius) ** 2)
     # Beyond its ends a motion goes on as its mirror image about the end's own pose: the ends stay where they are.
-    changes = {}
+    changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
         value = getattr(params, name)
         turning = _turns(name, value, value)

@@ -74,6 +74,7 @@ class BakeTask(PhotometricTask):
     """
 
     config: BakeConfig
+    sequence: AvatarSequence
 
     def __init__(
         self,
@@ -133,7 +134,7 @@ class BakeTask(PhotometricTask):
         """Return the pose as the field is shown it."""
         noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
-            motion = motion.without_code()
+            motion = self.sequence.as_new_motion(frame)
         if self.config.pose_noise:
             moved = torch.tensor(noise.normal(size=len(motion.pose)) * self.config.pose_noise)
             motion = replace(motion, pose=motion.pose + moved.to(motion.pose))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
@@ -60,6 +61,7 @@ class CompensateTask(PhotometricTask):
     """
 
     config: CompensateConfig
+    sequence: AvatarSequence
 
     def __init__(
         self, sequence: AvatarSequence, student: Student, config: CompensateConfig, context: TaskContext = ALONE
@@ -87,7 +89,7 @@ class CompensateTask(PhotometricTask):
         views = self.views(item)
         motion = self.sequence.motion(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
-            motion = motion.without_code()
+            motion = self.sequence.as_new_motion(item.frame)
         posed = self.student(motion, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         return total, {"loss": float(total.detach()), **terms}
@@ -109,7 +111,8 @@ def compensate(
             gives normals where the capture has no maps.
     """
     with fixed_seed(config.seed):
-        made = student.with_blend_shapes(shapes)
+        known = torch.stack([sequence.motion(frame).pose for frame in sequence.train_frames])
+        made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
     context = with_surface_normals(session.context, sequence, None if teacher is None else teacher.track)
