@@ -172,7 +172,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             init_from_track=True,
             weights=_LEAN_WEIGHTS,
         ),
-        blend_shapes=BlendShapeConfig(jaw=True),
+        blend_shapes=BlendShapeConfig(jaw=True, gated=True),
         control_points=size.control_points,
     )
 
@@ -201,7 +201,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             head_share=70 / 270,
             control_points=2400,
             track=TrackConfig().levels,
-            body_motion_weight=0.0,
+            body_motion_weight=1.0,
             tight_reach=0.0,
             pretrain=500,
             field_lr=5e-3,
