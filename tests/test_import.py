@@ -15,7 +15,7 @@ from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
-SHARED = {"core", "native", "raster", "skinning", "body", "template", "data"}
+SHARED = {"core", "native", "raster", "skinning", "body", "template", "cloth", "data"}
 STAGES = {
     "capture",
     "segment",
@@ -168,6 +168,7 @@ def test_stages_do_not_import_each_other(stage):
         ("skinning", {"core"}),
         ("body", {"core", "skinning"}),
         ("template", {"core", "skinning", "body"}),
+        ("cloth", {"core", "native", "skinning", "body", "template"}),
     ],
 )
 def test_shared_rooms_reach_little(room, reaches):

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -174,6 +174,11 @@ class Rig:
         displacements = self.displaced(motion, displacements)
         rest = motion.rest if displacements is None else motion.rest + displacements
         return _Skinning.apply(rest, motion.world_from_rest)
+
+    @torch.no_grad()
+    def places(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float64[np.ndarray, "V 3"]:
+        """Return what `pose` does, as numbers."""
+        return self.pose(motion, displacements).double().cpu().numpy()
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=self.device)

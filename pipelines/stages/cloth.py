@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from avatar.data.cloth_motion import ClothMotions
 from avatar.data.sequence import AvatarSequence
@@ -154,14 +153,11 @@ def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment,
     """Where the followed surface has a garment's particles in the training frames; gaps between frames are NaN."""
     frames = np.arange(min(track.row), max(track.row) + 1)
     rig, poses, world = sequence.rig, [], np.full((len(frames), len(garment.particles), 3), np.nan)
-    at = torch.as_tensor(garment.particles, device=rig.device)
     last = None
     for k, frame in enumerate(frames.tolist()):
         params = sequence.capture.params(frame)
         if frame in track.row and params is not None:
-            motion = sequence.motion(frame)
-            with torch.no_grad():
-                world[k] = rig.pose(motion, track.displacements(frame))[at].double().cpu().numpy()
+            world[k] = rig.places(sequence.motion(frame), track.displacements(frame))[garment.particles]
         last = params if params is not None else last
         assert last is not None  # the first frame is a training frame, which has parameters
         poses.append(last.without_shape())

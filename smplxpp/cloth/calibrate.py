@@ -194,7 +194,7 @@ def _found(
 
 def _particle_areas(garment: Garment) -> Float[np.ndarray, " n"]:
     rest = garment.rest
-    return sum(np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=rest.vertex_count) for k in range(3))
+    return np.bincount(rest.faces.ravel(), np.repeat(rest.face_areas / 3.0, 3), minlength=rest.vertex_count)
 
 
 def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:

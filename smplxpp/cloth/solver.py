@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, Int32
 
 from smplxpp.cloth.fabric import Fabric, SolverConfig
 from smplxpp.cloth.model import ClothModel
+from smplxpp.core.errors import InputError
 from smplxpp.native import address, native_library
 
 GRAVITY = 9.81
@@ -104,7 +105,19 @@ class ClothSolver:
             places: where the particles would be on the body, metres, at four moments `seconds` apart: the last one,
                 this span's start and end, the next one. Between them they move along Catmull and Rom's curve.
             skin: the collider's vertices at the same moments.
+
+        Raises:
+            InputError: another number of moments, particles or vertices.
         """
+        for name, arrays, count in (
+            ("particles", (state.position, state.velocity), len(self.model.inverse_mass)),
+            ("four moments of places", places, len(self.model.inverse_mass)),
+            ("four moments of the collider", skin, len(self.collider.margin)),
+        ):
+            wanted = [(count, 3)] * (2 if name == "particles" else 4)
+            if [array.shape for array in arrays] != wanted:
+                received = str([array.shape for array in arrays])
+                raise InputError(f"cloth: {name}", expected=str(wanted), received=received)
         moments = _Moments(
             (ctypes.c_void_p * 4)(*(address(array).value for array in places)),
             (ctypes.c_void_p * 4)(*(address(array).value for array in skin)),

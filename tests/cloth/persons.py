@@ -1,0 +1,89 @@
+"""A person of balls in a skirt: what garments are cut from."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from smplxpp.body import load_body
+from smplxpp.core.labels import LOWER
+from smplxpp.core.params import BodyParams
+from smplxpp.template.template import Template
+from tests.dolls.doll import Part, ball, make_template
+
+PART = LOWER.name
+AROUND, DOWN = 48, 20
+WAIST, HEM = 0.95, 0.45
+"""Heights of the skirt's openings, metres."""
+
+
+@cache
+def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False) -> Template:
+    """Hips and two legs, one of which a joint moves, and a skirt from the waist to the knees.
+
+    Args:
+        web: a ring of faces closes the hem inwards, as a scan does.
+        tight: the waistband lies on the hips; else it hangs 9 cm from them.
+        outwards: the skirt's faces look out.
+        torn: a slit from hem to waist, and a piece that hangs together with nothing.
+    """
+    hips = ball((0.16, 0.2, 0.12), 0.92, {"pelvis": 1.0}, subdivisions=4)
+    legs = [_leg(name, x) for name, x in (("left_hip", 0.08), ("right_hip", -0.08))]
+    skirt = _skirt(web=web, tight=tight, outwards=outwards, torn=torn)
+    names = load_body().joint_names
+    parts = [hips, *legs]
+    vertices = np.concatenate([part.vertices for part in parts])
+    places = {"left_hip": (0.08, 0.85, 0.0), "right_hip": (-0.08, 0.85, 0.0)}
+    regressor = np.zeros((len(names), len(vertices)))
+    for row, name in enumerate(names):
+        nearest = np.argsort(np.linalg.norm(vertices - places.get(name, (0.0, 0.92, 0.0)), axis=1))[:6]
+        regressor[row, nearest] = 1.0 / 6.0
+    return make_template(parts, {PART: skirt}, bases_changed={"joint_regressor": regressor})
+
+
+def _leg(name: str, x: float) -> Part:
+    part = ball((0.07, 0.42, 0.07), 0.45, {name: 1.0}, subdivisions=4)
+    return Part(part.vertices + [x, 0.0, 0.0], part.faces, part.joints)
+
+
+def _skirt(*, web: bool, tight: bool, outwards: bool, torn: bool) -> Part:
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    circle = np.stack([np.sin(angle), np.zeros(AROUND), np.cos(angle)], axis=1)
+    t = np.linspace(0.0, 1.0, DOWN)
+    # The hips' half axes at the waist, and what the skirt adds to them on its way down.
+    wide = (0.006 if tight else 0.09) + 0.12 * t
+    rings = [
+        circle * [0.158 + w, 0, 0.119 + w] + [0, (1 - s) * WAIST + s * HEM, 0] for s, w in zip(t, wide, strict=True)
+    ]
+    if web:  # 3 cm inwards
+        rings += [rings[-1] * [s, 1, s] for s in (0.95, 0.9)]
+    rows = len(rings)
+    a = (np.arange(rows - 1)[:, None] * AROUND + np.arange(AROUND)).ravel()
+    b = (np.arange(rows - 1)[:, None] * AROUND + (np.arange(AROUND) + 1) % AROUND).ravel()
+    faces = np.concatenate([np.stack([a, a + AROUND, b], 1), np.stack([b, a + AROUND, b + AROUND], 1)])
+    vertices = np.concatenate(rings)
+    if torn:
+        column = np.concatenate([np.tile(np.arange(AROUND), rows - 1)] * 2)
+        faces = faces[column != 5]
+        scrap = np.array([[0.5, 0.5, 0.0], [0.5, 0.4, 0.0], [0.6, 0.4, 0.0]])
+        faces = np.concatenate([faces, len(vertices) + np.array([[0, 1, 2]])])
+        vertices = np.concatenate([vertices, scrap])
+    return Part(vertices, faces if outwards else faces[:, ::-1], {"pelvis": 1.0}, LOWER.id)
+
+
+def standing(
+    *, at: tuple[float, float, float] = (0.0, 0.0, 0.0), turned: float = 0.0, lifted: float = 0.0, swung: float = 0.0
+) -> BodyParams:
+    """One frame.
+
+    Args:
+        at: metres. turned: about the vertical, lifted: the left leg to the front, swung: the hips about the axis to the
+            front, radians.
+    """
+    pose = np.zeros((1, 55, 3))
+    pose[:, 0, 1], pose[:, 0, 2] = turned, swung
+    pose[:, load_body().joint_names.index("left_hip"), 0] = -lifted
+    return BodyParams.from_full_pose(
+        pose, betas=np.zeros((1, 2)), expression=np.zeros((1, 0)), transl=np.array([at], dtype=float)
+    )
