@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,10 +28,15 @@ from smplxpp.cloth.calibrate import Calibration, CalibrationConfig, Followed, ca
 from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
 from smplxpp.core.validation import require_known
+from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
+OUTLINE_FRAMES, OUTLINE_CAMERAS = 16, 4
+"""Training frames, and cameras of each, whose masks decide whether a part is simulated."""
 ClothMode = Literal["simulate", "field", "skin"]
 """What moves loose clothes: a simulation, a student's own field, or skinning alone."""
 
@@ -41,8 +46,8 @@ class ClothConfig:
     """Which clothes are simulated, and how.
 
     Attributes:
-        parts: by name; None: those whose followed surface leaves skinning and that simulation brings nearer to it.
-            Named ones are simulated whatever the measurement says.
+        parts: by name; None: those whose followed surface leaves skinning, and with which simulated the person's
+            outline in training views is nearer to the masks. Named ones are simulated whatever is measured.
         garment: how they are cut. calibration: how they are fitted.
         seed: nothing is drawn; there for the stage.
     """
@@ -85,12 +90,12 @@ class ClothStage(ModelStage):
         teacher = trainer.model(self.teacher)
         track = teacher.track if isinstance(teacher, TeacherAvatar) else None
         reference = load_params_of_run(trainer.run).frame(0).without_shape()
-        garments, found, said = find_garments(sequence, reference, self.config, track, session)
+        garments, found, outlines, said = find_garments(sequence, reference, self.config, track, session)
         save_garments(folder / self.file, garments)
         numbers = {
             "loose": [garment.part for garment in garments],
             "particles": {garment.part: len(garment.particles) for garment in garments},
-            "calibration": {one.part: _numbers_of(one) for one in found},
+            "calibration": {one.part: _numbers_of(one, outlines.get(one.part)) for one in found},
             "said": said,
             "mean": {},
             "iterations": self.iterations,
@@ -98,7 +103,7 @@ class ClothStage(ModelStage):
             "seconds_of_steps": time.monotonic() - begin,
             "finished": True,
         }
-        return StageOutput(_checks(found, garments), numbers)
+        return StageOutput(_checks(outlines, garments), numbers)
 
     def read(self, path: Path, rig: Rig) -> list[Garment]:
         return load_garments(path, rig.template)
@@ -110,7 +115,7 @@ def find_garments(
     config: ClothConfig,
     track: Track | None,
     session: Session,
-) -> tuple[list[Garment], list[Calibration], list[str]]:
+) -> tuple[list[Garment], list[Calibration], dict[str, Outlines], list[str]]:
     """Cut and fit the loose parts of a template.
 
     Args:
@@ -118,18 +123,21 @@ def find_garments(
         track: the surface that was followed through the training frames; None: parts go by name, with the defaults.
 
     Returns:
-        The garments, what was found of every part that was looked at, and sentences on what could not be done.
+        The garments, what was found of every part that was looked at, outlines of those that move, and sentences on
+        what could not be done.
     """
-    template, said = sequence.rig.template, []
+    template = sequence.rig.template
+    said: list[str] = []
+    outlines: dict[str, Outlines] = {}
     clothes = [label.name for label in CLOTH_LABELS if label.name in template.part_names]
     if config.parts is not None:
         require_known("loose parts", config.parts, [name for name in template.part_names if name != "body"])
     wanted = clothes if config.parts is None else list(config.parts)
     if config.parts is None and track is None:
-        return [], [], ["nothing was followed through the frames: no part is simulated unless it is named"]
+        return [], [], {}, ["nothing was followed through the frames: no part is simulated unless it is named"]
     fps = sequence.capture.fps
     if wanted and track is not None and fps is None:
-        return [], [], ["the capture does not say how many frames a second it has: nothing is simulated"]
+        return [], [], {}, ["the capture does not say how many frames a second it has: nothing is simulated"]
     garments, found = [], []
     for k, part in enumerate(wanted):
         session.report(Progress(k, len(wanted), 0.0, 0.0))
@@ -142,11 +150,47 @@ def find_garments(
             followed = followed_particles(sequence, track, garment, fps)
             fitted, one = calibrate(template, garment, followed, config=config.calibration)
             found.append(one)
-            if config.parts is None and not one.loose:
-                continue
             garment = fitted
+            if one.moves:
+                outlines[part] = measure_outlines(sequence, garment, fps)
+            if config.parts is None and not (one.moves and outlines[part].better):
+                continue
         garments.append(garment)
-    return garments, found, said
+    return garments, found, outlines, said
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """How far the person's outline is from the masks of training views: 1 - IoU, a mean.
+
+    Attributes:
+        skinned: by skinning alone. simulated: with the part simulated. views: how many.
+    """
+
+    skinned: float
+    simulated: float
+    views: int
+
+    @property
+    def better(self) -> bool:
+        """Whether the simulation is nearer."""
+        return self.simulated < self.skinned
+
+
+def measure_outlines(sequence: AvatarSequence, garment: Garment, fps: float) -> Outlines:
+    """Hold a simulated part against the masks of at most `OUTLINE_FRAMES` training frames, some cameras each."""
+    rig, capture = sequence.rig, sequence.capture
+    motions = ClothMotions(rig.template, [garment], params=capture.params, frames=capture.frames, fps=fps)
+    clothed = sequence.with_cloth(motions)
+    wrong: dict[bool, list[float]] = {False: [], True: []}
+    for turn, frame in enumerate(spread(sequence.train_frames, OUTLINE_FRAMES)):
+        for simulated, motion in ((False, sequence.motion(frame)), (True, clothed.as_new_motion(frame))):
+            mesh = TriangleMesh(rig.pose(motion).double().cpu().numpy(), rig.template.faces)
+            for camera in sequence.cameras(frame, turn, OUTLINE_CAMERAS, 0):
+                mask = capture.mask(camera, frame)
+                drawn = rasterize_mesh(mesh, capture.cameras[camera]).mask
+                wrong[simulated].append(1.0 - float((mask & drawn).sum() / max((mask | drawn).sum(), 1)))
+    return Outlines(float(np.mean(wrong[False])), float(np.mean(wrong[True])), len(wrong[True]))
 
 
 def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment, fps: float) -> Followed:
@@ -184,31 +228,31 @@ def simulated_parts(run: Path, template: Template) -> list[Garment]:
     return load_garments(path, template) if path.is_file() else []
 
 
-def _numbers_of(one: Calibration) -> dict[str, Any]:
+def _numbers_of(one: Calibration, outlines: Outlines | None) -> dict[str, Any]:
     return {
-        "loose": one.loose,
-        "why": one.why,
+        "moves": one.moves,
+        "fitted": one.fitted,
         "drag_per_s": one.drag,
-        "drag_spread": None if np.isnan(one.drag_spread) else one.drag_spread,
+        "drag_spread": one.drag_spread,
         "pin_depth_mm": 1e3 * one.pin_depth,
-        "pin_spread_mm": None if np.isnan(one.pin_spread) else 1e3 * one.pin_spread,
+        "pin_spread_mm": None if one.pin_spread is None else 1e3 * one.pin_spread,
+        "outlines": None if outlines is None else asdict(outlines),
         "skinned_mm": 1e3 * one.skinned,
         "simulated_mm": 1e3 * one.simulated,
         "frames": one.frames,
     }
 
 
-def _checks(found: list[Calibration], garments: list[Garment]) -> list[Check]:
-    simulated = {garment.part for garment in garments}
+def _checks(outlines: Mapping[str, Outlines], garments: list[Garment]) -> list[Check]:
     return [
         Check(
-            f"{one.part}: distance of the simulation to the followed surface",
-            value=one.simulated / one.skinned,
+            f"{garment.part}: wrong outline with it simulated",
+            value=outlines[garment.part].simulated / max(outlines[garment.part].skinned, 1e-9),
             unit="of skinning's",
             warn=1.0,
             fail=2.0,
-            explanation=one.why,
+            explanation=f"1 - IoU of silhouettes and masks in {outlines[garment.part].views} training views",
         )
-        for one in found
-        if one.part in simulated
+        for garment in garments
+        if garment.part in outlines
     ]

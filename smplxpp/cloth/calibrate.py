@@ -27,8 +27,8 @@ class CalibrationConfig:
     Attributes:
         drags: 1/s. pin_depths: metres. All pairs are tried, then drags between the best one's neighbours.
         least_motion: metres by which the followed surface leaves skinning, on average over a part, for it to be loose.
-        most_share: of skinning's distance to the followed surface that the simulation's may have; a part that the
-            simulation does not bring nearer than that stays with the field.
+        most_share: of skinning's distance to the followed surface that the simulation's may have for what was fitted to
+            be kept; else the surface was followed too badly to say anything, and the values stay what they were.
         blocks: of consecutive frames; each is left out once for the uncertainty.
     """
 
@@ -53,21 +53,21 @@ class Calibration:
     """What was found for one part.
 
     Attributes:
-        part: its name. loose: whether it is to be simulated. why: one sentence.
+        part: its name. moves: whether its followed surface leaves skinning. fitted: whether the values below are.
         drag, pin_depth: 1/s and metres. drag_spread, pin_spread: standard deviations by leaving blocks of frames out
-            (jackknife).
+            (jackknife); None where nothing was fitted.
         skinned, simulated: mean distance of particles to the followed surface, metres, by skinning alone and with
             these values.
         frames: how many were looked at.
     """
 
     part: str
-    loose: bool
-    why: str
+    moves: bool
+    fitted: bool
     drag: float
-    drag_spread: float
+    drag_spread: float | None
     pin_depth: float
-    pin_spread: float
+    pin_spread: float | None
     skinned: float
     simulated: float
     frames: int
@@ -96,7 +96,7 @@ def calibrate(
     driver: DriverConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Garment, Calibration]:
-    """Fit drag and pin depth to a followed surface; decide whether the part is loose.
+    """Fit drag and pin depth to a followed surface, where it moves.
 
     The distance is the mean over particles that move and frames, cut off at `MOST`. Chaos sets its noise: a start moved
     by half a millimetre moves folds by several, so more parameters would be fitted to noise.
@@ -138,8 +138,7 @@ def calibrate(
     rest = template.vertices[garment.particles]
     skinned = errors([np.einsum("nab,nb->na", b[:, :, :3], rest) + b[:, :, 3] for b in blends])
     if skinned.mean() < config.least_motion:
-        why = f"the followed surface is {1e3 * skinned.mean():.1f} mm from skinning: nothing to simulate"
-        return garment, _found(garment, False, why, skinned, skinned)
+        return garment, _found(garment, skinned, skinned, moves=False)
 
     pairs = list(product(config.drags, config.pin_depths))
     table: dict[tuple[float, float], Float[np.ndarray, " T"]] = {}
@@ -151,15 +150,12 @@ def calibrate(
         table[finer, pin] = simulated(finer, pin)
     progress(len(pairs) + 2, len(pairs) + 2)
     best = min(table, key=lambda pair: table[pair].mean())
-    loose = bool(table[best].mean() < config.most_share * skinned.mean())
-    why = (
-        f"the simulation is {1e3 * table[best].mean():.1f} mm from the followed surface, skinning "
-        f"{1e3 * skinned.mean():.1f} mm"
-    )
+    if table[best].mean() > config.most_share * skinned.mean():
+        return garment, _found(garment, skinned, table[best], moves=True)
     left_out = [_best_without(table, block) for block in np.array_split(np.arange(len(bodies)), config.blocks)]
     spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
     found = with_values(garment, drag=best[0], pin_depth=best[1])
-    return found, _found(found, loose, why, skinned, table[best], spread=(spread[0], spread[1]))
+    return found, _found(found, skinned, table[best], moves=True, spread=(spread[0], spread[1]))
 
 
 def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
@@ -171,21 +167,20 @@ def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
 
 def _found(
     garment: Garment,
-    loose: bool,
-    why: str,
     skinned: Float[np.ndarray, " T"],
     simulated: Float[np.ndarray, " T"],
     *,
-    spread: tuple[float, float] = (float("nan"), float("nan")),
+    moves: bool,
+    spread: tuple[float, float] | None = None,
 ) -> Calibration:
     return Calibration(
         part=garment.part,
-        loose=loose,
-        why=why,
+        moves=moves,
+        fitted=spread is not None,
         drag=garment.config.fabric.drag,
-        drag_spread=spread[0],
+        drag_spread=None if spread is None else spread[0],
         pin_depth=garment.config.pin_depth,
-        pin_spread=spread[1],
+        pin_spread=None if spread is None else spread[1],
         skinned=float(skinned.mean()),
         simulated=float(simulated.mean()),
         frames=len(skinned),

@@ -17,6 +17,7 @@ from smplxpp.cloth.opening_webs import find_opening_webs
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
+from smplxpp.core.topology import component_labels
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
 from smplxpp.template.template import BODY_PART, Template
 
@@ -77,8 +78,11 @@ class Garment:
 
     @property
     def pinned(self) -> Bool[np.ndarray, " n"]:
-        """The particles that follow the body exactly."""
-        return self.depth <= self.config.pin_depth
+        """The particles that follow the body exactly: within the pin depth, at least the nearest ones of each piece."""
+        piece = _pieces(self.rest)
+        least = np.full(piece.max(initial=-1) + 1, np.inf)
+        np.minimum.at(least, piece, self.depth)
+        return self.depth <= np.maximum(self.config.pin_depth, least[piece])
 
     def model(self) -> ClothModel:
         """Return the solver's constraints."""
@@ -122,10 +126,15 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
         )
     depth = geodesics(sheet, carriers)[0]
     seeds, faces = coarsen(sheet, config.spacing)
-    rest = TriangleMesh(sheet.vertices[seeds], faces)
+    rest, of_seeds = TriangleMesh(sheet.vertices[seeds], faces).submesh(_held(seeds, faces, depth, config))
+    seeds = seeds[of_seeds]
     # Vertices of the web ride on the nearest triangle; how deep they hang is what the nearest particle says.
     all_depth = np.full(cloth.vertex_count, np.inf)
     all_depth[of_cloth] = depth
+    if not rest.face_count:
+        raise InputError(
+            f"loose part {part!r}", expected="a piece of cloth that hangs from the body", received="shreds"
+        )
     embedding = embed(cloth.vertices, rest)
     nearest = depth[seeds][embedding.corners[np.arange(cloth.vertex_count), embedding.weights.argmax(axis=1)]]
     all_depth = np.where(np.isfinite(all_depth), all_depth, nearest)
@@ -142,3 +151,23 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
         embedding=embedding,
         collider=collider_of(template, part, posed, config),
     )
+
+
+def _held(
+    seeds: Int64[np.ndarray, " n"],
+    faces: Int64[np.ndarray, "m 3"],
+    depth: Float[np.ndarray, " N"],
+    config: GarmentConfig,
+) -> Bool[np.ndarray, " m"]:
+    """The coarse faces of pieces that what carries the cloth reaches.
+
+    Narrow bridges of the fine mesh may have no triangle in the coarse one; what hung on them would fall.
+    """
+    piece = component_labels(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), len(seeds))
+    least = np.full(piece.max(initial=-1) + 1, np.inf)
+    np.minimum.at(least, piece, depth[seeds])
+    return least[piece[faces[:, 0]]] <= config.spacing
+
+
+def _pieces(mesh: TriangleMesh) -> Int64[np.ndarray, " n"]:
+    return component_labels(mesh.edges, mesh.vertex_count)
