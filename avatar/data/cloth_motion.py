@@ -5,16 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Literal
 
 import numpy as np
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
-from smplxpp.cloth.poses import smoothed
+from smplxpp.cloth.poses import smoothed, upsampled
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.template.template import Template
+
+SLOWEST = 40.0
+"""Poses a second at least that clothes follow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,15 +88,16 @@ class ClothMotions:
         first = run[0] - self.config.pre_roll * self._fps
         span = self._frames[(self._frames >= first) & (self._frames <= run[-1])].tolist()
         known = [frame for frame in span if self._params(frame) is not None]
-        poses = self._smoothed(known)
+        ways = self._ways(known)
         driver = ClothDriver(self.template, self.garments, self.config.driver)
         last: int | None = None
         wanted = set(run)
-        for frame in span:
+        for frame in known:
             seconds = 1.0 if last is None else (frame - last) / self._fps
-            shape = driver.step(poses.get(frame), seconds) if frame in poses or last is not None else None
-            last = frame if frame in poses else last
-            if frame in wanted and shape is not None:
+            for pose in ways[frame]:
+                shape = driver.step(pose, seconds / len(ways[frame]))
+            last = frame
+            if frame in wanted:
                 self._shapes[frame] = shape
         for said in driver.said:
             warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
@@ -110,13 +115,19 @@ class ClothMotions:
         """Return the seconds since the motion's first frame."""
         return float(frame - self._frames[0]) / self._fps
 
-    def _smoothed(self, frames: Sequence[int]) -> dict[int, BodyParams]:
-        """Poses by frame, smoothed within stretches of frames that follow each other evenly."""
-        out: dict[int, BodyParams] = {}
+    def _ways(self, frames: Sequence[int]) -> dict[int, list[BodyParams]]:
+        """The poses from each frame's predecessor to it, smoothed within stretches of frames that follow each other.
+
+        Slow frame rates get poses in between: places that go straight from pose to pose cut the corners of limbs.
+        """
+        out: dict[int, list[BodyParams]] = {}
+        times = max(1, ceil(SLOWEST / self._fps - 1e-6))
         cuts = np.flatnonzero(np.diff(frames) != 1) + 1
         for stretch in np.split(np.array(frames), cuts):
             found = [self._params(int(frame)) for frame in stretch]
             poses = BodyParams.concatenate([one for one in found if one is not None])
-            soft = smoothed(poses, radius=self.config.smoothing * self._fps)
-            out |= {int(frame): soft.frame(k) for k, frame in enumerate(stretch)}
+            fine = upsampled(smoothed(poses, radius=self.config.smoothing * self._fps), times)
+            out[int(stretch[0])] = [fine.frame(0)]
+            for k, frame in enumerate(stretch.tolist()[1:]):
+                out[frame] = [fine.frame(k * times + j + 1) for j in range(times)]
         return out

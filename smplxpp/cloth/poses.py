@@ -69,6 +69,42 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
     return replace(params, **changes)
 
 
+def upsampled(params: BodyParams, times: int) -> BodyParams:
+    """Return a motion with `times` as many steps: cubic Hermite curves through the poses, joints about themselves.
+
+    Tangents are those of Catmull and Rom, taken in the space of rotation vectors about each step's first pose; at the
+    ends a motion goes on as it came.
+
+    Args:
+        params: T frames, evenly spaced. times: poses a step; 1 changes nothing.
+
+    Returns:
+        (T - 1) times + 1 frames; every `times`-th is one of those given.
+    """
+    require_at_least("poses a step", times, 1)
+    count = len(params)
+    if times == 1 or count < 2:
+        return params
+    step = np.repeat(np.arange(count - 1), times)
+    t = np.tile(np.arange(times) / times, count - 1)[:, None]
+    before, after = np.maximum(step - 1, 0), np.minimum(step + 2, count - 1)
+    changes: dict[str, Any] = {}
+    for name in (*_ROTATIONS, "expression", "transl"):
+        value = getattr(params, name)
+        turning = _turns(name, value, value)
+        way = _step(value, step, step + 1, turning)
+        start = 0.5 * (way - _step(value, step, before, turning))
+        end = 0.5 * (_step(value, step + 1, after, turning) - _step(value, step + 1, step, turning))
+        # At an end there is no pose beyond: the tangent is that of the step.
+        start = np.where((step == 0)[:, None], way, start)
+        end = np.where((step == count - 2)[:, None], way, end)
+        t2, t3 = t * t, t * t * t
+        curve = (t3 - 2.0 * t2 + t) * start + (3.0 * t2 - 2.0 * t3) * way + (t3 - t2) * end
+        changes[name] = np.concatenate([_moved(value[step], curve, turning), value[-1:]])
+    rows = np.append(step, count - 1)
+    return replace(params.select(rows), **changes)
+
+
 class CausalSmoother:
     """Smooths a motion as it comes, one pose at a time: exponential, with a time constant that fast motion shortens.
 
