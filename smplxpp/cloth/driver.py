@@ -119,6 +119,18 @@ class ClothDriver:
         require_choice("simulated part", part, names)
         return self._threads[names.index(part)].particles()
 
+    def place(self, part: str, particles: Float32[np.ndarray, "n 3"]) -> None:
+        """Put the particles of a part elsewhere, world, metres; their velocities stay.
+
+        Raises:
+            InputError: no such part is simulated, or another number of particles.
+        """
+        expected = self.particles(part).shape
+        if particles.shape != expected:
+            raise InputError(f"particles of {part}", expected=f"shape {expected}", received=str(particles.shape))
+        names = [garment.part for garment in self.garments]
+        self._threads[names.index(part)].place(particles)
+
     def restart(self) -> None:
         """Forget the state: the next step starts cold."""
         self._last = None

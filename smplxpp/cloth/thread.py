@@ -73,6 +73,10 @@ class GarmentThread:
         self._state = ClothState.at_rest(own)
         return "the simulation broke down; the cloth is on the body again and goes on from there"
 
+    def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
+        """Put the particles elsewhere, world, metres; their velocities stay."""
+        self._state.position[:] = particles
+
     def particles(self) -> Float32[np.ndarray, "n 3"]:
         """Return where the particles are, world, metres."""
         return self._state.position.copy()
