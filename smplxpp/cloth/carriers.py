@@ -24,7 +24,8 @@ def find_carriers(cloth: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray, "
 
     A garment hangs on its upper openings, a waistband or a neckline, on tight ones, and on what it covers from above,
     shoulders and the crown. A hem is an opening too, but looks down and is not tight; the median of an opening's
-    distances decides.
+    distances decides. A garment that is torn from one opening to another has a single border: where nothing else holds
+    it, what is tight of the border's upper half does.
 
     Args:
         cloth: N vertices, without webs. body: the naked body in the same pose, closed or nearly.
@@ -39,4 +40,8 @@ def find_carriers(cloth: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray, "
         reach = WORN if opening_axis(cloth, loop)[1] > UP else TIGHT
         if float(np.median(distance[loop])) < reach:
             out[loop] = True
+    if not out.any() and len(border := np.unique(cloth.border_edges)):
+        height = cloth.vertices[:, 1]
+        middle = 0.5 * (height[used].min() + height[used].max())
+        out[border] = (distance[border] < TIGHT) & (height[border] > middle)
     return out

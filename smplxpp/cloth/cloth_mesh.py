@@ -13,6 +13,8 @@ from smplxpp.core.topology import face_components
 
 # Metres: shorter borders are holes.
 SHORTEST_OPENING = 0.15
+# Faces that are asked which way they look.
+_LOOKS = 2000
 
 
 def opening_axis(mesh: TriangleMesh, loop: Int[np.ndarray, " n"]) -> Float[np.ndarray, " 3"]:
@@ -48,6 +50,19 @@ def edge_graph(mesh: TriangleMesh, lengths: Float[np.ndarray, " E"] | None = Non
     if lengths is None:
         lengths = row_lengths(mesh.vertices[a] - mesh.vertices[b])
     return csr_matrix((np.maximum(lengths, 1e-9), (a, b)), shape=(n, n))
+
+
+def looks_inwards(mesh: TriangleMesh, body: TriangleMesh) -> bool:
+    """Whether cloth lies on a body with its faces turned inside out: most of its area looks against the skin's side."""
+    every = max(1, mesh.face_count // _LOOKS)
+    face = igl.point_mesh_squared_distance(mesh.face_centers[::every], body.vertices, body.faces)[1]
+    alike = np.einsum("mi,mi->m", mesh.face_normals[::every], body.face_normals[face])
+    return bool((mesh.face_areas[::every] * alike).sum() < 0)
+
+
+def turned_over(mesh: TriangleMesh) -> TriangleMesh:
+    """Return the same surface looking to the other side."""
+    return TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
 
 
 def largest_piece(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
@@ -127,6 +142,6 @@ def _middles(
     cells = np.split(order, np.flatnonzero(np.diff(source[order])) + 1)
     out = []
     for cell in cells:
-        own = cell[border[cell]] if border[source[cell[0]]] else cell
+        own = cell[border[cell]] if border[cell].any() else cell
         out.append(own[np.argmin(row_lengths(points[own] - points[own].mean(axis=0)))])
     return np.array(out)

@@ -182,6 +182,12 @@ class ClothDriver:
             self._advance(self.template.posed_body(between), _RAMP_STEP, at_any_speed=True)
         for _ in range(still + min(steps, 1)):
             self._advance(posed, _RAMP_STEP, at_any_speed=True)
+        for thread in self._threads:
+            if buried := thread.buried():
+                self.said.append(
+                    f"{thread.garment.part} at {self._time:.2f} s: {buried} of {len(thread.garment.particles)} "
+                    "particles start inside the body; they come out as it moves"
+                )
         self._last = params
 
     def _advance(self, posed: PosedBody, seconds: float, *, at_any_speed: bool = False) -> bool:

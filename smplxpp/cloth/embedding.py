@@ -43,10 +43,12 @@ class Embedding:
 def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     """Bind points to the nearest triangles of a mesh; `carried` by that mesh they stay where they are."""
     face, near = igl.point_mesh_squared_distance(np.ascontiguousarray(points), coarse.vertices, coarse.faces)[1:3]
-    corners = coarse.faces[face]
-    weights = np.clip(np.nan_to_num(barycentric_coordinates(near, coarse.vertices[corners]), nan=1 / 3), 0.0, 1.0)
+    corners = coarse.faces[face].astype(np.int32)
+    with np.errstate(invalid="ignore", divide="ignore"):  # triangles without area
+        weights = barycentric_coordinates(near, coarse.vertices[corners])
+    weights = np.clip(np.nan_to_num(weights, nan=1 / 3, posinf=1.0, neginf=0.0), 1e-12, 1.0)
     weights /= weights.sum(axis=1, keepdims=True)
-    zero = Embedding(corners.astype(np.int32), weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32))
+    zero = Embedding(corners, weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32))
     missing = points - zero.carried(coarse)
     normals = _smooth_normals(coarse)
     normal = _unit(sum(weights[:, k : k + 1] * normals[corners[:, k]] for k in range(3)))

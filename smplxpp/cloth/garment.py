@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from smplxpp.cloth.carriers import find_carriers
-from smplxpp.cloth.cloth_mesh import coarsen, geodesics, largest_piece, lengths_along
+from smplxpp.cloth.cloth_mesh import coarsen, geodesics, largest_piece, lengths_along, looks_inwards, turned_over
 from smplxpp.cloth.collider import ColliderMesh, collider_of
 from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import ClothModel, build_model
 from smplxpp.cloth.opening_webs import find_opening_webs
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import component_labels
@@ -111,11 +112,14 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
     require_choice("loose part", part, [name for name in template.part_names if name != BODY_PART])
     posed = TriangleMesh(template.pose(reference)[0], template.faces)
     cloth, index = posed.submesh(template.part_faces(part))
+    body = TriangleMesh(posed.vertices, template.faces[template.part_faces(BODY_PART)])
+    if cloth.face_count and looks_inwards(cloth, body):
+        warnings.warn(f"{part}: its faces look inwards; it is simulated turned over", GeometryWarning, stacklevel=2)
+        cloth = turned_over(cloth)
     kept = largest_piece(cloth, ~find_opening_webs(template)[template.part_faces(part)])
     if not cloth.face_areas[kept].sum() > 0:
         raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside webs")
     sheet, of_cloth = cloth.submesh(kept)
-    body = TriangleMesh(posed.vertices, template.faces[template.part_faces(BODY_PART)])
     carriers = np.flatnonzero(find_carriers(sheet, body))
     if not len(carriers):
         raise InputError(

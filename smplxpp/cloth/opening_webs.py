@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from smplxpp.cloth.cloth_mesh import SHORTEST_OPENING, geodesics, loop_length, opening_axis
+from smplxpp.cloth.cloth_mesh import (
+    SHORTEST_OPENING,
+    geodesics,
+    looks_inwards,
+    loop_length,
+    opening_axis,
+    turned_over,
+)
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
@@ -30,10 +37,12 @@ def find_opening_webs(template: Template) -> Bool[np.ndarray, " F"]:
     opening's axis, which cloth that goes on to the border does not, and have a hollow behind them.
     """
     out = np.zeros(len(template.faces), dtype=bool)
-    body = SignedDistanceField(template.part_mesh(BODY_PART), solid=True)
+    skin = template.part_mesh(BODY_PART)
+    body = SignedDistanceField(skin, solid=True)
     for part in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
         faces = template.part_faces(part)
-        out[faces] = _webs_of(template.mesh.submesh(faces)[0], body)
+        cloth = template.mesh.submesh(faces)[0]
+        out[faces] = _webs_of(turned_over(cloth) if looks_inwards(cloth, skin) else cloth, body)
     return out
 
 

@@ -133,7 +133,7 @@ class ClothSolver:
 
 def push_out(
     points: Float32[np.ndarray, "N 3"],
-    normals: Float32[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
     surface: Float32[np.ndarray, "c 3"],
     collider: Collider,
     *,

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Metres that what is carried keeps from the skin.
 _FINE_MARGIN = 0.002
+# Metres inside what it touches from which a particle counts as buried.
+_BURIED = 0.005
 
 
 class GarmentThread:
@@ -92,6 +94,13 @@ class GarmentThread:
             return points
         collider = self._solver.collider
         return push_out(points.astype(np.float32), normals, self._surfaces[-1], collider, margin=_FINE_MARGIN)
+
+    def buried(self) -> int:
+        """Return how many particles lie inside what the garment touches."""
+        coarse = self.garment.rest.with_vertices(self._state.position)
+        normals, loose = coarse.vertex_normals, ~self.garment.pinned
+        out = push_out(self._state.position, normals, self._surfaces[-1], self._solver.collider, margin=0.0)
+        return int((row_lengths(out - self._state.position)[loose] > _BURIED).sum())
 
     def laid_over(
         self, vertices: Int64[np.ndarray, " c"], surface: Float32[np.ndarray, "c 3"]
