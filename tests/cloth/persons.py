@@ -52,7 +52,7 @@ def _skirt(*, web: bool, tight: bool, outwards: bool, torn: bool) -> Part:
     circle = np.stack([np.sin(angle), np.zeros(AROUND), np.cos(angle)], axis=1)
     t = np.linspace(0.0, 1.0, DOWN)
     # The hips' half axes at the waist, and what the skirt adds to them on its way down.
-    wide = (0.006 if tight else 0.09) + 0.12 * t
+    wide = (0.006 if tight else 0.09) + 0.05 * t
     rings = [
         circle * [0.158 + w, 0, 0.119 + w] + [0, (1 - s) * WAIST + s * HEM, 0] for s, w in zip(t, wide, strict=True)
     ]

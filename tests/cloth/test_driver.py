@@ -1,0 +1,210 @@
+"""The driver: starts, cuts, gaps, broken simulations, and that nothing but the motion decides what the cloth does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from smplxpp.cloth import ClothDriver, DriverConfig, Garment, GarmentConfig, cut_garment
+from smplxpp.cloth.play import play
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+from tests.cloth.persons import PART, person, standing
+
+QUICK = DriverConfig(ramp=0.2, hold=0.1)
+
+
+@cache
+def garment() -> Garment:
+    """The skirt, coarse."""
+    return cut_garment(person(), PART, standing(), GarmentConfig(spacing=0.06, collider_spacing=0.04))
+
+
+def driver(config: DriverConfig = QUICK) -> ClothDriver:
+    return ClothDriver(person(), [garment()], config)
+
+
+def swaying(t: float) -> BodyParams:
+    """A pose of a motion that begins without a jerk."""
+    return standing(at=(0.15 * np.sin(2 * np.pi * 0.5 * t) ** 2, 0.0, 0.0), lifted=0.5 * np.sin(np.pi * 0.5 * t) ** 2)
+
+
+def followed(fps: float, seconds: float = 1.0) -> ClothDriver:
+    """A driver that has followed the swaying."""
+    one = driver()
+    for k in range(round(seconds * fps) + 1):
+        one.step(swaying(k / fps), 1.0 / fps)
+    return one
+
+
+def skinned() -> np.ndarray:
+    """The particles where skinning has them."""
+    return person().vertices[garment().particles]
+
+
+def test_a_cold_start_ends_where_cloth_hangs():
+    one = driver(DriverConfig())
+    shape = one.step(standing(at=(0.4, 0.0, 0.2), turned=0.5), 0.0)
+    still = one.particles(PART)
+    for _ in range(10):
+        one.step(standing(at=(0.4, 0.0, 0.2), turned=0.5), 1 / 30)
+    assert one.said == []
+    assert np.abs(one.particles(PART) - still).max() < 0.05
+    assert np.abs(one.particles(PART) - still).mean() < 0.01
+    np.testing.assert_array_equal(shape.vertices, garment().vertices)
+    assert shape.displacements[shape.share > 0].any()
+
+
+def test_displacements_put_the_cloth_where_the_particles_are():
+    one = followed(30.0)
+    shape = one.step(swaying(1.0), 1 / 30)
+    template = person()
+    posed = template.posed_body(swaying(1.0))
+    moved = template.vertices.copy()
+    moved[shape.vertices] += shape.displacements
+    blended = np.einsum("vj,jab->vab", template.weights.dense(), posed.posed_from_rest[0])
+    world = np.einsum("vij,vj->vi", blended[:, :3, :3], moved) + blended[:, :3, 3]
+    # Those that stand for particles; skin may push them out by a few millimetres.
+    np.testing.assert_allclose(world[garment().particles], one.particles(PART), atol=0.015)
+    assert np.abs(world[garment().particles] - one.particles(PART)).mean() < 0.002
+
+
+def test_pinned_particles_are_on_the_body_and_the_others_lag():
+    one = driver()
+    for k in range(16):
+        one.step(standing(at=(0.8 * (k / 15) ** 2, 0.0, 0.0)), 1 / 30)
+    there, pinned = skinned() + [0.8, 0.0, 0.0], garment().pinned
+    np.testing.assert_allclose(one.particles(PART)[pinned], there[pinned], atol=1e-5)
+    hem = garment().depth > 0.4
+    assert (one.particles(PART)[hem, 0] - there[hem, 0]).mean() < -0.03
+
+
+def test_the_same_motion_gives_the_same_bits():
+    np.testing.assert_array_equal(followed(30.0).particles(PART), followed(30.0).particles(PART))
+
+
+def test_a_person_who_stands_and_looks_elsewhere_has_the_same_cloth():
+    shapes = []
+    for turned, at in ((0.0, (0.0, 0.0, 0.0)), (1.2, (0.5, 0.3, -0.2))):
+        one, turn = driver(), matrix_from_rotvec(np.array([0.0, turned, 0.0]))
+        for k in range(12):
+            swayed = turn @ [0.1 * np.sin(k / 5) ** 2, 0.0, 0.0]
+            shape = one.step(standing(at=tuple(swayed + at), turned=turned), 1 / 30)
+        shapes.append(shape.displacements)
+    assert np.abs(shapes[0]).max() > 0.03
+    # Folds are chaotic: rounding grows by ten in a tenth of a second.
+    assert np.linalg.norm(shapes[1] - shapes[0], axis=1).mean() < 0.0015
+
+
+def test_frames_a_second_hardly_matter():
+    ends = {fps: followed(fps).particles(PART) for fps in (5.0, 30.0, 120.0)}
+    there = skinned() + [0.15 * np.sin(np.pi) ** 2, 0, 0]
+    assert np.linalg.norm(ends[120.0] - there, axis=1).mean() > 0.02  # it moved
+    apart = {fps: np.linalg.norm(ends[fps] - ends[120.0], axis=1) for fps in (5.0, 30.0)}
+    assert apart[30.0].mean() < 0.015 and apart[5.0].mean() < 0.025
+
+
+@pytest.mark.parametrize(
+    ("at", "seconds", "why"), [((3.0, 0.0, 0.0), 1 / 30, "leap"), ((0.1, 0.0, 0.0), 0.5, "without a pose")]
+)
+def test_a_leap_and_a_gap_start_anew_and_say_so(at, seconds, why):
+    one = followed(30.0, 0.3)
+    assert one.said == []
+    shape = one.step(standing(at=at), seconds)
+    assert len(one.said) == 1 and why in one.said[0] and "start anew" in one.said[0]
+    fresh = driver()
+    np.testing.assert_array_equal(shape.displacements, fresh.step(standing(at=at), 0.0).displacements)
+    # From there on as well.
+    again = [one.step(standing(at=(at[0] + 0.02, 0.0, 0.0)), 1 / 30) for one in (one, fresh)]
+    np.testing.assert_array_equal(again[0].displacements, again[1].displacements)
+
+
+def test_restart_forgets():
+    one = followed(30.0, 0.3)
+    one.restart()
+    np.testing.assert_array_equal(
+        one.step(standing(), 1 / 30).displacements, driver().step(standing(), 0.0).displacements
+    )
+    assert one.said == []
+
+
+def test_a_pose_that_is_not_known_holds_the_cloth_and_is_said():
+    one = followed(30.0, 0.3)
+    before = one.particles(PART)
+    held = one.step(None, 1 / 30)
+    assert "no pose" in one.said[0]
+    np.testing.assert_array_equal(one.particles(PART), before)
+    assert np.isfinite(held.displacements).all()
+    one.step(swaying(0.3 + 2 / 30), 2 / 30)  # seconds since the last step that had one
+    assert len(one.said) == 1
+    assert np.abs(one.particles(PART) - followed(30.0, 0.3 + 2 / 30).particles(PART)).mean() < 0.005
+
+
+def test_motion_may_begin_with_unknown_poses():
+    one = driver()
+    for _ in range(3):
+        shape = one.step(None, 1 / 30)
+    assert not shape.displacements.any() and len(one.said) == 3
+    assert one.step(standing(), 1 / 30).displacements.any()
+
+
+def test_a_simulation_that_breaks_falls_back_to_the_body_and_says_so():
+    one = driver(replace(QUICK, most_stretch=0.01))
+    shape = one.step(standing(), 0.0)
+    assert one.said and all("broke down" in sentence and PART in sentence for sentence in one.said)
+    np.testing.assert_allclose(one.particles(PART), skinned(), atol=1e-5)
+    moving = shape.share > 0
+    assert np.linalg.norm(shape.displacements[moving], axis=1).mean() < 0.004  # a coarse mesh carries it
+
+
+def test_a_body_that_starts_in_collision_is_said_and_comes_out():
+    lifted = standing(lifted=1.0)
+    one = driver(DriverConfig(ramp=0.0, hold=0.0))
+    one.step(lifted, 0.0)
+    assert any("start inside the body" in sentence for sentence in one.said)
+    count = len(one.said)
+    for _ in range(30):
+        shape = one.step(lifted, 1 / 30)
+    assert len(one.said) == count  # nothing broke
+    assert np.isfinite(shape.displacements).all()
+
+
+def test_surfaces_along_a_motion_are_those_of_the_steps():
+    motion = BodyParams.concatenate([swaying(k / 30) for k in range(4)])
+    template, one, said = person(), driver(), []
+    for k, surface in enumerate(play(template, [garment()], motion, fps=30.0, config=QUICK, said=said)):
+        shape = one.step(motion.frame(k), 1 / 30)
+        plain = template.pose(motion.frame(k))[0]
+        others = np.setdiff1d(np.arange(template.vertex_count), shape.vertices)
+        np.testing.assert_allclose(surface[others], plain[others], atol=1e-6)
+        at_pins = shape.vertices[shape.share == 0]
+        np.testing.assert_allclose(surface[at_pins], plain[at_pins], atol=1e-6)
+    moving = garment().particles[garment().depth > 0.1]
+    assert np.abs(surface[moving] - one.particles(PART)[garment().depth > 0.1]).mean() < 0.003
+    assert said == []
+
+
+def test_what_is_not_asked_for_rightly_is_refused():
+    template = person()
+    with pytest.raises(InputError, match="at least one garment"):
+        ClothDriver(template, [])
+    with pytest.raises(InputError, match="cut from this template"):
+        ClothDriver(template, [replace(garment(), part="cape")])
+    with pytest.raises(InputError, match="cut from this template"):
+        ClothDriver(template, [replace(garment(), vertices=garment().vertices + template.vertex_count)])
+    one = driver()
+    with pytest.raises(InputError, match="simulated part"):
+        one.particles("cape")
+    with pytest.raises(InputError, match="one frame"):
+        one.step(BodyParams.concatenate([standing(), standing()]), 1 / 30)
+    one.step(standing(), 0.0)
+    for seconds in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="seconds"):
+            one.step(standing(), seconds)
+    for name, value in (("ramp", -0.1), ("hold", float("nan")), ("teleport", 0.0), ("most_stretch", -1.0)):
+        with pytest.raises(InputError, match=name):
+            DriverConfig(**{name: value})

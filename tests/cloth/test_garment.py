@@ -1,0 +1,168 @@
+"""Garments cut from a template: what holds them, what they carry, what they touch; webs of openings; bad garments."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
+from smplxpp.cloth.carriers import find_carriers
+from smplxpp.cloth.opening_webs import find_opening_webs
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.template.template import BODY_PART
+from tests.cloth.persons import HEM, PART, WAIST, person, standing
+
+COARSE = GarmentConfig(spacing=0.06, collider_spacing=0.04)
+
+
+def cut(config: GarmentConfig = COARSE, **changes) -> Garment:
+    return cut_garment(person(**changes), PART, standing(), config)
+
+
+def test_a_skirt_hangs_from_its_waist_alone():
+    garment = cut()
+    height = garment.rest.vertices[:, 1]
+    assert garment.pinned.any()
+    np.testing.assert_allclose(height[garment.pinned], WAIST, atol=0.001)
+    assert (height[garment.depth > 0.45] < HEM + 0.1).all() and garment.depth.max() > 0.45
+    model = garment.model()
+    assert (model.inverse_mass[garment.pinned] == 0).all() and (model.inverse_mass[~garment.pinned] > 0).all()
+    assert 1.0 / model.inverse_mass[~garment.pinned].sum() > 0
+    mass = (1.0 / model.inverse_mass[~garment.pinned].astype(float)).sum()
+    assert mass == pytest.approx(garment.config.fabric.density * garment.rest.face_areas.sum(), rel=0.1)
+
+
+def test_it_carries_all_vertices_of_the_part_and_the_pins_have_none_of_the_simulation():
+    garment, template = cut(), person()
+    np.testing.assert_array_equal(garment.vertices, np.unique(template.faces[template.part_faces(PART)]))
+    share, depth = garment.share(), garment.vertex_depth
+    assert (share[depth <= garment.config.pin_depth] == 0).all()
+    assert (share[depth >= garment.config.pin_depth + garment.config.band] == 1).all()
+    order = np.argsort(depth)
+    assert (np.diff(share[order]) >= 0).all() and 0 < share.mean() < 1
+    np.testing.assert_allclose(garment.embedding.carried(garment.rest), template.vertices[garment.vertices], atol=1e-6)
+
+
+def test_lengths_at_rest_are_those_of_the_cloth_not_of_its_chords():
+    garment = cut()
+    a, b = garment.rest.edges.T
+    chords = np.linalg.norm(garment.rest.vertices[a] - garment.rest.vertices[b], axis=1)
+    assert (garment.lengths >= chords - 1e-9).all()
+    assert garment.lengths.sum() > 1.001 * chords.sum()  # it is round
+
+
+def test_spacing_is_what_was_asked_for():
+    counts = {}
+    for spacing in (0.06, 0.04):
+        garment = cut(replace(COARSE, spacing=spacing))
+        assert np.median(garment.lengths) == pytest.approx(spacing, rel=0.3)
+        counts[spacing] = len(garment.particles)
+    assert counts[0.04] / counts[0.06] == pytest.approx(2.25, rel=0.25)
+
+
+def test_it_touches_skin_near_it_that_faces_out():
+    garment, template = cut(), person()
+    collider = garment.collider
+    assert (collider.vertices < template.body.vertex_count).all()
+    mesh = TriangleMesh(template.vertices[collider.vertices], collider.faces)
+    body = template.part_mesh(BODY_PART)
+    skin = body.vertex_normals[collider.vertices[collider.faces]].mean(axis=1)
+    assert (np.einsum("fi,fi->f", mesh.face_normals, skin) > 0.3).mean() > 0.98
+    np.testing.assert_allclose(collider.margin, garment.config.skin_margin)
+
+
+def test_another_pin_depth_holds_more_without_cutting_anew():
+    garment = cut()
+    deeper = garment.with_config(replace(garment.config, pin_depth=0.1))
+    assert deeper.pinned.sum() > 2 * garment.pinned.sum() and deeper.rest is garment.rest
+    assert (deeper.share() <= garment.share()).all() and deeper.share().sum() < garment.share().sum()
+
+
+def test_a_web_under_a_hem_is_found_and_cut_off():
+    template = person(web=True)
+    web = find_opening_webs(template)
+    heights = template.vertices[template.faces[web]][..., 1]
+    assert web.sum() == 192 and np.ptp(heights) < 1e-9 and heights[0, 0] == pytest.approx(HEM)
+    with_web, without = cut(web=True), cut()
+    assert with_web.rest.face_areas.sum() == pytest.approx(without.rest.face_areas.sum(), rel=0.01)
+    # Its vertices ride along.
+    assert len(with_web.vertices) == len(without.vertices) + 96
+    assert np.isfinite(with_web.vertex_depth).all() and with_web.share()[-96:].min() == 1.0
+
+
+def test_a_skirt_without_a_web_has_none_and_nobody_takes_a_waist_for_one():
+    assert not find_opening_webs(person()).any()
+    assert not find_opening_webs(person(tight=False)).any()
+
+
+def test_waists_carry_and_hems_do_not():
+    template = person()
+    cloth = template.mesh.submesh(template.part_faces(PART))[0]
+    body = template.part_mesh(BODY_PART)
+    carriers = find_carriers(cloth, body)
+    np.testing.assert_allclose(cloth.vertices[carriers][:, 1], WAIST)
+    assert carriers.sum() == 48
+    lowered = cloth.with_vertices(cloth.vertices * [1.3, 1, 1.3])  # 5 cm from the skin: a waistband under a shirt
+    assert find_carriers(lowered, body).sum() == 48
+    wide = cloth.with_vertices(cloth.vertices * [2.0, 1, 2.0])
+    assert not find_carriers(wide, body).any()
+
+
+def test_a_garment_that_nothing_holds_is_refused_with_what_to_do():
+    with pytest.raises(InputError, match="to hang from") as error:
+        cut(tight=False)
+    assert PART in str(error.value) and "--cloth" in str(error.value)
+
+
+def test_an_inside_out_garment_is_turned_over_and_said():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        right = cut()
+    with pytest.warns(GeometryWarning, match="inwards"):
+        wrong = cut(outwards=False)
+    np.testing.assert_array_equal(wrong.particles, right.particles)
+    np.testing.assert_array_equal(wrong.pinned, right.pinned)
+    out = np.einsum("fi,fi->f", wrong.rest.face_normals, wrong.rest.face_centers * [1, 0, 1])
+    assert (out > 0).all()
+
+
+def test_a_torn_garment_hangs_from_what_is_tight_and_its_scraps_ride_along():
+    garment = cut(torn=True)
+    np.testing.assert_allclose(garment.rest.vertices[garment.pinned][:, 1], WAIST, atol=0.001)
+    scrap = garment.vertices[-3:]
+    assert not np.isin(scrap, garment.particles).any()
+    assert np.isfinite(garment.vertex_depth[-3:]).all()
+
+
+def test_what_is_no_garment_is_refused():
+    template = person()
+    for part in (BODY_PART, "cape"):
+        with pytest.raises(InputError, match="loose part"):
+            cut_garment(template, part, standing())
+    flat = np.array(template.vertices)
+    flat[template.body.vertex_count :] = [0.0, 1.0, 0.0]
+    with pytest.raises(InputError, match="area"):
+        cut_garment(replace(template, vertices=flat), PART, standing(), COARSE)
+
+
+@pytest.mark.parametrize(
+    ("cls", "name", "value"),
+    [
+        (GarmentConfig, "spacing", 0.0),
+        (GarmentConfig, "pin_depth", -1.0),
+        (GarmentConfig, "skin_margin", float("nan")),
+        (Fabric, "density", 0.0),
+        (Fabric, "compression", float("inf")),
+        (Fabric, "friction", -0.1),
+        (SolverConfig, "substep", 0.0),
+        (SolverConfig, "contacts_every", 0),
+        (SolverConfig, "own_margin", -1.0),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(cls, name, value):
+    with pytest.raises(InputError, match=name):
+        cls(**{name: value})
