@@ -13,6 +13,7 @@ from smplxpp.cloth.cloth_mesh import (
     opening_axis,
     turned_over,
 )
+from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
@@ -34,12 +35,19 @@ def find_opening_webs(template: Template) -> Bool[np.ndarray, " F"]:
     """Find the faces of a template's clothes that close an opening, in the T-pose.
 
     A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
-    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them.
+    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them. A body without an
+    inside has none.
     """
     out = np.zeros(len(template.faces), dtype=bool)
+    parts = [label.name for label in CLOTH_LABELS if label.name in template.part_names]
+    if not parts:
+        return out
     skin = template.part_mesh(BODY_PART)
-    body = SignedDistanceField(skin, solid=True)
-    for part in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
+    try:
+        body = SignedDistanceField(skin, solid=True)
+    except InputError:  # where the body has no inside, nobody knows what is hollow
+        return out
+    for part in parts:
         faces = template.part_faces(part)
         cloth = template.mesh.submesh(faces)[0]
         out[faces] = _webs_of(turned_over(cloth) if looks_inwards(cloth, skin) else cloth, body)

@@ -99,6 +99,17 @@ def test_a_skirt_without_a_web_has_none_and_nobody_takes_a_waist_for_one():
     assert not find_opening_webs(person(tight=False)).any()
 
 
+def test_a_body_that_is_no_solid_has_no_webs_and_carries_nothing():
+    template = person(web=True)
+    faces = template.faces.copy()
+    body = template.part_faces(BODY_PART)
+    faces[body] = faces[body][:, ::-1]
+    hollow = replace(template, faces=faces)
+    assert not find_opening_webs(hollow).any()
+    with pytest.raises(InputError, match="inward"):
+        cut_garment(hollow, PART, standing(), COARSE)
+
+
 def test_waists_carry_and_hems_do_not():
     template = person()
     cloth = template.mesh.submesh(template.part_faces(PART))[0]
