@@ -106,7 +106,7 @@ def test_a_body_that_is_no_solid_has_no_webs_and_carries_nothing():
     faces[body] = faces[body][:, ::-1]
     hollow = replace(template, faces=faces)
     assert not find_opening_webs(hollow).any()
-    with pytest.raises(InputError, match="inward"):
+    with pytest.warns(GeometryWarning, match="inwards"), pytest.raises(InputError, match="point inward"):
         cut_garment(hollow, PART, standing(), COARSE)
 
 

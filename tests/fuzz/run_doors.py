@@ -30,9 +30,12 @@ from pipelines.stages.photographed import unit_cube_of
 from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct, save_reconstruct
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.body import load_body
+from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.template import Template
 from tests.avatar_export.test_splats import random_splats
+from tests.cloth.persons import person
+from tests.cloth.test_driver import garment
 from tests.dolls.dancing import gaussians, template
 from tests.fuzz.examine import Door
 from tests.models.test_model_file import make
@@ -138,6 +141,11 @@ def run_doors() -> list[Door]:
     groups = {"scan": {"vertices": np.zeros((3, 3)), "faces": np.array([[0, 1, 2]])}, "hair": {"label": np.arange(3)}}
     return [
         Door("body npz", lambda folder: _write_body(folder / "b.npz"), lambda folder: load_body(folder / "b.npz")),
+        Door(
+            "garments",
+            lambda folder: save_garments(folder / "g.npz", [garment()]),
+            lambda folder: [one.model() for one in load_garments(folder / "g.npz", person())],
+        ),
         Door("template", lambda folder: template().save(folder / "t.npz"), lambda f: Template.load(f / "t.npz")),
         *(_model_door(kind) for kind in ("teacher", "tracked", "student", "shapes")),
         _model_door("shapes", compact=True),
