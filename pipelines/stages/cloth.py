@@ -82,14 +82,17 @@ class ClothStage(ModelStage):
         return {"cloth": self.config, "fps": trainer.scene.capture.fps}
 
     def inputs(self, trainer: Trainer) -> Mapping[str, str]:
-        return {**trainer.scene.digests, PARAMS: sha256_file(trainer.run / PARAMS)}
+        known = (trainer.run / PARAMS).is_file()
+        return {**trainer.scene.digests, **({PARAMS: sha256_file(trainer.run / PARAMS)} if known else {})}
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
         begin = time.monotonic()
         sequence = trainer.sequence(self.ground)
         teacher = trainer.model(self.teacher)
         track = teacher.track if isinstance(teacher, TeacherAvatar) else None
-        reference = load_params_of_run(trainer.run).frame(0).without_shape()
+        reference = None
+        if (trainer.run / PARAMS).is_file() or self.config.parts is not None:
+            reference = load_params_of_run(trainer.run).frame(0).without_shape()
         garments, found, outlines, said = find_garments(sequence, reference, self.config, track, session)
         save_garments(folder / self.file, garments)
         numbers = {
@@ -111,7 +114,7 @@ class ClothStage(ModelStage):
 
 def find_garments(
     sequence: AvatarSequence,
-    reference: BodyParams,
+    reference: BodyParams | None,
     config: ClothConfig,
     track: Track | None,
     session: Session,
@@ -119,7 +122,7 @@ def find_garments(
     """Cut and fit the loose parts of a template.
 
     Args:
-        reference: the pose in which the template's surface is the scan's.
+        reference: the pose in which the template's surface is the scan's; None: nobody knows it.
         track: the surface that was followed through the training frames; None: parts go by name, with the defaults.
 
     Returns:
@@ -133,6 +136,8 @@ def find_garments(
     if config.parts is not None:
         require_known("loose parts", config.parts, [name for name in template.part_names if name != "body"])
     wanted = clothes if config.parts is None else list(config.parts)
+    if reference is None:
+        return [], [], {}, ["the run does not say in which pose its template was scanned: nothing is simulated"]
     if config.parts is None and track is None:
         return [], [], {}, ["nothing was followed through the frames: no part is simulated unless it is named"]
     fps = sequence.capture.fps

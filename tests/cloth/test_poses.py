@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.cloth.poses import CausalSmoother, pose_between, reference_facing_as, smoothed
+from smplxpp.cloth.poses import CausalSmoother, pose_between, reference_facing_as, smoothed, upsampled
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
@@ -138,3 +138,47 @@ def test_a_smoother_starts_with_the_first_pose_and_after_a_restart_again():
     assert smoother(shaken.frame(1), 1 / 30).transl.tolist() != shaken.transl[1:2].tolist()
     smoother.restart()
     assert smoother(shaken.frame(2), 1 / 30).transl.tolist() == shaken.transl[2:].tolist()
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_poses_in_between_pass_through_those_given_and_go_evenly_where_they_do(times):
+    for params in (motion(8), motion(8, seed=1, degrees=20.0)):
+        fine = upsampled(params, times)
+        assert len(fine) == 7 * times + 1
+        assert angles(fine.select(slice(None, None, times)), params).max() < 1e-6
+        np.testing.assert_allclose(fine.transl[::times], params.transl, atol=1e-12)
+        # No jump: at an end of a step poses lie as near to each other as within it.
+        steps = np.linalg.norm(np.diff(fine.transl, axis=0), axis=1)
+        assert steps.max() < 4 * np.median(steps) + 1e-9
+    even = upsampled(motion(8), times)
+    np.testing.assert_allclose(
+        np.diff(even.transl, axis=0), 1 / times * np.tile([0.1, 0, 0.05], (7 * times, 1)), atol=1e-9
+    )
+    turns = angles(even.select(slice(1, None)), even.select(slice(0, -1)))
+    np.testing.assert_allclose(turns[:, 0], 0.25 / times, atol=1e-6)
+
+
+def test_poses_in_between_of_nothing_to_divide_are_what_was_given():
+    shaken = motion(5, seed=1)
+    assert upsampled(shaken, 1) is shaken
+    assert len(upsampled(shaken.frame(0), 4)) == 1
+    with pytest.raises(InputError, match="poses a step"):
+        upsampled(shaken, 0)
+
+
+def test_poses_in_between_are_near_the_curve_that_was_sampled():
+    t = np.arange(12) / 10.0
+
+    def curve(times: np.ndarray) -> BodyParams:
+        pose = np.zeros((len(times), 55, 3))
+        pose[:, 4, 0], pose[:, 0, 1] = np.sin(2 * times), 0.5 * np.sin(3 * times)
+        transl = np.stack([0.2 * np.sin(3 * times), 0 * times, 0 * times], axis=1)
+        count = len(times)
+        return BodyParams.from_full_pose(
+            pose, betas=np.zeros((count, 2)), expression=np.zeros((count, 2)), transl=transl
+        )
+
+    fine, truth = upsampled(curve(t), 4), curve(np.arange(45) / 40.0)
+    inner = slice(4, -4)
+    assert np.abs(fine.transl - truth.transl)[inner].max() < 0.001
+    assert angles(fine, truth)[inner].max() < np.radians(0.4)

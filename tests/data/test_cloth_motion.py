@@ -1,0 +1,182 @@
+"""Clothes simulated along a capture's frames: which frames, from where on, and what training is spared."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
+from avatar.data.sequence import AvatarSequence
+from smplxpp.capture import open_capture
+from smplxpp.cloth import ClothDriver, ClothShape
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.params import BodyParams
+from tests.cloth.persons import person, standing
+from tests.cloth.test_driver import QUICK, garment
+from tests.dolls.dancing import NOVEL_POSES, dance, template, write_dance
+
+FPS = 60.0
+
+
+def pose(frame: float) -> BodyParams:
+    t = frame / FPS
+    return standing(at=(0.15 * np.sin(3 * t) ** 2, 0.0, 0.1 * t), lifted=0.3 * np.sin(2 * t) ** 2)
+
+
+def shaken(frame: int) -> BodyParams:
+    off = 0.004 * np.random.default_rng(frame).normal(size=3)
+    return standing(at=tuple(pose(frame).transl[0] + off), lifted=0.3 * np.sin(2 * frame / FPS) ** 2)
+
+
+def motions(params=pose, *, count: int = 60, fps: float = FPS, **config) -> ClothMotions:
+    config = ClothMotionConfig(**{"smoothing": 0.0, "pre_roll": 0.2, "driver": QUICK, **config})
+    return ClothMotions(person(), [garment()], params=params, frames=range(count), fps=fps, config=config)
+
+
+def stepped(frames: range, params=pose) -> list[ClothShape]:
+    """What a driver says of frames that it begins with the first of."""
+    driver = ClothDriver(person(), [garment()], QUICK)
+    return [driver.step(params(frame), 1 / FPS) for frame in frames]
+
+
+def apart(one: ClothShape, other: ClothShape) -> float:
+    """The mean distance of what is wholly simulated, metres."""
+    return float(np.linalg.norm(one.displacements - other.displacements, axis=1)[one.share == 1].mean())
+
+
+def test_a_run_is_what_the_driver_says_after_its_pre_roll():
+    made = motions()
+    made.simulate(range(30, 36))
+    expected = stepped(range(18, 36))[-6:]
+    for frame, shape in zip(range(30, 36), expected, strict=True):
+        np.testing.assert_array_equal(made.shape(frame).displacements, shape.displacements)
+        assert made.time(frame) == pytest.approx(frame / FPS)
+    with pytest.raises(KeyError):
+        made.shape(29)  # the pre-roll is nobody's business
+
+
+def test_frames_are_simulated_once_and_in_any_order_of_asking():
+    made = motions()
+    made.simulate([33, 31, 32])
+    first = made.shape(32)
+    made.simulate([32, 31])
+    assert made.shape(32) is first
+    made.simulate([31, 34])  # 34 alone is new, and has its own pre-roll
+    np.testing.assert_array_equal(made.shape(34).displacements, stepped(range(22, 35))[-1].displacements)
+    made.simulate([])
+
+
+def test_frames_that_nobody_knows_the_pose_of_are_passed_over():
+    def some(frame: int) -> BodyParams | None:
+        return None if frame in (27, 28, 31) else pose(frame)
+
+    made = motions(some)
+    made.simulate([30, 31, 32])
+    assert apart(made.shape(32), stepped(range(18, 33))[-1]) < 0.004
+    with pytest.raises(KeyError):
+        made.shape(31)
+
+
+def test_a_long_gap_is_said_and_the_rest_goes_on():
+    made = motions(lambda frame: None if 10 < frame < 40 else pose(frame), pre_roll=1.0)
+    with pytest.warns(GeometryWarning, match="simulated clothes: .*start anew"):
+        made.simulate([50])
+    assert np.isfinite(made.shape(50).displacements).all()
+
+
+def test_skinned_clothes_have_no_displacement_where_they_would_be_simulated():
+    made = motions(mode="skin")
+    made.simulate([3, 4])
+    np.testing.assert_array_equal(made.shape(3).share, garment().share())
+    assert not made.shape(3).displacements.any()
+
+
+def test_few_frames_a_second_give_about_the_same_motion():
+    made, slow = motions(), motions(lambda frame: pose(6 * frame), count=10, fps=FPS / 6)
+    made.simulate(range(60))
+    slow.simulate(range(10))
+    still = made.shape(0)
+    off = [apart(slow.shape(k), made.shape(6 * k)) for k in range(10)]
+    moved = [apart(still, made.shape(6 * k)) for k in range(10)]
+    assert max(moved) > 0.015 and np.mean(off) < 0.35 * np.mean(moved), (off, moved)
+
+
+def test_smoothing_takes_the_shaking_of_a_tracker_out_of_the_cloth():
+    shakes = {}
+    for smoothing in (0.0, 0.03):
+        made = motions(shaken, smoothing=smoothing)
+        made.simulate(range(20, 50))
+        accelerations = np.diff([made.shape(frame).displacements for frame in range(20, 50)], n=2, axis=0)
+        shakes[smoothing] = np.abs(accelerations).mean()
+    assert shakes[0.03] < 0.5 * shakes[0.0]
+
+
+def test_frames_and_numbers_that_cannot_be_are_refused():
+    with pytest.raises(InputError, match="frames to simulate"):
+        motions().simulate([59, 60])
+    for fps in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="frames a second"):
+            motions(fps=fps)
+    for name in ("pre_roll", "smoothing"):
+        with pytest.raises(InputError, match=name):
+            ClothMotionConfig(**{name: -0.1})
+
+
+class Told:
+    """Takes the place of simulated clothes and remembers what was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[int]] = []
+
+    def simulate(self, run) -> None:
+        self.asked.append(list(run))
+
+    def shape(self, frame: int) -> ClothShape:
+        it = np.flatnonzero(template().cloth_mask)
+        moved = np.full((len(it), 3), 0.01 * frame, np.float32)
+        return ClothShape(it, moved, np.ones(len(it), np.float32))
+
+    def time(self, frame: int) -> float:
+        return frame / 10.0
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return open_capture(write_dance(tmp_path_factory.mktemp("captures") / "dance"))
+
+
+def test_a_sequence_simulates_what_training_does_not_see_and_nothing_else(capture):
+    told = Told()
+    sequence = AvatarSequence(capture, template(), cloth=told)
+    for frame in sequence.train_frames:
+        motion = sequence.motion(frame)
+        assert motion.cloth is None and motion.frame == frame
+    assert told.asked == []
+    for frame in NOVEL_POSES:
+        motion = sequence.motion(frame)
+        assert motion.frame is None and motion.time == frame / 10.0
+        np.testing.assert_allclose(motion.cloth.displacements[template().cloth_mask].numpy(), 0.01 * frame)
+    assert told.asked[0] == list(NOVEL_POSES)  # the whole run at once, in order
+    plain = AvatarSequence(capture, template())
+    assert plain.motion(NOVEL_POSES[0]).cloth is None
+    assert plain.with_cloth(told).motion(NOVEL_POSES[0]).cloth is not None
+
+
+def test_training_frames_as_new_ones_are_simulated_in_order_from_one_start(capture):
+    told = Told()
+    sequence = AvatarSequence(capture, template(), cloth=told)
+    motion = sequence.as_new_motion(2)
+    assert motion.frame is None and motion.known == 0.0 and motion.cloth is not None
+    assert told.asked == [list(sequence.train_frames)]
+    assert sequence.motion(2).cloth is None
+    without = AvatarSequence(capture, template()).as_new_motion(2)
+    assert without.frame is None and without.cloth is None
+
+
+def test_the_run_about_a_frame_ends_where_training_begins(capture):
+    sequence = AvatarSequence(capture, template(), cloth=Told())
+    runs = [sequence._run_of(frame) for frame in NOVEL_POSES]
+    assert runs == [list(NOVEL_POSES)] * 2
+    assert all(b - a == 1 for a, b in pairwise(runs[0])) and len(dance()) == NOVEL_POSES[-1] + 1
