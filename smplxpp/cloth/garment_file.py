@@ -17,13 +17,15 @@ from smplxpp.cloth.garment import Garment, GarmentConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text, parse_json
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 
 SCHEMA = 1
 _ABOUT = "smplxpp_garments"
 _REMEDY = "train again, or take the file as `smplxpp train` wrote it"
+# Metres: as near are vertices that were posed on two machines.
+_SAME = 1e-4
 # Arrays of a garment by name: type and shape, whose letters are sizes.
 _ARRAYS: Mapping[str, tuple[type, str]] = {
     "particles": (np.int64, "n"),
@@ -109,6 +111,15 @@ def _garment(
     reference = BodyParams.from_mapping(params, source=subject)
     if len(reference) != 1:
         raise InputError(subject, expected="one reference pose", received=f"{len(reference)}", remedy=_REMEDY)
+    # Another template may have as many vertices and more: particles are vertices, in the reference pose.
+    off = float(row_lengths(template.pose(reference)[0][own["particles"]] - rest.vertices).max())
+    if not off < _SAME:
+        raise InputError(
+            subject,
+            expected="particles that are vertices of the template",
+            received=f"some that are {1e3 * off:.3g} mm off",
+            remedy="it is of another template: train again",
+        )
     return Garment(
         part=as_text(about.get("part"), subject=f"{subject}: part"),
         config=_config(as_object(about.get("config"), subject=f"{subject}: config"), subject),

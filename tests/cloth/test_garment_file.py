@@ -88,6 +88,7 @@ def set_first(value):
         ("collider_vertices", set_first(2**40)),
         ("rest_vertices", set_first(np.nan)),
         ("rest_vertices", lambda a: a[:-1]),
+        ("rest_vertices", set_first(1e300)),
         ("depth", set_first(np.nan)),
         ("offset", set_first(np.inf)),
         ("lengths", lambda a: a[:-1]),
@@ -140,6 +141,13 @@ def test_other_files_and_other_templates_are_refused(path, tmp_path):
 
     with pytest.raises(InputError, match="another template"):
         load_garments(path, template())
+
+
+def test_a_template_that_was_built_anew_is_another_one(path):
+    it = person()
+    moved = replace(it, vertices=it.vertices + 0.002 * np.sin(50 * it.vertices))
+    with pytest.raises(InputError, match="of another template"):
+        load_garments(path, moved)
 
 
 def test_a_newer_file_asks_for_a_newer_program(path):
