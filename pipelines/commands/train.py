@@ -169,9 +169,16 @@ class Train:
         """
         if self.no_teacher and "teacher" in (self.stage, self.until):
             raise InputError("option no-teacher", expected="another last stage than the teacher", received="teacher")
-        if self.cloth == "none" and (self.loose_parts or "cloth" in (self.stage, self.until)):
+        if self.loose_parts or "cloth" in (self.stage, self.until):
             asked = f"loose parts {' '.join(self.loose_parts)}" if self.loose_parts else "the stage cloth"
-            raise InputError("option cloth", expected="auto", received=f"none, with {asked}")
+            if self.cloth == "none":
+                raise InputError("option cloth", expected="auto", received=f"none, with {asked}")
+            if self.no_teacher:
+                raise InputError(
+                    "option no-teacher",
+                    expected="a teacher, to whose followed surface clothes are fitted",
+                    received=f"none, with {asked}",
+                )
         if self.stage is not None:
             return (self.stage,)
         return STAGES[: STAGES.index(self.until) + 1]

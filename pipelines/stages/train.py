@@ -17,6 +17,7 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
+from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import (
     BAKE_STAGE,
     BIND_STAGE,
@@ -39,6 +40,8 @@ from pipelines.stages.teacher import TeacherStage
 from pipelines.stages.usable import normal_maps
 from smplxpp.capture import Capture
 from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_known
+from smplxpp.template.template import BODY_PART
 
 log = logging.getLogger(__name__)
 Shapes = Literal["full", "local", "pruned"]
@@ -145,6 +148,10 @@ def train(
             received="none",
             remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
         )
+    if "cloth" in steps and config.cloth is not None and config.cloth.parts:
+        names = [name for name in scene.template.part_names if name != BODY_PART]
+        require_known("loose parts", config.cloth.parts, names)
+        load_params_of_run(run)
     records: dict[str, StageRecord] = {}
     how = config.refine
     if "refine" in steps and how is not None:

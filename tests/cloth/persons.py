@@ -20,7 +20,7 @@ WAIST, HEM = 0.95, 0.45
 
 @cache
 def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False) -> Template:
-    """Hips and two legs, one of which a joint moves, and a skirt from the waist to the knees.
+    """Hips, two legs, a head, and a skirt from the waist to the knees.
 
     Args:
         web: a ring of faces closes the hem inwards, as a scan does.
@@ -32,7 +32,8 @@ def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn
     legs = [_leg(name, x) for name, x in (("left_hip", 0.08), ("right_hip", -0.08))]
     skirt = _skirt(web=web, tight=tight, outwards=outwards, torn=torn)
     names = load_body().joint_names
-    parts = [hips, *legs]
+    head = ball((0.09, 0.12, 0.1), 1.3, {"head": 1.0}, subdivisions=3)
+    parts = [hips, *legs, head]
     vertices = np.concatenate([part.vertices for part in parts])
     places = {"left_hip": (0.08, 0.85, 0.0), "right_hip": (-0.08, 0.85, 0.0)}
     regressor = np.zeros((len(names), len(vertices)))

@@ -19,6 +19,7 @@ from pipelines.cli import main
 from pipelines.figures.comparison import read_strip
 from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
+from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import HELD_OUT, template, write_dance, write_dance_run
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
@@ -107,12 +108,24 @@ def test_the_models_load_and_the_students_blend_shapes_fit_the_template(trained)
     assert student.frames == (0, 1, 2, 3)
 
 
+def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so(trained):
+    numbers = read_manifest(trained / "83_cloth")["numbers"]
+    assert numbers["loose"] == [] and "which pose" in numbers["said"][0]
+    assert load_garments(trained / "83_cloth" / "garments.npz", template()) == []
+
+
+def test_training_without_simulation_has_no_such_stage(fitted, capture, capsys):
+    assert train(fitted, capture, "--cloth", "none", "--until", "teacher") == 0
+    assert list(json.loads(capsys.readouterr().out)["stages"]) == ["fit", "teacher"]
+    assert not (fitted / "83_cloth").exists()
+
+
 def test_what_stands_is_not_trained_again(own, capture, capsys):
     made = {stage: (own / stage / "manifest.json").stat().st_mtime_ns for stage in STAGES}
     assert train(own, capture) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["finished"] and not any(stage["ran"] for stage in answer["stages"].values())
-    assert list(answer["stages"]) == ["fit", "teacher", "bake", "compensate"]
+    assert list(answer["stages"]) == ["fit", "teacher", "cloth", "bake", "compensate"]
     assert made == {stage: (own / stage / "manifest.json").stat().st_mtime_ns for stage in STAGES}
 
 

@@ -1,0 +1,77 @@
+"""`smplxpp evaluate --cloth`: a student's skirt simulated, moved by its field, or by the joints alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from avatar.evaluation.report import EvalReport
+from pipelines.runs.layout import GARMENTS
+from pipelines.runs.stage import read_manifest
+from smplxpp.cloth.garment_file import save_garments
+from tests.cloth.persons import PART, person
+from tests.dolls.skirted import garment, write_skirted
+from tests.pipelines.test_evaluate import evaluate, refused, write_models
+
+FEW = ("--sets", "novel_pose", "--every", "1", "--no-report", "--models", "student")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_skirted(tmp_path_factory.mktemp("captures") / "skirted")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    run = tmp_path_factory.mktemp("runs") / "skirted"
+    (run / "60_assemble").mkdir(parents=True)
+    person().save(run / "60_assemble" / "smplxpp.npz")
+    write_models(run, person())
+    (run / GARMENTS).parent.mkdir()
+    save_garments(run / GARMENTS, [garment()])
+    return run
+
+
+def measured(run, capture, capsys, *options: str) -> dict:
+    """The student's distance to the true skirt in held-out frames, metres, and whether it was measured now."""
+    assert evaluate(run, capture, *FEW, *options) == 0
+    answer = json.loads(capsys.readouterr().out)
+    report = EvalReport.load(run / "95_evaluate" / "metrics.json")
+    mean = report.models["student"].surfaces["held_out"].mean
+    return {"ran": answer["ran"], "p2s": mean["labels"][PART]["p2s"]}
+
+
+def test_a_simulated_skirt_is_nearer_to_the_true_one_than_a_skinned_one(trained, capture, tmp_path, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    simulated = measured(run, capture, capsys)
+    assert read_manifest(run / "95_evaluate")["config"]["cloth"] == "simulate"
+    assert measured(run, capture, capsys)["ran"] is False  # it stands
+    skinned = measured(run, capture, capsys, "--cloth", "skin")
+    moved_by_field = measured(run, capture, capsys, "--cloth", "field")
+    assert skinned["ran"] and moved_by_field["ran"]
+    assert simulated["p2s"] < 0.6 * skinned["p2s"]
+    assert moved_by_field["p2s"] not in (simulated["p2s"], skinned["p2s"])
+
+
+def test_other_garments_are_measured_anew_and_none_are_the_field(trained, capture, tmp_path, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    by_field = measured(run, capture, capsys, "--cloth", "field")["p2s"]
+    save_garments(run / GARMENTS, [])
+    assert measured(run, capture, capsys) == {"ran": False, "p2s": by_field}
+    assert read_manifest(run / "95_evaluate")["config"]["cloth"] == "field"
+
+
+def test_a_capture_without_its_frame_rate_is_refused_and_says_what_to_do(trained, capture, tmp_path, capsys):
+    run, silent = shutil.copytree(trained, tmp_path / "run"), shutil.copytree(capture, tmp_path / "capture")
+    about = json.loads((silent / "capture.json").read_text())
+    (silent / "capture.json").write_text(json.dumps({name: value for name, value in about.items() if name != "fps"}))
+    assert "--cloth field" in refused(capsys, run, silent, *FEW)
+    assert evaluate(run, silent, *FEW, "--cloth", "field") == 0
+
+
+def test_garments_of_a_template_that_was_built_anew_are_refused(trained, capture, tmp_path, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / GARMENTS).write_bytes(b"not a file of garments")
+    assert "train again" in refused(capsys, run, capture, *FEW)
