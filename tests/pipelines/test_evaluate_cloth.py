@@ -7,7 +7,6 @@ import shutil
 
 import pytest
 
-from avatar.evaluation.report import EvalReport
 from pipelines.runs.layout import GARMENTS
 from pipelines.runs.stage import read_manifest
 from smplxpp.cloth.garment_file import save_garments
@@ -35,11 +34,10 @@ def trained(tmp_path_factory):
 
 
 def measured(run, capture, capsys, *options: str) -> dict:
-    """The student's distance to the true skirt in held-out frames, metres, and whether it was measured now."""
+    """The student's distance to the true skirt in held-out frames, millimetres, and whether it was measured now."""
     assert evaluate(run, capture, *FEW, *options) == 0
     answer = json.loads(capsys.readouterr().out)
-    report = EvalReport.load(run / "95_evaluate" / "metrics.json")
-    mean = report.models["student"].surfaces["held_out"].mean
+    mean = answer["models"]["student"]["surfaces"]["held_out"]["mean"]
     return {"ran": answer["ran"], "p2s": mean["labels"][PART]["p2s"]}
 
 
@@ -71,7 +69,7 @@ def test_a_capture_without_its_frame_rate_is_refused_and_says_what_to_do(trained
     assert evaluate(run, silent, *FEW, "--cloth", "field") == 0
 
 
-def test_garments_of_a_template_that_was_built_anew_are_refused(trained, capture, tmp_path, capsys):
+def test_a_damaged_file_of_garments_is_refused(trained, capture, tmp_path, capsys):
     run = shutil.copytree(trained, tmp_path / "run")
     (run / GARMENTS).write_bytes(b"not a file of garments")
-    assert "train again" in refused(capsys, run, capture, *FEW)
+    assert "Train again" in refused(capsys, run, capture, *FEW)
