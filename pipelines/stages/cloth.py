@@ -192,8 +192,10 @@ def measure_outlines(sequence: AvatarSequence, garment: Garment, fps: float) -> 
         for simulated, motion in ((False, sequence.motion(frame)), (True, clothed.as_new_motion(frame))):
             mesh = TriangleMesh(rig.pose(motion).double().cpu().numpy(), rig.template.faces)
             for camera in sequence.cameras(frame, turn, OUTLINE_CAMERAS, 0):
-                mask = capture.mask(camera, frame) > 127
-                drawn = rasterize_mesh(mesh, capture.cameras[camera]).mask
+                image = capture.mask(camera, frame)
+                if image is None:
+                    continue
+                mask, drawn = image > 127, rasterize_mesh(mesh, capture.cameras[camera]).mask
                 wrong[simulated].append(1.0 - float((mask & drawn).sum() / max((mask | drawn).sum(), 1)))
     return Outlines(float(np.mean(wrong[False])), float(np.mean(wrong[True])), len(wrong[True]))
 
