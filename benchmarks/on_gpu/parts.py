@@ -278,7 +278,7 @@ def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]
     (run / TEMPLATE).parent.mkdir(parents=True, exist_ok=True)
     (run / TEMPLATE).write_bytes((job.run / TEMPLATE).read_bytes())
     toy = ("--gaussians", 300) if job.toy else ()
-    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report")
+    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report", "--cloth", "none")
     return command("train", *where, "--preset", preset, *toy, *options)
 
 

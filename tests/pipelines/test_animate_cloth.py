@@ -1,0 +1,70 @@
+"""`smplxpp animate` with loose clothes: simulated where the run has found some or a part is named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.cli import main
+from pipelines.commands.animate import Animate
+from pipelines.runs.layout import GARMENTS, PARAMS, TEMPLATE
+from smplxpp.cloth.garment_file import save_garments
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from tests.cloth.persons import PART, person, standing
+from tests.dolls.skirted import garment, pose
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "skirted"
+    for path in (TEMPLATE, PARAMS, GARMENTS):
+        (folder / path).parent.mkdir(parents=True)
+    person().save(folder / TEMPLATE)
+    standing().save(folder / PARAMS)
+    save_garments(folder / GARMENTS, [garment()])
+    return folder
+
+
+@pytest.fixture
+def params(tmp_path):
+    BodyParams.concatenate([pose(frame) for frame in range(FRAMES)]).save(tmp_path / "walk.npz")
+    return tmp_path / "walk.npz"
+
+
+def film(run, params, out, **options) -> tuple[dict, np.ndarray]:
+    result = Animate(run, params, out, height=80, json=True, fps=15.0, **options).run()
+    return result, np.stack([np.asarray(Image.open(path)).astype(int) for path in sorted(out.iterdir())])
+
+
+def test_clothes_that_training_found_swing(run, params, tmp_path):
+    simulated, moving = film(run, params, tmp_path / "simulated")
+    skinned, stiff = film(run, params, tmp_path / "skinned", cloth="skin")
+    assert simulated["simulated"] == [PART] and skinned["simulated"] == [] and simulated["said"] == []
+    changed = (moving != stiff).any(axis=3)
+    assert changed.any(axis=(1, 2)).all()
+    rows = np.flatnonzero(changed.any(axis=(0, 2)))
+    assert rows.min() > 20  # head and waist are where the joints have them
+    np.testing.assert_array_equal(film(run, params, tmp_path / "again")[1], moving)
+
+
+def test_a_part_of_a_film_is_simulated_too(run, params, tmp_path):
+    part, pictures = film(run, params, tmp_path / "part", start=3)
+    later, last = film(run, params, tmp_path / "later", start=4)
+    assert (part["frames"], later["frames"]) == (len(pictures), len(last)) == (3, 2)
+    # Both are preceded by the whole motion before them; the camera alone is fitted to other frames.
+    assert [part["simulated"], later["simulated"]] == [[PART]] * 2
+
+
+def test_parts_may_be_named_without_any_training(run, params, tmp_path, capsys):
+    options = ("--params", str(params), "-o", str(tmp_path / "named"), "--height", "40", "--json")
+    assert main(["animate", str(run), *options, "--loose-parts", PART]) == 0
+    assert json.loads(capsys.readouterr().out)["simulated"] == [PART]
+    with pytest.raises(InputError, match="loose part"):
+        film(run, params, tmp_path / "cape", loose_parts=("cape",))
+    assert not (tmp_path / "cape").exists()
