@@ -298,8 +298,16 @@ def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
     """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
     motion = sequence.motion(frame)
     if model.rig is sequence.rig:
-        return motion if isinstance(model, Student) else motion.without_cloth()
+        return motion if simulates(model) else motion.without_cloth()
     return model.rig.motion(_params(sequence, frame), frame=motion.frame)
+
+
+def simulates(model: AvatarModel) -> bool:
+    """Whether loose clothes of a model are simulated: those of students with a field, in its place.
+
+    Gaussians that follow the joints alone are the baseline that simulation is held against.
+    """
+    return isinstance(model, Student) and model.field is not None
 
 
 def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -> None:
