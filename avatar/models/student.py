@@ -98,8 +98,15 @@ class Student(nn.Module):
         jaw = motion.jaw[None] if self.blend_shapes.config.jaw else None
         z = self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw)
         head = self.blend_shapes.config.head_shapes
-        z = torch.cat([z[..., :head], self._known(motion) * z[..., head:]], dim=-1)
-        du, dc = self.blend_shapes(z)
+        of_head, of_body = z.clone(), self._known(motion) * z
+        of_head[..., head:], of_body[..., :head] = 0.0, 0.0
+        if motion.cloth is None:
+            du, dc = self.blend_shapes(of_head + of_body)
+        else:  # what was learned from a followed surface says nothing of one that is simulated
+            still = (1.0 - motion.cloth.share[self.rig.faces[bound.face_index]].mean(dim=1))[None]
+            du, dc = (
+                a + still * b for a, b in zip(self.blend_shapes(of_head), self.blend_shapes(of_body), strict=True)
+            )
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
     def _known(self, motion: Motion) -> float | Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
@@ -95,11 +95,6 @@ def build_model(
         tether=tether,
         spring=spring,
     )
-
-
-def with_pins(model: ClothModel, rest: TriangleMesh, fabric: Fabric) -> ClothModel:
-    """Return the same constraints with the masses of another density."""
-    return replace(model, inverse_mass=build_model(rest, (model.inverse_mass == 0.0) * 1.0, fabric).inverse_mass)
 
 
 def _edge_areas(rest: TriangleMesh) -> Float[np.ndarray, " e"]:
