@@ -9,8 +9,7 @@ import igl
 import numpy as np
 import pytest
 
-from pipelines.synth.checks import free_edge_strain
-from pipelines.synth.contact import depths
+from pipelines.synth.checks import depths, free_edge_strain
 from pipelines.synth.person_file import load_person
 from pipelines.synth.simulate import Take
 from smplxpp.body import load_body

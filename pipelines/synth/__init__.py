@@ -1,1 +1,1 @@
-"""The synthetic capture: performance, cloth dynamics (XPBD), soft light, files."""
+"""The synthetic capture: performance, clothes in motion, soft light, files."""

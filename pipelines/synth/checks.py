@@ -47,10 +47,15 @@ def _depths(person: Person, frames: Float[np.ndarray, "T V 3"]) -> dict[str, Flo
     count, own = person.body.vertex_count, {k: person.vertex_part == PART_NAMES.index(k) for k in _GARMENTS}
     found: dict[str, list[np.ndarray]] = {name: [] for name in _GARMENTS}
     for vertices in frames:
-        body = SignedDistanceField(TriangleMesh(vertices[:count], person.body.faces), solid=True)
+        body = TriangleMesh(vertices[:count], person.body.faces)
         for name in _GARMENTS:
-            found[name].append(np.maximum(-body.query(vertices[own[name]]).distance, 0.0))
+            found[name].append(depths(body, vertices[own[name]]))
     return {name: np.stack(rows) for name, rows in found.items()}
+
+
+def depths(surface: TriangleMesh, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """Return how deep points lie inside a closed surface, metres; 0 outside. Winding numbers tell the sides exactly."""
+    return np.maximum(-SignedDistanceField(surface, solid=True).query(points).distance, 0.0)
 
 
 def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarray, "T E"]:

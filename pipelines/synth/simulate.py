@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipelines.synth.cloth_model import Fabric, build_cloth
-from pipelines.synth.cloth_solver import ClothSolver, SolverConfig, Tick
-from pipelines.synth.contact import body_contacts, sheet_contacts
+from pipelines.synth.garment import Block, Garment, Stepping
 from pipelines.synth.motion import Motion
 from pipelines.synth.noise import ramp
 from pipelines.synth.person import PART_NAMES, Person
@@ -19,6 +17,8 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
 
+# Metres behind skin and skirt up to which cloth is pushed out of them: half a limb, little of a sheet.
+_SKIN_DEPTH, _SHEET_DEPTH = 0.05, 0.02
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 
 
@@ -28,11 +28,11 @@ class SimulationConfig:
 
     Attributes:
         fps: of the frames.
-        tick: longest time between two searches for contacts, seconds.
+        tick: longest time between two poses that move the clothes, seconds.
         settle: seconds in which the clothes come to rest on the first pose before the motion starts.
         skin_margin, sheet_margin: metres that cloth keeps from the skin, and the shirt from the skirt.
-        substeps: of a tick, a garment: the skirt hangs from its waist alone and needs more.
-        fabric, solver: material, stepping.
+        substep: seconds at most, a garment: the skirt hangs from its waist alone and needs shorter ones.
+        stepping: material, and how time is stepped.
     """
 
     fps: float = 10.0
@@ -40,9 +40,8 @@ class SimulationConfig:
     settle: float = 0.8
     skin_margin: float = 0.004
     sheet_margin: float = 0.003
-    substeps: Mapping[str, int] = field(default_factory=lambda: {"lower": 20, "upper": 12})
-    fabric: Fabric = field(default_factory=Fabric)
-    solver: SolverConfig = field(default_factory=SolverConfig)
+    substep: Mapping[str, float] = field(default_factory=lambda: {"lower": 1.0 / 1000.0, "upper": 1.0 / 600.0})
+    stepping: Stepping = field(default_factory=Stepping)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,39 +123,6 @@ def attachment(person: Person) -> Float[np.ndarray, " V"]:
     return out
 
 
-class _Garment:
-    """One piece of clothing: its particles among all vertices, and their solver."""
-
-    def __init__(
-        self,
-        person: Person,
-        part: int,
-        hold: Float[np.ndarray, " V"],
-        start: Float[np.ndarray, "V 3"],
-        config: SimulationConfig,
-    ) -> None:
-        skinned = TriangleMesh(start, person.tpose.faces)
-        rest, self.vertices = skinned.submesh(person.face_part == part)
-        substeps = config.substeps[PART_NAMES[part]]
-        model = build_cloth(rest, hold[self.vertices], config.fabric)
-        self.solver = ClothSolver(model, rest.vertices, replace(config.solver, substeps=substeps))
-        self.free = np.flatnonzero(~model.fixed)
-
-    def advance(self, tick: Tick, *, damped: bool) -> None:
-        """Go on by a tick; what is tight all over goes where the body takes it."""
-        if not len(self.free):
-            self.solver.position = tick.places[1]
-            return
-        if damped:
-            self.solver.velocity *= 0.7
-        self.solver.advance(tick)
-
-    @property
-    def mesh(self) -> TriangleMesh:
-        """The garment as it is now."""
-        return self.solver.model.rest.with_vertices(self.solver.position)
-
-
 class HairLag:
     """The rotation by which hair trails behind its head: a damped rotational spring.
 
@@ -198,7 +164,7 @@ class _Stage:
     def __init__(self, person: Person, performance: Motion, config: SimulationConfig) -> None:
         self.person, self.performance, self.config = person, performance, config
         self.hair = np.flatnonzero(person.vertex_part == HAIR)
-        self._skin_faces = _contact_faces(person)
+        self._skin = Block(_contact_faces(person), config.skin_margin, _SKIN_DEPTH)
         self._head = person.body.joint_names.index("head")
         self._ankles = [person.body.joint_names.index(name) for name in ("left_ankle", "right_ankle")]
         self._planted: Float[np.ndarray, " 3"] | None = None
@@ -207,10 +173,9 @@ class _Stage:
         self._pivot = self._head_joint(transforms[0])
         self.lag = HairLag(transforms[0, self._head, :3, :3])
         self._looseness = self._hair_looseness()
-        hold = attachment(person)
-        self.skirt, self.shirt = (
-            _Garment(person, part, hold=hold, start=self._layers, config=config) for part in (LOWER, UPPER)
-        )
+        self._skirt_vertices, self.skirt = self._garment(LOWER, [self._skin])
+        sheet = Block(self.skirt.mesh.faces, config.sheet_margin, _SHEET_DEPTH)
+        self._shirt_vertices, self.shirt = self._garment(UPPER, [self._skin, sheet])
 
     def standing(
         self, times: Float[np.ndarray, " T"]
@@ -247,19 +212,11 @@ class _Stage:
         """
         _, layers, transforms = self.standing(np.array([time]))
         before, after = self._layers, layers[0]
-        count = self.person.body.vertex_count
-        skin_before, skin_ends = TriangleMesh(before[:count], self._skin_faces), (before[:count], after[:count])
-        skirt_before = self.skirt.mesh
-        for garment in (self.skirt, self.shirt):
-            contacts = []
-            if len(garment.free):
-                touching = body_contacts(skin_before, garment.mesh, garment.free, margin=self.config.skin_margin)
-                contacts.append((touching, skin_ends))
-            if garment is self.shirt:
-                over = sheet_contacts(skirt_before, garment.mesh, garment.free, margin=self.config.sheet_margin)
-                contacts.insert(0, (over, (skirt_before.vertices, self.skirt.solver.position)))
-            places = (before[garment.vertices], after[garment.vertices])
-            garment.advance(Tick(seconds, places, contacts), damped=damped)
+        skin, skirt = (before, after), self._skirt_vertices
+        skirt_before = self.skirt.position
+        self.skirt.advance(seconds, (before[skirt], after[skirt]), [skin], damped=damped)
+        sheet, shirt = (skirt_before, self.skirt.position), self._shirt_vertices
+        self.shirt.advance(seconds, (before[shirt], after[shirt]), [skin, sheet], damped=damped)
         self.lag.advance(transforms[0, self._head, :3, :3], seconds)
         self._pivot = self._head_joint(transforms[0])
         self._layers = after
@@ -267,10 +224,18 @@ class _Stage:
     def layers(self) -> Float[np.ndarray, "V 3"]:
         """Return all layers as they are now."""
         out = self._layers.copy()
-        for garment in (self.skirt, self.shirt):
-            out[garment.vertices] = garment.solver.position
+        out[self._skirt_vertices], out[self._shirt_vertices] = self.skirt.position, self.shirt.position
         out[self.hair] = self.lag.applied(out[self.hair], self._looseness, self._pivot)
         return out
+
+    def _garment(self, part: int, touches: list[Block]) -> tuple[Int[np.ndarray, " N"], Garment]:
+        """Return the vertices of a part among all, and the part as a garment on the first pose."""
+        layers = TriangleMesh(self._layers, self.person.tpose.faces)
+        rest, vertices = layers.submesh(self.person.face_part == part)
+        stepping = self.config.stepping
+        solver = replace(stepping.solver, substep=self.config.substep[PART_NAMES[part]])
+        hold = attachment(self.person)[vertices]
+        return vertices, Garment(rest, hold, touches, replace(stepping, solver=solver))
 
     def _head_joint(self, transforms: Float[np.ndarray, "55 4 4"]) -> Float[np.ndarray, " 3"]:
         """Return where the head's joint is: the hair's pivot."""

@@ -36,7 +36,7 @@ QUICK = SynthConfig(
     size=48,
     supersampling=2,
     scan_faces=0,
-    simulation=SimulationConfig(settle=0.04, substeps={"lower": 3, "upper": 3}),
+    simulation=SimulationConfig(settle=0.04, substep={"lower": 1 / 150, "upper": 1 / 150}),
     light=LightConfig(directions=6, resolution=64),
 )
 

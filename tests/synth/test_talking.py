@@ -48,7 +48,7 @@ QUICK = SynthConfig(
     truth_step=2,
     normals_step=4,
     scan_faces=0,
-    simulation=SimulationConfig(settle=0.02, substeps={"lower": 2, "upper": 2}),
+    simulation=SimulationConfig(settle=0.02, substep={"lower": 1 / 100, "upper": 1 / 100}),
     light=LightConfig(directions=4, resolution=48),
 )
 

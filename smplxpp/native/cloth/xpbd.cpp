@@ -110,7 +110,8 @@ void normals(const Vec3* x, const int32_t* face, int64_t faces, std::vector<Vec3
     for (Vec3& n : out) n = n * (1.0f / std::max(length(n), 1e-12f));
 }
 
-// A moving surface that cloth may touch: where a point's nearest vertex is, and the nearest place on that vertex's faces.
+// A moving surface that cloth may touch: where a point's nearest vertex is, and the nearest place on its faces
+// and on those about.
 class Surface {
 public:
     Surface(int64_t vertices, const int32_t* face, int64_t faces)
@@ -140,19 +141,39 @@ public:
         });
         if (near < 0) return found;
         best = 1e9f;
-        for (int32_t k = first_[size_t(near)]; k < first_[size_t(near) + 1]; ++k) {
-            const int32_t* q = face_ + 3 * int64_t(at_[size_t(k)]);
-            float weight[3];
-            const Vec3 d = p - smplxpp::closest_on_triangle(p, vertex_[q[0]], vertex_[q[1]], vertex_[q[2]], weight);
-            if (!(dot(d, d) < best)) continue;  // nor a triangle without area
-            best = dot(d, d);
-            found.face = at_[size_t(k)];
-            std::copy(weight, weight + 3, found.weight);
+        // Among large and small triangles the nearest face need not be one of the nearest vertex: where the place lies on
+        // the far side of the vertex's faces, look on from there.
+        for (int step = 0; step < kSteps && scan(p, near, best, found); ++step) {
+            const int32_t* q = face_ + 3 * int64_t(found.face);
+            int32_t next = near;
+            float most = 0;
+            for (int j = 0; j < 3; ++j) {
+                if (q[j] == near && found.weight[j] > 0) return found;
+                if (found.weight[j] > most) most = found.weight[j], next = q[j];
+            }
+            if (!(dot(normal_[size_t(next)], cloth_normal) > kCovers)) break;
+            near = next;
         }
         return found;
     }
 
 private:
+    // Looks for a place nearer than the best on the faces of a vertex; says whether there is one.
+    bool scan(Vec3 p, int32_t vertex, float& best, Contact& found) const {
+        bool nearer = false;
+        for (int32_t k = first_[size_t(vertex)]; k < first_[size_t(vertex) + 1]; ++k) {
+            const int32_t* q = face_ + 3 * int64_t(at_[size_t(k)]);
+            float weight[3];
+            const Vec3 d = p - smplxpp::closest_on_triangle(p, vertex_[q[0]], vertex_[q[1]], vertex_[q[2]], weight);
+            if (!(dot(d, d) < best)) continue;  // nor a triangle without area
+            best = dot(d, d), nearer = true;
+            found.face = at_[size_t(k)];
+            std::copy(weight, weight + 3, found.weight);
+        }
+        return nearer;
+    }
+
+    static constexpr int kSteps = 8;          // from one vertex's faces to the next one's
     static constexpr float kReach = 0.035f;   // metres within which a vertex is found
     static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
     const int32_t* face_;
