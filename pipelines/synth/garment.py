@@ -46,7 +46,7 @@ class Stepping:
         default_factory=lambda: Fabric(
             stretch_stiffness=11_500.0,
             compression=1.0,
-            bend_stiffness=2e-5,
+            bend_stiffness=3e-6,
             slack=0.005,
             drag=0.8,
             normal_drag=0.0,
