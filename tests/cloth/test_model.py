@@ -7,7 +7,7 @@ import pytest
 
 from smplxpp.cloth.embedding import embed
 from smplxpp.cloth.fabric import Fabric
-from smplxpp.cloth.model import build_model
+from smplxpp.cloth.model import build_model, shuffled
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec
 from tests.cloth.sheets import bent, hanging, held
@@ -19,6 +19,18 @@ def test_masses_are_the_sheets():
     mesh, fabric = bent(hanging()), Fabric(density=0.3)
     mass = 1.0 / build_model(mesh, np.zeros(35), fabric).inverse_mass.astype(float)
     assert mass.sum() == pytest.approx(0.3 * mesh.face_areas.sum(), rel=1e-5)
+
+
+def test_shuffled_edges_are_the_same_edges_in_no_order():
+    model = build_model(hanging(20, 20), held(hanging(20, 20)), Fabric())
+    other = shuffled(model)
+    rows = [
+        sorted(zip(*(getattr(m, name).tolist() for name in ("edges", "lengths", "stretch", "compress")), strict=True))
+        for m in (model, other)
+    ]
+    assert rows[0] == rows[1]
+    assert abs(np.corrcoef(np.arange(len(other.edges)), other.edges.sum(axis=1))[0, 1]) < 0.1
+    np.testing.assert_array_equal(shuffled(model).edges, other.edges)
 
 
 def test_every_edge_that_moves_once_from_what_holds_downwards():

@@ -15,7 +15,7 @@ import pytest
 from smplxpp.cloth import solver as solver_module
 from smplxpp.cloth.fabric import Fabric, SolverConfig
 from smplxpp.cloth.model import build_model
-from smplxpp.cloth.solver import GRAVITY, ClothState
+from smplxpp.cloth.solver import GRAVITY, ClothState, push_out
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec
@@ -259,6 +259,17 @@ def test_cloth_deep_under_a_surface_is_left_where_it_is(weightless):
         ends.append(scene.run(0.1).position)
     assert (np.linalg.norm(ends[0], axis=1) > 0.12).all()
     np.testing.assert_array_equal(ends[1], deep.vertices.astype(np.float32))
+
+
+def test_the_nearest_place_is_found_on_large_faces_beside_small_ones():
+    # A large level face, and a small one that falls away from its edge with the vertex that is nearest to the point.
+    edge, far, near = [[0.0, 0, -0.025], [0, 0, 0.025]], [-0.04, 0, 0], [0.003, -0.004, 0]
+    surface = TriangleMesh(np.array([*edge, far, near]), np.array([[1, 0, 2], [0, 1, 3]]))
+    assert (surface.face_normals[:, 1] > 0).all()
+    point, up = np.array([[-0.008, 0.001, 0]], np.float32), np.array([[0.0, 1, 0]])
+    vertices = surface.vertices.astype(np.float32)
+    out = push_out(point, up, vertices, collider(surface), margin=0.002)
+    np.testing.assert_allclose(out, [[-0.008, 0.002, 0]], atol=2e-4)
 
 
 def slid(degrees: float, seconds: float, friction: float) -> float:
