@@ -33,7 +33,7 @@ class AblationBenchmark:
     """Run with the ablation."""
     capture: OptionalPath = None
     """Folder of the capture, to train and measure first what is missing."""
-    preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
+    preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
     """Of the training."""
     rows: tuple[str, ...] = ("paper",)
     """Rows and groups."""

@@ -30,7 +30,7 @@ from avatar.models.networks.teacher import Teacher
 from avatar.render.map_frame import MapFrame
 from benchmarks.machine import store_results
 
-VERTICES, GAUSSIANS = 22_000, {"paper": 220_000, "gpu": 220_000, "cpu": 50_000, "demo": 20_000}
+VERTICES, GAUSSIANS = 22_000, {"paper": 220_000, "gpu": 220_000, "paper-small": 50_000, "cpu": 50_000, "demo": 20_000}
 
 
 @dataclass(frozen=True)

@@ -42,12 +42,16 @@ class DisplacementLoss:
         return difference[self.mask].mean() / self.unit
 
 
+def vertex_labels(rig: Rig, *, tau: float = TAU) -> Float[Tensor, "V 3"]:
+    """Return the labels of the template's vertices, `e = c + sin(tau v)`; arguments as of `semantic_labels`."""
+    return rig.semantic_colors + torch.sin(tau * rig.vertices)
+
+
 def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) -> Float[Tensor, "N 3"]:
     """Return the labels of the Gaussians, `e = c + sin(tau v)` interpolated from their triangles' corners.
 
     Args:
         tau: radians a metre; v are the corners in the T-pose, c their semantic colours in [0, 1].
     """
-    labels = rig.semantic_colors + torch.sin(tau * rig.vertices)
-    corners = labels[rig.faces[gaussians.face_index]]
+    corners = vertex_labels(rig, tau=tau)[rig.faces[gaussians.face_index]]
     return on_triangles(corners, gaussians.barycentric)

@@ -34,7 +34,7 @@ class Ablate:
     """Folder that `smplxpp build` wrote; the ablation goes into RUN/ablation."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters."""
-    preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
+    preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
     """Sizes and iterations of all rows, as for `smplxpp train`."""
     rows: tuple[str, ...] = ("paper",)
     """Rows by name, or groups of them: paper, options, baselines, all. See docs/ablation.md."""

@@ -41,9 +41,10 @@ class Train:
     it. Write --run-folder with torchrun, which takes --run for an option of its own."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
-    preset: Literal["paper", "gpu", "cpu", "demo"] = "cpu"
+    preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
     """paper: the numbers that the paper states (docs/training.md lists the others), for a GPU; gpu: smaller and some
-    hours; cpu: two cores, half an hour; demo: minutes, to see whether all fits together."""
+    hours; paper-small: the paper's recipe in the minutes of cpu; cpu: two cores, half an hour; demo: minutes, to see
+    whether all fits together."""
     stage: Annotated[
         Literal["refine", "teacher", "cloth", "bake", "compensate"] | None,
         tyro.conf.arg(metavar="{refine,teacher,cloth,bake,compensate}", help_behavior_hint="(optional)"),

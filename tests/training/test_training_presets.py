@@ -68,5 +68,5 @@ def test_the_bakes_student_has_no_blend_shapes(name):
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(InputError, match="'paper' or 'gpu' or 'cpu' or 'demo'"):
+    with pytest.raises(InputError, match="'paper' or 'gpu' or 'paper-small' or 'cpu' or 'demo'"):
         training_preset("tpu")

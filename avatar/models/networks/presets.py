@@ -19,11 +19,15 @@ class NetworkPreset:
 
 _LEAN = TeacherConfig(networks="shared", position_size=128, centred=True, style_layers=1, noise=False, zero_output=True)
 
+# Three networks, as published.
+_SMALL = TeacherConfig(centred=True, style_layers=1, noise=False, zero_output=True)
+
 _TEACHERS = {
     "paper": TeacherConfig(),
     "gpu": TeacherConfig(
         in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
     ),
+    "paper-small": replace(_SMALL, in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32),
     "cpu": replace(_LEAN, in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32),
     "demo": replace(_LEAN, in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16),
 }
@@ -39,7 +43,7 @@ NETWORK_PRESETS = {
 
 
 def network_preset(name: str) -> NetworkPreset:
-    """Return the preset "paper", "gpu", "cpu" or "demo".
+    """Return the preset "paper", "gpu", "paper-small", "cpu" or "demo".
 
     Raises:
         InputError: another name.

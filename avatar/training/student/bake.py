@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,12 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
-from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels
+from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels, vertex_labels
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.avatar_view import Rendering
+from avatar.render.mesh_maps import mesh_maps
+from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion
 from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import Progress
@@ -39,6 +42,8 @@ class BakeConfig(PhotometricConfig):
         imagined: poses between those of the training frames that the pretraining asks the teacher about.
         images: what renderings are compared with: the "teacher"'s, or "photographs".
         nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
+        semantic_map: what shows the student's labels: its "mesh", as in the paper, whose gradients reach the field
+            alone; or its "gaussians", which are drawn with the image.
         tau: radians a metre, of the semantic labels.
         code_lr_factor: Adam's step of the frame codes, as a multiple of `lr`.
         null_share: of the poses that are shown with the null code, so that it means something.
@@ -52,6 +57,7 @@ class BakeConfig(PhotometricConfig):
     imagined: int = 0
     nonrigid: float = 0.1
     semantic: float = 1.0
+    semantic_map: str = "gaussians"
     tau: float = TAU
     code_lr_factor: float = 1.0
     null_share: float = 0.0
@@ -60,6 +66,7 @@ class BakeConfig(PhotometricConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("bake: images", self.images, ("teacher", "photographs"))
+        require_choice("bake: semantic_map", self.semantic_map, ("mesh", "gaussians"))
         for name in ("imagined", "nonrigid", "semantic", "code_lr_factor", "pose_noise"):
             require_at_least(f"bake: {name}", getattr(self, name), 0.0)
         require_between("bake: null_share", self.null_share, 0.0, 1.0)
@@ -105,7 +112,12 @@ class BakeTask(PhotometricTask):
             self.displacement_loss = DisplacementLoss(
                 sequence.rig, teacher.frame, teacher_config.out_size, teacher_config.position_scale
             )
-            self.labels = semantic_labels(sequence.rig, student.gaussians(), tau=config.tau)
+            self.of_mesh = config.semantic_map == "mesh"
+            self.labels = (
+                vertex_labels(sequence.rig, tau=config.tau)
+                if self.of_mesh
+                else semantic_labels(sequence.rig, student.gaussians(), tau=config.tau)
+            )
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame and its terms."""
@@ -118,10 +130,12 @@ class BakeTask(PhotometricTask):
         semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
         shown = self.targets.of_views(item.frame, views) if semantic or imitates else []
         targets = [one.target for one in shown] if imitates else None
-        total, terms, renderings = self.compared(posed, views, targets, extra=self.labels if semantic else None)
+        total, terms, renderings = self.compared(
+            posed, views, targets, extra=None if self.of_mesh or not semantic else self.labels
+        )
         if semantic:
-            pairs = zip(renderings, shown, strict=True)
-            differences = [(_labels(drawn) - one.labels).abs().mean() for drawn, one in pairs]
+            drawn = self._mesh_labels(posed, views) if self.of_mesh else map(_labels, renderings)
+            differences = [(own - one.labels).abs().mean() for own, one in zip(drawn, shown, strict=True)]
             terms["semantic"] = float(torch.stack(differences).mean().detach())
             total = total + self.config.semantic * torch.stack(differences).mean()
         if self.config.nonrigid and posed.displacements is not None:
@@ -129,6 +143,12 @@ class BakeTask(PhotometricTask):
             terms["nonrigid"] = float(nonrigid.detach())
             total = total + self.config.nonrigid * nonrigid
         return total, {"loss": float(total.detach()), **terms}
+
+    def _mesh_labels(self, posed: PosedAvatar, views: Sequence[View]) -> Iterator[Tensor]:
+        """Return the labels of the student's mesh in each view, with gradients to its vertices."""
+        for view in views:
+            maps = mesh_maps(posed.vertices, self.sequence.rig.faces, view.camera)
+            yield maps.interpolate(self.labels)
 
     def _seen(self, motion: Motion, frame: int) -> Motion:
         """Return the pose as the field is shown it."""
