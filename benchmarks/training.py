@@ -29,7 +29,7 @@ from avatar.training.student.compensate import CompensateTask
 from avatar.training.student.pretrain import PretrainFieldTask
 from avatar.training.teacher.fit_teacher import TeacherTask
 from avatar.training.teacher.pretrain import PretrainTeacherTask
-from avatar.training.tracking.track import TrackTask
+from avatar.training.tracking.track import TrackConfig, TrackTask
 from benchmarks.machine import store_results
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.protocol import run_protocol
@@ -59,7 +59,7 @@ class TrainingBenchmark:
     """Run that was trained and evaluated."""
     capture: Path
     """Folder of its capture."""
-    preset: Literal["cpu", "demo"] = "cpu"
+    preset: Literal["paper-small", "cpu", "demo"] = "cpu"
     """That it was trained with."""
 
     def run(self) -> None:
@@ -191,38 +191,39 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
     teacher = load_avatar(run / "80_teacher" / "teacher.safetensors", rig)
     baked = load_avatar(run / "85_bake" / "student.safetensors", rig)
     student = load_avatar(run / "90_compensate" / "student.safetensors", rig)
-    followed = TrackedAvatar(
-        rig, load_bound(run / "70_bind" / "gaussians.safetensors"), preset.teacher.track.control_points
-    )
-    steps, bake = preset.teacher.track.steps, preset.bake
+    track, pretrain, bake = preset.teacher.track, preset.teacher.pretrain, preset.bake
 
-    def tracking(task: TrackTask) -> Callable[[int], Any]:
+    def tracking(config: TrackConfig) -> Callable[[int], Any]:
+        gaussians = load_bound(run / "70_bind" / "gaussians.safetensors")
+        task = TrackTask(sequence, TrackedAvatar(rig, gaussians, config.control_points), config)
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.
-        return lambda k: task.step(steps * (k // TIMED) + k % TIMED * steps // TIMED)
+        return lambda k: task.step(config.steps * (k // TIMED) + k % TIMED * config.steps // TIMED)
 
     # Made one after the other: the bake's task freezes the teacher.
     tasks = {
-        "tracking": lambda: tracking(TrackTask(sequence, followed, preset.teacher.track)),
-        "teacher's pretraining": lambda: (
-            PretrainTeacherTask(sequence, teacher, preset.teacher.pretrain, 0, teacher.track).step
-        ),
+        "tracking": track and (lambda: tracking(track)),
+        "teacher's pretraining": pretrain
+        and (lambda: PretrainTeacherTask(sequence, teacher, pretrain, 0, teacher.track).step),
         "teacher": lambda: TeacherTask(sequence, teacher.train(), preset.teacher).step,
-        "bake's pretraining": lambda: (
-            PretrainFieldTask(
-                sequence,
-                baked,
-                teacher,
-                bake.pretrain,
-                0,
-                code_lr_factor=bake.code_lr_factor,
-                null_share=bake.null_share,
-                imagined=bake.imagined,
-            ).step
+        "bake's pretraining": bake.pretrain
+        and (
+            lambda: (
+                PretrainFieldTask(
+                    sequence,
+                    baked,
+                    teacher,
+                    bake.pretrain,
+                    0,
+                    code_lr_factor=bake.code_lr_factor,
+                    null_share=bake.null_share,
+                    imagined=bake.imagined,
+                ).step
+            )
         ),
         "bake": lambda: BakeTask(sequence, baked.train(), bake, teacher=teacher).step,
         "compensation": lambda: CompensateTask(sequence, student.train(), preset.compensate).step,
     }
-    return {name: _profile(task()) for name, task in tasks.items()}
+    return {name: _profile(task()) for name, task in tasks.items() if task}
 
 
 def _profile(step: Callable[[int], Any]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from avatar.models.networks.teacher import Teacher
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.presets import TRAINING_PRESETS, TrainingPreset
 
+_WORDS = {"mesh": "mesh", "gaussians": "Gaussians"}
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 
 
@@ -47,6 +48,9 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "compensation: iterations": f"{compensate.iterations:,}",
         "steps without rendering before: teacher, bake": _numbers(before, "iterations"),
         "poses in each of those steps": _numbers(before, "batch"),
+        "the bake compares with": "the teacher's pictures" if bake.images == "teacher" else "photographs",
+        "weights of `L_non`, `L_sem`": f"{bake.nonrigid:g}, {bake.semantic:g}",
+        "labels of `L_sem` are drawn of": ("-" if not bake.semantic else f"the student's {_WORDS[bake.semantic_map]}"),
         "imagined poses of the bake": f"{bake.imagined}" if bake.imagined else "none",
         "poses a step": ", ".join(str(stage.poses_per_step) for stage in stages),
         "cameras a pose": ", ".join(str(stage.views) for stage in stages),
@@ -55,6 +59,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
+        "blend shapes start from": "the surface" if compensate.init_from_track else "zero",
         "jaw drives the head": "yes" if preset.blend_shapes.jaw else "no",
     }
 

@@ -22,7 +22,23 @@ def test_the_papers_numbers():
     for stage in (paper.teacher, paper.bake, paper.compensate):
         weights = stage.weights
         assert (weights.dssim, weights.perceptual, weights.normal, weights.alpha) == (0.2, 0.01, 0.02, 0.0)
-    assert (paper.bake.nonrigid, paper.bake.semantic) == (0.1, 1.0)
+    assert (paper.bake.nonrigid, paper.bake.semantic, paper.bake.semantic_map) == (0.1, 1.0, "mesh")
+
+
+def test_the_small_recipe_is_the_papers():
+    """Sizes, rates and cameras a step are those of cpu; what is learned from what is published."""
+    small, paper, cpu = (training_preset(name) for name in ("paper-small", "paper", "cpu"))
+    assert small.teacher.track is None and small.teacher.pretrain is None and small.networks.teacher.zero_output
+    assert set(small.networks.teacher.network_configs()) == {"position", "colour", "other"}
+    assert small.networks.field == paper.networks.field and small.blend_shapes == paper.blend_shapes
+    shared = ("images", "pretrain", "imagined", "nonrigid", "semantic", "semantic_map", "null_share", "attributes")
+    for name in shared:
+        assert getattr(small.bake, name) == getattr(paper.bake, name), name
+    for name in ("poses_per_step", "views", "attributes", "null_share", "init_from_track"):
+        assert getattr(small.compensate, name) == getattr(paper.compensate, name), name
+    assert small.fit == cpu.fit and small.control_points == cpu.control_points
+    for stage in ("teacher", "bake", "compensate"):
+        assert getattr(small, stage).weights == getattr(cpu, stage).weights
 
 
 @pytest.mark.parametrize("name", TRAINING_PRESETS)

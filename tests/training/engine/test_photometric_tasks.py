@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.data.sequence import camera_centers_of
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.learned_gaussians import LEARNED
 from avatar.models.networks.blend_shapes import BlendShapeConfig
@@ -114,6 +115,25 @@ def test_the_bakes_semantic_term_is_zero_for_equal_geometry(frames):
     _, terms = task.loss(task.micro_batches(0)[0])
     assert terms["semantic"] < 1e-3  # targets are kept in half precision
     assert terms["nonrigid"] < 1e-5 and terms["l1"] < 2e-3
+
+
+def test_the_semantic_term_of_the_mesh_pulls_the_field_alone(frames):
+    """It grows with a mesh that stands elsewhere, and Gaussians cannot make up for the mesh."""
+    teacher = TeacherAvatar(TINY_TEACHER, frames.rig, varied(gaussians()))  # at zero residuals: skinning alone
+    values = []
+    for shift in (0.0, 0.05):
+        task = bake_of(frames, teacher, semantic_map="mesh", nonrigid=0.0)
+        with torch.no_grad():
+            for network in (task.student.field.body, task.student.field.cloth):
+                network.last.bias += shift
+        item = task.micro_batches(0)[0]
+        values.append(task.loss(item)[1]["semantic"])
+    assert values[1] > 1.2 * values[0]
+    views = task.views(item)
+    posed = task.student(frames.motion(item.frame), camera_centers_of(views))
+    sum(labels.square().sum() for labels in task._mesh_labels(posed, views)).backward()
+    touched = {name for name, value in task.student.named_parameters() if value.grad is not None and value.grad.any()}
+    assert "field.body.last.weight" in touched and not any(name.startswith("gaussians") for name in touched)
 
 
 STILL = {"null_share": 0.0, "pose_noise": 0.0}
