@@ -190,4 +190,4 @@ def test_refused_maps():
         teacher(positions, semantics, views[:1])
     with pytest.raises(InputError, match="preset"):
         network_preset("huge")
-    assert set(NETWORK_PRESETS) == {"paper", "gpu", "cpu", "demo"}
+    assert set(NETWORK_PRESETS) == {"paper", "gpu", "paper-small", "cpu", "demo"}
