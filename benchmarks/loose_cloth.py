@@ -54,12 +54,14 @@ class LooseCloth:
     """Trained run with garments in 83_cloth."""
     capture: Path
     """Folder of its capture, with true surfaces of held-out frames."""
+    params: Path | None = None
+    """Poses that drive the clothes, as a tracker gives them; by default those of the run."""
     name: str = ""
     """Of the stored file; by default that of the capture."""
 
     def run(self) -> None:
         """Print and store all rows."""
-        bench = _Bench(self.run_folder, self.capture)
+        bench = _Bench(self.run_folder, self.capture, self.params)
         figures: dict[str, Any] = {
             "protocol": bench.protocol,
             "frames": list(bench.truths),
@@ -80,10 +82,11 @@ class LooseCloth:
 
 
 class _Bench:
-    def __init__(self, run: Path, capture: Path) -> None:
-        scene = open_scene(run, TrainInputs(capture, None, None, (), 1.0, None))
+    def __init__(self, run: Path, capture: Path, params: Path | None) -> None:
+        scene = open_scene(run, TrainInputs(capture, params, None, (), 1.0, None))
         self.sequence = AvatarSequence(scene.capture, scene.template)
-        self.template, self.protocol = scene.template, scene.capture.protocol or "exact"
+        self.template = scene.template
+        self.protocol = scene.capture.protocol or ("as given" if params is None else f"poses of {params.name}")
         self.garments = load_garments(run / GARMENTS, scene.template)
         if not self.garments or scene.capture.fps is None:
             raise InputError("run", expected="loose parts in 83_cloth, frames a second", received="none")
