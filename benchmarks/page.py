@@ -272,9 +272,15 @@ PARTS = (
     Part(
         "loose_cloth_woman_casual",
         "Loose clothes in motion that training did not show, a synthetic woman",
-        "The long skirt of `woman_casual`, mm over the held-out frames that have a true surface (6 of 12); exact "
+        "The long skirt of `woman_casual`, mm over all 12 held-out frames; exact "
         "poses. Vertexwise: frame-0 correspondences. Rows differ by where the simulation starts. Milliseconds of CPU a "
         "step on a busy machine; the solver alone takes about 3 on a quiet one.",
+    ),
+    Part(
+        "loose_cloth_woman_casual_noisy",
+        "The same, driven by a tracker's noisy poses",
+        "Template and garment of the exact run, poses of the capture's tracked protocol, not refined: errors of the pose "
+        "move the whole body, skinning as much as the simulation.",
     ),
     Part(
         "loose_cloth_person",
