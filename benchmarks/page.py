@@ -279,7 +279,7 @@ PARTS = (
     Part(
         "loose_cloth_woman_casual_noisy",
         "The same, driven by a tracker's noisy poses",
-        "Template and garment of the exact run, poses of the capture's tracked protocol, not refined: errors of the pose "
+        "Template and garment of the exact run, poses of the capture's tracked protocol, not refined: their errors "
         "move the whole body, skinning as much as the simulation.",
     ),
     Part(
