@@ -29,8 +29,12 @@ class ControlCage(nn.Module):
 
     Args:
         rig: that of the template. count: K.
+
+    Attributes:
+        vertices: (K,) of the template, those that the control points are.
     """
 
+    vertices: Tensor
     off_clothes: Tensor
     from_body: Tensor
     edges: Tensor
@@ -42,6 +46,7 @@ class ControlCage(nn.Module):
         self.count = len(control.vertices)
         weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
         self.rows = SparseRows(neighbours, weights, self.count)
+        self.register_buffer("vertices", torch.tensor(control.vertices, device=rig.device))
         self.register_buffer("off_clothes", ~rig.cloth_mask[torch.as_tensor(control.vertices, device=rig.device)])
         self.register_buffer("from_body", torch.tensor(_from_body(rig.template, control.vertices), device=rig.device))
         # Two control points are neighbours if some vertex has them as its two nearest.

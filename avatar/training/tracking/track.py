@@ -18,12 +18,13 @@ from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.losses.reconstruction import ReconstructionWeights
-from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import Session
+from avatar.training.tracking.foresight import Foresight, simulate_controls
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
@@ -58,6 +59,8 @@ class TrackConfig:
         tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
             what lies on the body goes where the body goes. 0: no clothes do.
         extrapolation: share of the motion between the two frames before that a frame starts with.
+        simulate: let simulated clothes say where frames start, the more the better they foresaw the frames before; where
+            `reference` and the capture's frames a second are known, and clothes hang from the body.
         weights: of the losses.
         reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
             comes first.
@@ -71,6 +74,7 @@ class TrackConfig:
     body_motion_weight: float = 0.0
     tight_reach: float = 0.0
     extrapolation: float = 1.0
+    simulate: bool = True
     weights: ReconstructionWeights = field(
         default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
     )
@@ -129,6 +133,8 @@ class TrackTask(PhotometricTask):
             sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], context
         )
         self.avatar, self.track_config = avatar, config
+        self.foresight = _foresight(sequence, avatar.cage, config)
+        self._shapes: dict[int, Tensor] = {}
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
@@ -171,7 +177,7 @@ class TrackTask(PhotometricTask):
         posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         cage, controls = self.avatar.cage, self.avatar.controls
-        total = total + self.track_config.smoothness * cage.roughness(controls)
+        total = total + self.track_config.smoothness * cage.roughness(controls - self._shape(item.frame))
         if self.track_config.body_motion_weight and not cage.off_clothes.all():
             left = cage.motion_off_clothes(controls, reach=self.track_config.tight_reach)
             total = total + self.track_config.body_motion_weight * left
@@ -190,18 +196,22 @@ class TrackTask(PhotometricTask):
         return metrics
 
     def _start(self, place: int) -> Tensor:
-        """Displacements that a frame begins with: the nearest done frame's, carried on."""
-        frame, done = self.order[place], self.order[:place]
-        if not done:
+        """Displacements that a frame begins with."""
+        if place == 0:
             return torch.zeros_like(self.avatar.controls)
-        near = min(done, key=lambda other: abs(other - frame))
-        start = self.solved[self.row[near]]
-        behind = [other for other in done if (other - near) * (near - frame) > 0]
-        if behind:
-            far = min(behind, key=lambda other: abs(other - near))
-            carried = self.track_config.extrapolation * (frame - near) / (near - far)
-            start = start + carried * (start - self.solved[self.row[far]])
-        return start
+        return self.foresight.start(self.order[place], self._done(place))
+
+    def _shape(self, frame: int) -> Tensor:
+        """The shape that a frame's displacements are smooth about, kept while the frame is followed."""
+        if frame not in self._shapes:
+            place = self.order.index(frame)
+            nothing = torch.zeros_like(self.avatar.controls)
+            self._shapes = {frame: self.foresight.shape(frame, self._done(place)) if place else nothing}
+        return self._shapes[frame]
+
+    def _done(self, place: int) -> dict[int, Tensor]:
+        """Displacements of the frames before a place in the order."""
+        return {frame: self.solved[self.row[frame]] for frame in self.order[:place]}
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         """Return nothing: the control points are those of one frame."""
@@ -227,6 +237,17 @@ class TrackTask(PhotometricTask):
         if self.track_config.reference is not None:
             solved -= self.solved[self.row[self.track_config.reference]]
         return Track(self.row, solved, self.avatar.cage)
+
+
+def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> Foresight:
+    simulated, fps = None, sequence.capture.fps
+    if config.simulate and config.reference is not None and fps is not None:
+        poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
+        reference = poses[config.reference].without_shape()
+        simulated = simulate_controls(
+            sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices
+        )
+    return Foresight(config.extrapolation, simulated, config.reference)
 
 
 def follow_surface(

@@ -1,0 +1,187 @@
+"""What a frame begins with: the last frames' motion carried on, blended with that of simulated clothes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.data.cloth_motion import ClothMotions
+from smplxpp.cloth import Garment, cut_garment
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.params import BodyParams
+from smplxpp.template.template import Template
+
+FADING = 0.3
+"""Seconds in which what the simulation has wrong falls to 1/e: it swings as the cloth does, out of step."""
+JUDGED = 4
+"""Frames, the last ones, by which forecasts are judged."""
+DOUBT = 1e-3
+"""Metres that every forecast may be wrong by: two that are better are alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedControls:
+    """Simulated clothes of frames at the control points of a cage.
+
+    Attributes:
+        displacements: (K, 3) by frame, metres along the axes of the T-pose, 0 off simulated clothes.
+        share: in [0, 1]: how much of a control point's displacement the simulation can tell.
+        part: of each control point, a number from 0 to P - 1; 0: not simulated.
+        fps: frames a second of the frames' numbers.
+    """
+
+    displacements: Mapping[int, Float[Tensor, "K 3"]]
+    share: Float[Tensor, " K"]
+    part: Int[Tensor, " K"]
+    fps: float
+
+
+def simulate_controls(
+    template: Template, poses: Mapping[int, BodyParams], fps: float, *, reference: BodyParams, controls: Tensor
+) -> SimulatedControls | None:
+    """Simulate the clothes of a template through frames, in the default material.
+
+    Args:
+        poses: one frame each, by its number. fps: of the numbers.
+        reference: one frame, the pose in which the template is the surface.
+        controls: (K,) the template's vertices that the control points are.
+
+    Returns:
+        None where no part of the clothes hangs from the body.
+    """
+    frames = sorted(poses)
+    stride = int(np.gcd.reduce(np.diff(frames))) if len(frames) > 1 else 1
+    number = {frame: (frame - frames[0]) // stride for frame in frames}
+    # The stage that keeps garments says what is wrong with them; here they foresee, and photographs decide.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)
+        garments = _loose_parts(template, reference)
+        if not garments:
+            return None
+        by_number = {number[frame]: poses[frame] for frame in frames}
+        clothes = ClothMotions(template, garments, params=by_number.get, frames=list(by_number), fps=fps / stride)
+        clothes.simulate(list(by_number))
+    rows = controls.cpu().numpy()
+    displacements = {}
+    for frame in frames:
+        shape = clothes.shape(number[frame])
+        whole = np.zeros((template.vertex_count, 3), np.float32)
+        whole[shape.vertices] = shape.share[:, None] * shape.displacements
+        displacements[frame] = torch.tensor(whole[rows], device=controls.device)
+    share, part = np.zeros(template.vertex_count, np.float32), np.zeros(template.vertex_count, np.int64)
+    for k, garment in enumerate(garments):
+        share[garment.vertices], part[garment.vertices] = garment.share(), k + 1
+    tensors = (torch.tensor(values[rows], device=controls.device) for values in (share, part))
+    return SimulatedControls(displacements, *tensors, fps)
+
+
+def _loose_parts(template: Template, reference: BodyParams) -> list[Garment]:
+    """The clothes that can be cut for simulation."""
+    garments = []
+    for name in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
+        with suppress(InputError):
+            garments.append(cut_garment(template, name, reference))
+    return garments
+
+
+@dataclass(frozen=True, eq=False)
+class Foresight:
+    """Displacements that a frame begins with, from the frames that are done.
+
+    Attributes:
+        extrapolation: share of the motion between the two frames before that is carried on.
+        simulated: clothes; None: nothing is simulated.
+        reference: frame in which the template is the surface: what was found there is an error of the Gaussians.
+    """
+
+    extrapolation: float
+    simulated: SimulatedControls | None = None
+    reference: int | None = None
+
+    def start(self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]) -> Float[Tensor, "K 3"]:
+        """Return what a frame begins with.
+
+        Either forecast counts by the inverse square of how far it was from what was found in the last frames.
+
+        Args:
+            solved: displacements of the frames that are done, at least one, in the order in which they were found.
+        """
+        carried, foreseen = self._forecasts(frame, solved)
+        if self.simulated is None:
+            return carried
+        before = [(self._forecasts(one, dict(_until(one, solved))), solved[one]) for one in self._judged(frame, solved)]
+        trust = self.simulated.share * self._trust([(a - true, b - true) for (a, b), true in before])
+        return carried + trust[:, None] * (foreseen - carried)
+
+    def shape(self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]) -> Float[Tensor, "K 3"]:
+        """Return the shape about which displacements of a frame are smooth: between skinning's, 0, and the simulated one.
+
+        Either counts by the inverse square of how far it was from what was found in the last frames.
+        """
+        if self.simulated is None:
+            return torch.zeros_like(next(iter(solved.values())))
+        own = self.simulated.displacements
+        found = {one: solved[one] - self._error(solved) for one in self._judged(frame, solved)}
+        trust = self._trust([(true, own[one] - true) for one, true in found.items()])
+        return trust[:, None] * own[frame]
+
+    def _trust(self, wrong: Sequence[tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]]) -> Float[Tensor, " K"]:
+        """How much the simulation counts at each control point, part by part, in [0, 1].
+
+        Args:
+            wrong: in each judged frame, how far the other forecast and the simulated one were from what was found.
+        """
+        assert self.simulated is not None
+        share, part = self.simulated.share, self.simulated.part
+        parts = int(part.max()) + 1
+        weight = share.new_zeros(parts).index_add(0, part, share).clamp(min=1e-6)
+        good = []
+        for errors in ([pair[side] for pair in wrong] for side in (0, 1)):
+            square = sum((share * error.square().sum(-1) for error in errors), torch.zeros_like(share))
+            mean = share.new_zeros(parts).index_add(0, part, square) / weight / max(len(errors), 1)
+            good.append(1.0 / (mean + DOUBT**2))
+        return (good[1] / (good[0] + good[1]))[part]
+
+    def _judged(self, frame: int, solved: Mapping[int, Tensor]) -> list[int]:
+        """The nearest done frames on the same side of the first one, those that had frames before them."""
+        done = list(solved)
+        first = done[0]
+        side = [other for other in done[1:] if (other - first) * (frame - first) > 0]
+        return sorted(side, key=lambda other: abs(other - frame))[:JUDGED]
+
+    def _forecasts(
+        self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]
+    ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]:
+        """The motion before carried on, and the simulated one."""
+        near = min(solved, key=lambda other: abs(other - frame))
+        carried = solved[near]
+        behind = [other for other in solved if (other - near) * (near - frame) > 0]
+        if behind:
+            far = min(behind, key=lambda other: abs(other - near))
+            share = self.extrapolation * (frame - near) / (near - far)
+            carried = carried + share * (carried - solved[far])
+        if self.simulated is None:
+            return carried, carried
+        own = self.simulated.displacements
+        kept = exp(-abs(frame - near) / self.simulated.fps / FADING)
+        error = self._error(solved)
+        return carried, error + own[frame] + kept * (solved[near] - error - own[near])
+
+    def _error(self, solved: Mapping[int, Tensor]) -> Tensor:
+        """What was found where the template is the surface."""
+        return solved[self.reference] if self.reference in solved else torch.zeros_like(next(iter(solved.values())))
+
+
+def _until(frame: int, solved: Mapping[int, Tensor]) -> list[tuple[int, Tensor]]:
+    """What had been found before a frame was."""
+    items = list(solved.items())
+    return items[: list(solved).index(frame)]

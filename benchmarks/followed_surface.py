@@ -1,0 +1,198 @@
+"""How far the surface that training follows is from the truth, and whether that hangs on the frame rate.
+
+    python -m benchmarks.followed_surface --run RUN --capture DIR --every 1 2 3
+
+The tracking of a preset follows the loose part of a RUN's template through every n-th training frame of its capture,
+from the RUN's own Gaussians and poses. Measured are the part's points, each against where it truly is ("vertexwise"),
+its surface, and pictures of cameras that training did not see. The truth is for measuring alone.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import mean
+from typing import Annotated, Any
+
+import igl
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float, Int
+
+from avatar.data.sequence import AvatarSequence, camera_centers_of
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.bound_file import load_bound
+from avatar.metrics.surface_quality import mean_surface, surface_quality
+from avatar.metrics.view_quality import view_quality
+from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.render.avatar_view import render_view
+from avatar.training.engine.session import Session
+from avatar.training.presets import training_preset
+from avatar.training.tracking.track import TrackConfig, follow_surface
+from benchmarks.machine import store_results
+from benchmarks.repainted import RepaintedSequence
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import GAUSSIANS
+from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread_inside
+
+SAMPLES = 30_000
+SAME = 2e-3
+"""Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
+LOOKED_AT = 6
+"""Frames whose held-out views are rendered."""
+
+
+@dataclass(frozen=True)
+class FollowedSurface:
+    """Follow, measure, store."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Run with a template and a reference fit."""
+    capture: Path
+    """Folder of its capture, with true surfaces whose vertices are the same points in all frames."""
+    every: tuple[int, ...] = (1, 2, 3)
+    """One row each: every n-th training frame is followed."""
+    preset: str = "cpu"
+    part: str = "lower"
+    """That is measured."""
+    simulate: bool = True
+    """Let simulated clothes say where frames begin, as presets do."""
+    name: str = ""
+    """Of the stored file; by default that of the capture."""
+
+    def run(self) -> None:
+        """Print and store all rows."""
+        bench = Bench(self.run_folder, self.capture, self.part)
+        config = training_preset(self.preset).teacher.track
+        if config is None:
+            raise InputError("preset", expected="one that follows the surface", received=self.preset)
+        figures: dict[str, Any] = {"protocol": bench.protocol, "preset": self.preset, "part": self.part, "rows": {}}
+        for every in self.every:
+            row = bench.row(replace(config, simulate=self.simulate), every)
+            figures["rows"][f"every {every}"] = row
+            print(f"every {every}: {row}", flush=True)
+        command = "python -m benchmarks.followed_surface --run RUN --capture DIR"
+        path = store_results(f"followed_surface_{self.name or bench.capture.name}", command, figures)
+        print(f"stored {path.name}")
+
+
+class Bench:
+    """A run's scene, opened once.
+
+    Args:
+        run: with template and reference fit. folder: of the capture. part: that is measured.
+    """
+
+    def __init__(self, run: Path, folder: Path, part: str) -> None:
+        scene = open_scene(run, TrainInputs(folder))
+        self.scene, self.capture, self.part = scene, scene.capture, part
+        self.protocol = scene.capture.protocol or "exact"
+        self.gaussians = load_bound(run / GAUSSIANS, faces=scene.template.faces)
+        self.reference = load_params_of_run(run).frame(0)
+        self.same = _SamePoints.found(scene, self.reference, part)
+
+    def row(
+        self, config: TrackConfig, every: int, *, count: int | None = None, pattern: str | None = None
+    ) -> dict[str, Any]:
+        """Follow every n-th training frame, of these the first `count`, and measure.
+
+        Args:
+            pattern: among those of `benchmarks.repainted`, painted on the part; None: the photographs as they are.
+        """
+        frames = self.capture.splits.train_frames[::every][:count]
+        capture = replace(self.capture, splits=replace(self.capture.splits, train_frames=frames))
+        sequence, gaussians = AvatarSequence(capture, self.scene.template), self.gaussians
+        if pattern is not None:
+            posed = self.scene.template.pose(self.reference)[0]
+            frame = self.scene.built_frame or 0
+            sequence = RepaintedSequence(
+                capture, self.scene.template, posed=posed, frame=frame, part=self.part, pattern=pattern
+            )
+            gaussians = sequence.gaussians(self.gaussians)
+        config = replace(config, reference=self.scene.built_frame)
+        begin = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            track, _ = follow_surface(sequence, gaussians, config, Session(Path(folder)))
+        seconds = (time.perf_counter() - begin) / len(frames)
+        return {**self.measured(sequence, track, gaussians), "frames": len(frames), "seconds_a_frame": round(seconds, 2)}
+
+    def measured(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> dict[str, Any]:
+        """Distances of the part to the truth, mm, over the frames; dB of held-out cameras."""
+        rig, apart, worst, found = sequence.rig, {}, {}, []
+        for frame in sequence.train_frames[1:]:
+            truth = self.capture.truth_mesh(frame)
+            if truth is None:
+                continue
+            vertices = rig.places(sequence.motion(frame), track.displacements(frame))
+            wrong = 1e3 * np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1)
+            apart[frame], worst[frame] = float(wrong.mean()), float(np.percentile(wrong, 95))
+            mesh = TriangleMesh(vertices, rig.template.faces)
+            found.append(surface_quality(mesh, rig.template.vertex_labels, truth, samples=SAMPLES).labels[self.part])
+        surface = mean_surface(found)
+        latest = max(apart, key=lambda frame: apart[frame])
+        return {
+            "vertexwise": round(mean(apart.values()), 2),
+            "vertexwise_p95": round(mean(worst.values()), 1),
+            "worst_frame": {"frame": latest, "vertexwise": round(apart[latest], 1)},
+            "p2s": _rounded(surface.p2s),
+            "truth_to_mesh": _rounded(surface.truth_to_mesh),
+            "psnr": round(self._psnr(sequence, track, gaussians), 2),
+        }
+
+    @torch.no_grad()
+    def _psnr(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> float:
+        """Mean dB over held-out views of some training frames, of the reference fit's Gaussians on the surface."""
+        avatar = TrackedAvatar(sequence.rig, gaussians, track.cage.count)
+        found = []
+        for frame in spread_inside(sequence.train_frames, LOOKED_AT):
+            avatar.controls.copy_(track.controls[track.row[frame]])
+            for camera in self.capture.splits.novel_view_cameras:
+                view = sequence.whole_view(camera, frame)
+                posed = avatar(sequence.motion(frame), camera_centers_of([view]))
+                seen = render_view(posed, 0, view, sequence.background)
+                quality = view_quality(view, seen.image, seen.alpha, sequence.background, head=None)
+                found.append(quality.psnr)
+        return mean(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _SamePoints:
+    """Vertices of the template and the points of true surfaces that they are."""
+
+    own: Int[np.ndarray, " K"]
+    corners: Int[np.ndarray, "K 3"]
+    weights: Float[np.ndarray, "K 3"]
+
+    @staticmethod
+    def found(scene: TrainScene, reference: BodyParams, part: str) -> _SamePoints:
+        """Find the points of the truth that a part's vertices are, in the frame that the template was built from."""
+        template = scene.template
+        truth = None if scene.built_frame is None else scene.capture.truth_mesh(scene.built_frame)
+        own = np.unique(template.faces[template.part_faces(part)])
+        points = np.ascontiguousarray(template.pose(reference)[0][own])
+        if truth is None:
+            raise InputError("capture", expected="true surfaces of training frames", received="none")
+        squared, face, near = igl.point_mesh_squared_distance(points, truth.vertices, truth.faces)[:3]
+        close = squared < SAME**2
+        corners = truth.faces[face[close]]
+        a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
+        return _SamePoints(own[close], corners, igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c))
+
+    def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
+        """Return where they are in another frame."""
+        return np.einsum("kc,kcd->kd", self.weights, truth.vertices[self.corners])
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
+
+
+if __name__ == "__main__":
+    tyro.cli(FollowedSurface, prog="python -m benchmarks.followed_surface").run()

@@ -1,0 +1,109 @@
+"""Where frames begin: clothes that were simulated well are believed, others are not, and nothing else changes."""
+
+from __future__ import annotations
+
+from math import cos
+
+import pytest
+import torch
+
+from avatar.training.tracking.foresight import Foresight, SimulatedControls, simulate_controls
+from smplxpp.core.labels import LOWER
+from tests.cloth.persons import person, standing
+
+FPS = 10.0
+POINTS = 6
+
+
+def swung(frame: int, late: float = 0.0) -> torch.Tensor:
+    """Cloth that swings to a side, 3 cm and back in 0.6 s."""
+    way = 0.03 * (1.0 - cos(10.5 * (frame - late) / FPS))
+    return torch.tensor([way, 0.0, 0.0]).expand(POINTS, 3)
+
+
+def simulated(late: float = 0.0, *, scale: float = 1.0) -> SimulatedControls:
+    """Three points of a part that can be simulated wholly, one that hangs where it begins, two of the body."""
+    share = torch.tensor([1.0, 1.0, 1.0, 0.2, 0.0, 0.0])
+    part = torch.tensor([1, 1, 1, 1, 0, 0])
+    return SimulatedControls({f: scale * share[:, None] * swung(f, late) for f in range(12)}, share, part, FPS)
+
+
+def solved(count: int) -> dict[int, torch.Tensor]:
+    return {frame: swung(frame) for frame in range(count)}
+
+
+def wrong(foresight: Foresight, frame: int = 8) -> float:
+    return float((foresight.start(frame, solved(frame)) - swung(frame))[:3].norm(dim=-1).mean())
+
+
+def test_a_swing_that_motion_carried_on_misses_is_foreseen():
+    carried, foreseen = wrong(Foresight(1.0)), wrong(Foresight(1.0, simulated(), 0))
+    assert foreseen < 0.1 * carried
+    late = wrong(Foresight(1.0, simulated(0.2), 0))
+    assert foreseen < late < 0.6 * carried
+
+
+def test_simulations_that_were_wrong_are_not_believed():
+    nonsense = simulated(3.0, scale=6.0)
+    shape, right = (Foresight(1.0, one, 0).shape(8, solved(8)) for one in (nonsense, simulated()))
+    assert shape[:3].norm(dim=-1).max() < 0.1 * nonsense.displacements[8][0].norm()
+    torch.testing.assert_close(right[:3], swung(8)[:3], rtol=0.05, atol=0.0)
+    assert wrong(Foresight(1.0, nonsense, 0)) < 1.3 * wrong(Foresight(1.0))
+
+
+def test_what_is_not_simulated_is_carried_on():
+    start = Foresight(1.0, simulated(), 0).start(8, solved(8))
+    carried = Foresight(1.0).start(8, solved(8))
+    assert torch.equal(start[4:], carried[4:])
+    assert not torch.equal(start[:3], carried[:3])
+
+
+def test_the_error_of_the_reference_stays_in_all_frames():
+    error = torch.tensor([0.0, 0.01, 0.0])
+    found = {frame: one + error for frame, one in solved(8).items()}
+    moved = Foresight(1.0, simulated(), 0).start(8, found)
+    torch.testing.assert_close(moved, Foresight(1.0, simulated(), 0).start(8, solved(8)) + error)
+
+
+def test_both_directions_from_the_reference_are_judged_apart():
+    foresight = Foresight(1.0, simulated(), 5)
+    found = {frame: swung(frame) for frame in (5, 4, 6, 3, 7)}
+    assert foresight._judged(8, found) == [7, 6] and foresight._judged(2, found) == [3, 4]
+    forth = foresight.start(8, found)
+    assert float((forth - swung(8))[:3].norm(dim=-1).mean()) < 0.01
+
+
+@pytest.fixture(scope="module")
+def skirt() -> SimulatedControls:
+    poses = {k: standing(lifted=0.05 * k) for k in range(0, 12, 2)}
+    controls = torch.arange(0, person().vertex_count, 7)
+    made = simulate_controls(person(), poses, 20.0, reference=standing(), controls=controls)
+    assert made is not None
+    return made
+
+
+def test_a_skirt_is_simulated_through_every_second_frame(skirt):
+    assert sorted(skirt.displacements) == list(range(0, 12, 2)) and skirt.fps == 20.0
+    controls = torch.arange(0, person().vertex_count, 7)
+    of_skirt = torch.tensor(person().vertex_part)[controls] == person().part_names.index(LOWER.name)
+    assert torch.equal(skirt.part > 0, of_skirt) and not skirt.share[~of_skirt].any() and skirt.share.max() == 1.0
+    last = skirt.displacements[10]
+    assert not last[~of_skirt].any() and last.abs().max() > 5e-3
+
+
+def test_frames_numbers_are_names():
+    poses = {k: standing(lifted=0.1 * k) for k in range(3)}
+    apart = {10 + 3 * k: pose for k, pose in poses.items()}
+    controls = torch.arange(0, person().vertex_count, 7)
+    one = simulate_controls(person(), poses, 10.0, reference=standing(), controls=controls)
+    other = simulate_controls(person(), apart, 30.0, reference=standing(), controls=controls)
+    assert one is not None and other is not None
+    for k in poses:
+        assert torch.equal(one.displacements[k], other.displacements[10 + 3 * k])
+
+
+def test_clothes_that_hang_from_nothing_are_left_out():
+    controls = torch.arange(0, 20)
+    poses = {0: standing()}
+    loose = person(tight=False)
+    assert simulate_controls(loose, poses, 10.0, reference=standing(), controls=controls) is None
