@@ -1,10 +1,11 @@
 """How far the surface that training follows is from the truth, and whether that hangs on the frame rate.
 
-    python -m benchmarks.followed_surface --run RUN --capture DIR --every 1 2 3
+    python -m benchmarks.followed_surface --run RUN --capture DIR --every 1 2 3 --patterns photographs dots
 
 The tracking of a preset follows the loose part of a RUN's template through every n-th training frame of its capture,
 from the RUN's own Gaussians and poses. Measured are the part's points, each against where it truly is ("vertexwise"),
-its surface, and pictures of cameras that training did not see. The truth is for measuring alone.
+its surface, and pictures of cameras that training did not see. Patterns other than the photographs' own are painted
+over them (`benchmarks.repainted`). The truth is for painting and measuring alone.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import tempfile
 import time
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import mean
 from typing import Annotated, Any
@@ -42,6 +44,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread_inside
 
+PHOTOGRAPHS = "photographs"
 SAMPLES = 30_000
 SAME = 2e-3
 """Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
@@ -62,8 +65,12 @@ class FollowedSurface:
     preset: str = "cpu"
     part: str = "lower"
     """That is measured."""
-    simulate: bool = True
-    """Let simulated clothes say where frames begin, as presets do."""
+    patterns: tuple[str, ...] = (PHOTOGRAPHS,)
+    """On the part: "photographs", as it is, or among those of `benchmarks.repainted`."""
+    count: int | None = None
+    """Of the frames that are followed, the first ones; None: all."""
+    simulate: tuple[bool, ...] = (True, False)
+    """With simulated clothes that foresee where frames begin, and without."""
     name: str = ""
     """Of the stored file; by default that of the capture."""
 
@@ -74,10 +81,12 @@ class FollowedSurface:
         if config is None:
             raise InputError("preset", expected="one that follows the surface", received=self.preset)
         figures: dict[str, Any] = {"protocol": bench.protocol, "preset": self.preset, "part": self.part, "rows": {}}
-        for every in self.every:
-            row = bench.row(replace(config, simulate=self.simulate), every)
-            figures["rows"][f"every {every}"] = row
-            print(f"every {every}: {row}", flush=True)
+        for pattern, every, simulate in product(self.patterns, self.every, self.simulate):
+            own = replace(config, simulate=simulate)
+            row = bench.row(own, every, count=self.count, pattern=None if pattern == PHOTOGRAPHS else pattern)
+            name = f"{pattern}, every {every}, {'foreseen' if simulate else 'carried on'}"
+            figures["rows"][name] = row
+            print(f"{name:44s} {row}", flush=True)
         command = "python -m benchmarks.followed_surface --run RUN --capture DIR"
         path = store_results(f"followed_surface_{self.name or bench.capture.name}", command, figures)
         print(f"stored {path.name}")
@@ -121,7 +130,11 @@ class Bench:
         with tempfile.TemporaryDirectory() as folder:
             track, _ = follow_surface(sequence, gaussians, config, Session(Path(folder)))
         seconds = (time.perf_counter() - begin) / len(frames)
-        return {**self.measured(sequence, track, gaussians), "frames": len(frames), "seconds_a_frame": round(seconds, 2)}
+        return {
+            **self.measured(sequence, track, gaussians),
+            "frames": len(frames),
+            "seconds_a_frame": round(seconds, 2),
+        }
 
     def measured(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> dict[str, Any]:
         """Distances of the part to the truth, mm, over the frames; dB of held-out cameras."""

@@ -80,8 +80,12 @@ def simulate_controls(
     share, part = np.zeros(template.vertex_count, np.float32), np.zeros(template.vertex_count, np.int64)
     for k, garment in enumerate(garments):
         share[garment.vertices], part[garment.vertices] = garment.share(), k + 1
-    tensors = (torch.tensor(values[rows], device=controls.device) for values in (share, part))
-    return SimulatedControls(displacements, *tensors, fps)
+    return SimulatedControls(
+        displacements,
+        torch.tensor(share[rows], device=controls.device),
+        torch.tensor(part[rows], device=controls.device),
+        fps,
+    )
 
 
 def _loose_parts(template: Template, reference: BodyParams) -> list[Garment]:
@@ -123,7 +127,7 @@ class Foresight:
         return carried + trust[:, None] * (foreseen - carried)
 
     def shape(self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]) -> Float[Tensor, "K 3"]:
-        """Return the shape about which displacements of a frame are smooth: between skinning's, 0, and the simulated one.
+        """Return the shape about which a frame's displacements are smooth: between skinning's, 0, and the simulated.
 
         Either counts by the inverse square of how far it was from what was found in the last frames.
         """
@@ -178,7 +182,9 @@ class Foresight:
 
     def _error(self, solved: Mapping[int, Tensor]) -> Tensor:
         """What was found where the template is the surface."""
-        return solved[self.reference] if self.reference in solved else torch.zeros_like(next(iter(solved.values())))
+        if self.reference is None or self.reference not in solved:
+            return torch.zeros_like(next(iter(solved.values())))
+        return solved[self.reference]
 
 
 def _until(frame: int, solved: Mapping[int, Tensor]) -> list[tuple[int, Tensor]]:

@@ -52,15 +52,16 @@ class TrackConfig:
     Attributes:
         levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
         control_points: on the template. views: cameras a step.
-        smoothness: weight of the mean squared difference of neighbouring control points, a square metre.
+        smoothness: weight of the mean squared difference of neighbouring control points' displacements from the shape
+            that is foreseen, a square metre.
         body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
             parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
             clothes.
         tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
             what lies on the body goes where the body goes. 0: no clothes do.
         extrapolation: share of the motion between the two frames before that a frame starts with.
-        simulate: let simulated clothes say where frames start, the more the better they foresaw the frames before; where
-            `reference` and the capture's frames a second are known, and clothes hang from the body.
+        simulate: let simulated clothes say where frames start and what shape they are smooth about, the more the better
+            they told the frames before; where `reference` and the capture's frames a second are known.
         weights: of the losses.
         reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
             comes first.
@@ -172,7 +173,7 @@ class TrackTask(PhotometricTask):
         return views
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Return `L_rec` with the roughness of the displacements and how far the body moves, and its terms."""
+        """Return `L_rec` with the roughness of what is not foreseen and how far the body moves, and its terms."""
         views = self.views(item)
         posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
@@ -196,7 +197,7 @@ class TrackTask(PhotometricTask):
         return metrics
 
     def _start(self, place: int) -> Tensor:
-        """Displacements that a frame begins with."""
+        """Displacements that a frame begins with: 0 in the first, what is foreseen in the others."""
         if place == 0:
             return torch.zeros_like(self.avatar.controls)
         return self.foresight.start(self.order[place], self._done(place))
@@ -244,9 +245,7 @@ def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig)
     if config.simulate and config.reference is not None and fps is not None:
         poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
         reference = poses[config.reference].without_shape()
-        simulated = simulate_controls(
-            sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices
-        )
+        simulated = simulate_controls(sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices)
     return Foresight(config.extrapolation, simulated, config.reference)
 
 
