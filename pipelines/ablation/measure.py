@@ -20,6 +20,7 @@ from pipelines.runs.digests import TRAINING
 from pipelines.runs.layout import ABLATION
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
+from pipelines.stages.cloth import ClothStage, clothed_sequence
 from pipelines.stages.evaluate import surface_digest
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -108,6 +109,7 @@ def measure_row(
         known: what is known of the inputs, for the report. in_time: whether there is time left.
     """
     stage = row_stage(trainer, name, row, model, config)
+    simulated = next((one for one in closure(model) if isinstance(one, ClothStage)), None)
     if decide(trainer.run, stage, force=force) != "skip" and not in_time:
         return None
 
@@ -118,7 +120,7 @@ def measure_row(
         shown: AvatarModel = WithoutCode(loaded) if row.null_code else loaded
         evaluation = evaluate_models(
             {row.title: shown},
-            trainer.sequence(CLOTHED),
+            clothed_sequence(trainer, CLOTHED, simulated),
             config,
             files={row.title: player},
             progress=progress,

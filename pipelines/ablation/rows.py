@@ -16,9 +16,10 @@ from avatar.models.student import StudentConfig
 from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shapes
 from avatar.training.student.bake import BakeConfig
 from pipelines.ablation.stages import BaselineStage, PruneConfig, PrunedStage
-from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
+from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, CLOTH_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
+from pipelines.stages.cloth import ClothConfig, ClothStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage
 from pipelines.stages.teacher import TeacherStage
@@ -64,7 +65,8 @@ OPTION_ROWS: Mapping[str, Row] = {
         f"Full; {PRUNED_SHARE:.0%} of the Gaussians keep blend shapes, in {PRUNED_MEGABYTES:g} MB",
     ),
     "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
-    "gated": Row("gated", "gated", "head shapes act on the head alone, body shapes on the rest"),
+    "ungated": Row("ungated", "ungated", "all blend shapes act on all Gaussians, as published"),
+    "no-cloth": Row("w/o simulation", "no_cloth", "the field moves loose clothes in new poses too"),
     "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),
 }
 BASELINE_ROWS: Mapping[str, Row] = {
@@ -154,6 +156,11 @@ class _Plan:
                     elsewhere=own.get("teacher", ()),
                 )
             )
+            if ground == CLOTHED:
+                teacher = self.teacher
+                self._add(
+                    ClothStage(name=_folder("cloth"), teacher=teacher, config=ClothConfig(), elsewhere=(CLOTH_STAGE,))
+                )
             self._bake(f"{prefix}bake", f"{prefix}teacher", ground=ground, elsewhere=own.get("bake", ()))
         self._compensate("full", "bake", elsewhere=(COMPENSATE_STAGE,))
         self._compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
@@ -174,7 +181,9 @@ class _Plan:
             self._bake("untracked_bake", "untracked_teacher")
             self._compensate("untracked", "untracked_bake", teacher=None)
         self._compensate("local", "bake", shapes=with_local_shapes(preset.blend_shapes))
-        self._compensate("gated", "bake", shapes=replace(preset.blend_shapes, gated=True))
+        self._compensate("ungated", "bake", shapes=replace(preset.blend_shapes, gated=False))
+        self._bake("no_cloth_bake", cloth=None)
+        self._compensate("no_cloth", "no_cloth_bake")
         self._add(
             PrunedStage(
                 name=_folder("pruned"),
@@ -230,14 +239,19 @@ class _Plan:
         ground: str = CLOTHED,
         student: StudentConfig | None = None,
         config: BakeConfig | None = None,
+        cloth: str | None = "cloth",
         elsewhere: tuple[str, ...] = (),
     ) -> None:
+        student = student or self.student
+        # Loose clothes are simulated in the field's place, and found on a surface that a teacher followed.
+        simulates = ground == CLOTHED and source == "teacher" and student.field is not None
         self._add(
             BakeStage(
                 name=_folder(name),
                 ground=ground,
                 source=self.stages[source],
-                student=student or self.student,
+                cloth=self.stages[cloth] if cloth is not None and simulates else None,
+                student=student,
                 config=config or self.preset.bake,
                 elsewhere=elsewhere,
             )
@@ -254,12 +268,14 @@ class _Plan:
         null_share: float = 0.0,
         elsewhere: tuple[str, ...] = (),
     ) -> None:
-        own = self.preset.compensate
+        own, student = self.preset.compensate, self.stages[baked]
+        assert isinstance(student, BakeStage)
         self._add(
             CompensateStage(
                 name=_folder(name),
                 ground=ground,
-                student=self.stages[baked],
+                student=student,
+                cloth=student.cloth,
                 teacher=self.stages[teacher] if teacher is not None and own.init_from_track else None,
                 shapes=shapes or self.preset.blend_shapes,
                 config=replace(own, null_share=max(own.null_share, null_share)),

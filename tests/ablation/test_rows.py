@@ -43,16 +43,16 @@ def test_every_row_has_a_stage_and_every_stage_what_it_needs():
 def test_what_the_papers_rows_leave_out():
     stages = stages_of()
     names = {row: [stage.name.split("/")[1] for stage in closure(stages[PAPER_ROWS[row].model])] for row in PAPER_ROWS}
-    assert names["full"] == ["gaussians", "teacher", "bake", "full"]
+    assert names["full"] == ["gaussians", "teacher", "cloth", "bake", "full"]
     assert names["no-gaussians"] == names["full"][:-1]
     assert names["no-mesh"][:2] == names["full"][:2] and stages["no_field_bake"].student.field is None
     assert not any(isinstance(stages[name], TeacherStage) for name in names["no-teacher"])
     assert all(stages[name].ground == "naked" for name in names["naked"])
     # Nothing else differs.
-    own = {"name": "ablation/no_field", "elsewhere": ()}
+    own = {"name": "ablation/no_field", "elsewhere": (), "cloth": None}  # what is simulated takes the field's place
     assert stages["no_field"] == replace(stages["full"], student=stages["no_field_bake"], **own)
     alone = stages["no_teacher_bake"]
-    fields = {"name": alone.name, "elsewhere": (), "config": alone.config}
+    fields = {"name": alone.name, "elsewhere": (), "config": alone.config, "cloth": None}
     assert alone == replace(stages["bake"], source=stages["gaussians"], **fields)
     assert alone.config == replace(stages["bake"].config, iterations=alone.config.iterations)
 

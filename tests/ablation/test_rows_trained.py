@@ -35,7 +35,7 @@ MEASURED = EvaluationConfig(
 )
 SURFACE = replace(MEASURED, protocol=ProtocolConfig(every=9, sets=("novel_view",)), samples=500)
 """One frame: what can be seen of a mesh is found in many renderings."""
-SHARED = {"gaussians", "teacher", "bake", "full"}
+SHARED = {"gaussians", "teacher", "cloth", "bake", "full"}
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_force_trains_anew(own, capture):
     before = made(own)
     ablated(own, capture, ("no-gaussians",), force=True)
     anew = {name for name, when in made(own).items() if before[name] != when}
-    assert anew == {"gaussians", "teacher", "bake", "rows/no-gaussians"}
+    assert anew == {"gaussians", "teacher", "cloth", "bake", "rows/no-gaussians"}
 
 
 def test_what_a_training_made_is_taken_as_it_stands(capture, tmp_path, monkeypatch):
