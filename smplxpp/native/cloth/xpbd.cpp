@@ -8,11 +8,15 @@
 #include <cstdint>
 #include <vector>
 
+#include "cloth/surface.hpp"
 #include "cloth/vec3.hpp"
 #include "common/status.hpp"
 
 namespace {
 
+using smplxpp::Contact;
+using smplxpp::Grid;
+using smplxpp::Surface;
 using smplxpp::Vec3;
 
 // What a garment is, over n particles, m faces, e edges, b hinges and a collider of c vertices and d faces.
@@ -55,135 +59,6 @@ void at_time(const float* const* moments, int64_t count, float t, Vec3* out) {
         (&out->x)[i] = a * moments[0][i] + b * moments[1][i] + c * moments[2][i] + d * moments[3][i];
 }
 
-// Points by the cell of a grid that they lie in.
-class Grid {
-public:
-    void fill(const Vec3* points, int64_t count, float cell) {
-        over_ = 1.0f / cell;
-        head_.assign(kCells, -1);
-        next_.resize(size_t(count));
-        for (int32_t i = 0; i < count; ++i) {
-            const uint32_t at = key(of(points[i].x), of(points[i].y), of(points[i].z));
-            next_[size_t(i)] = head_[at];
-            head_[at] = i;
-        }
-    }
-    // Calls visit with the points of the 27 cells about one.
-    template <class Visit>
-    void around(Vec3 p, Visit&& visit) const {
-        const int32_t x = of(p.x), y = of(p.y), z = of(p.z);
-        for (int32_t i = x - 1; i <= x + 1; ++i)
-            for (int32_t j = y - 1; j <= y + 1; ++j)
-                for (int32_t k = z - 1; k <= z + 1; ++k)
-                    for (int32_t q = head_[key(i, j, k)]; q >= 0; q = next_[size_t(q)]) visit(q);
-    }
-
-private:
-    static constexpr uint32_t kCells = 1u << 14;
-    static uint32_t key(int32_t i, int32_t j, int32_t k) {
-        return (uint32_t(i) * 73856093u ^ uint32_t(j) * 19349663u ^ uint32_t(k) * 83492791u) & (kCells - 1);
-    }
-    int32_t of(float x) const {  // far and broken points share a cell: a cast of them has no value
-        const float cell = std::floor(x * over_);
-        return cell > -1e9f && cell < 1e9f ? int32_t(cell) : 0;
-    }
-    float over_ = 1.0f;
-    std::vector<int32_t> head_, next_;
-};
-
-struct Contact {
-    int32_t face;  // of the collider, -1: none
-    float weight[3];
-};
-
-void add_normals(const Vec3* x, const int32_t* face, int64_t count, Vec3* out) {
-    for (int64_t k = 0; k < count; ++k) {
-        const int32_t* q = face + 3 * k;
-        const Vec3 n = cross(x[q[1]] - x[q[0]], x[q[2]] - x[q[0]]);
-        for (int j = 0; j < 3; ++j) out[q[j]] = out[q[j]] + n;
-    }
-}
-
-void normals(const Vec3* x, const int32_t* face, int64_t faces, std::vector<Vec3>& out) {
-    std::fill(out.begin(), out.end(), Vec3{0, 0, 0});
-    add_normals(x, face, faces, out.data());
-    for (Vec3& n : out) n = n * (1.0f / std::max(length(n), 1e-12f));
-}
-
-// A moving surface that cloth may touch: where a point's nearest vertex is, and the nearest place on its faces
-// and on those about.
-class Surface {
-public:
-    Surface(int64_t vertices, const int32_t* face, int64_t faces)
-        : face_(face), faces_(faces), normal_(size_t(vertices)), first_(size_t(vertices) + 1, 0), at_(3 * size_t(faces)) {
-        for (size_t i = 0; i < at_.size(); ++i) ++first_[size_t(face[i]) + 1];
-        for (size_t i = 0; i + 1 < first_.size(); ++i) first_[i + 1] += first_[i];
-        std::vector<int32_t> next(first_.begin(), first_.end() - 1);
-        for (size_t i = 0; i < at_.size(); ++i) at_[size_t(next[size_t(face[i])]++)] = int32_t(i / 3);
-    }
-    // Take the vertices as they are now; find() looks among these.
-    void look(const Vec3* vertex) {
-        vertex_ = vertex;
-        normals(vertex, face_, faces_, normal_);
-        grid_.fill(vertex, int64_t(normal_.size()), kReach);
-    }
-    Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
-
-    Contact find(Vec3 p, Vec3 cloth_normal) const {
-        Contact found = {-1, {0, 0, 0}};
-        int32_t near = -1;
-        float best = kReach * kReach;
-        grid_.around(p, [&](int32_t j) {
-            const Vec3 d = p - vertex_[j];
-            const float squared = dot(d, d);
-            // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
-            if (squared < best && dot(normal_[size_t(j)], cloth_normal) > kCovers) best = squared, near = j;
-        });
-        if (near < 0) return found;
-        best = 1e9f;
-        // Among large and small triangles the nearest face need not be one of the nearest vertex: where the place lies on
-        // the far side of the vertex's faces, look on from there.
-        for (int step = 0; step < kSteps && scan(p, near, best, found); ++step) {
-            const int32_t* q = face_ + 3 * int64_t(found.face);
-            int32_t next = near;
-            float most = 0;
-            for (int j = 0; j < 3; ++j) {
-                if (q[j] == near && found.weight[j] > 0) return found;
-                if (found.weight[j] > most) most = found.weight[j], next = q[j];
-            }
-            if (!(dot(normal_[size_t(next)], cloth_normal) > kCovers)) break;
-            near = next;
-        }
-        return found;
-    }
-
-private:
-    // Looks for a place nearer than the best on the faces of a vertex; says whether there is one.
-    bool scan(Vec3 p, int32_t vertex, float& best, Contact& found) const {
-        bool nearer = false;
-        for (int32_t k = first_[size_t(vertex)]; k < first_[size_t(vertex) + 1]; ++k) {
-            const int32_t* q = face_ + 3 * int64_t(at_[size_t(k)]);
-            float weight[3];
-            const Vec3 d = p - smplxpp::closest_on_triangle(p, vertex_[q[0]], vertex_[q[1]], vertex_[q[2]], weight);
-            if (!(dot(d, d) < best)) continue;  // nor a triangle without area
-            best = dot(d, d), nearer = true;
-            found.face = at_[size_t(k)];
-            std::copy(weight, weight + 3, found.weight);
-        }
-        return nearer;
-    }
-
-    static constexpr int kSteps = 8;          // from one vertex's faces to the next one's
-    static constexpr float kReach = 0.035f;   // metres within which a vertex is found
-    static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
-    const int32_t* face_;
-    int64_t faces_;
-    const Vec3* vertex_ = nullptr;
-    std::vector<Vec3> normal_;
-    std::vector<int32_t> first_, at_;
-    Grid grid_;
-};
-
 class Solver {
 public:
     Solver(const Model& m, const Forces& f, Vec3* position, Vec3* velocity)
@@ -200,7 +75,7 @@ public:
             at_time(moments.place, m_.particles, t, place_.data());
             at_time(moments.collider, m_.collider_vertices, t, skin_.data());
             const bool looks = s % contacts_every == 0;
-            if (looks || f_.normal_drag > 0) normals(x_, m_.face, m_.faces, normal_);
+            if (looks || f_.normal_drag > 0) smplxpp::normals(x_, m_.face, m_.faces, normal_);
             move(h);
             if (looks) find_contacts();
             if (looks && f_.own_margin > 0) find_pairs();
