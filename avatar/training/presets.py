@@ -101,7 +101,10 @@ class _Steps:
 
 @dataclass(frozen=True)
 class _Size:
-    """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations."""
+    """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations, rates.
+
+    `late` is the share of the compensation's usual rates.
+    """
 
     gaussians: int
     head_share: float
@@ -116,6 +119,7 @@ class _Size:
     teacher: _Steps
     bake: _Steps
     compensate: int
+    late: float = 1.0
 
 
 def _lean(name: str, size: _Size) -> TrainingPreset:
@@ -166,9 +170,11 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             iterations=size.compensate,
             poses_per_step=1,
             views=3,
-            lr=1e-3,
+            lr=1e-3 * size.late,
+            position_lr=0.02 * size.late,
+            color_lr=1e-3 * size.late,
             null_share=0.2,
-            attributes=1.0,
+            attributes=size.late,
             init_from_track=True,
             weights=_LEAN_WEIGHTS,
         ),
@@ -256,6 +262,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             teacher=_Steps(250, 3e-4, 3.5),
             bake=_Steps(250, 3e-4, 2.0),
             compensate=500,
+            # Faster, what few frames teach the blend shapes of their poses costs new ones.
+            late=0.5,
         ),
     ),
 }
