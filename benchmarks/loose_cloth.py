@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any
@@ -219,8 +219,6 @@ def _same_points(
 
 
 def _moved(motion: Motion, displacements: torch.Tensor | None) -> Motion:
-    from dataclasses import replace
-
     return motion if displacements is None else replace(motion, rest=motion.rest + displacements)
 
 

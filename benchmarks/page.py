@@ -274,7 +274,7 @@ PARTS = (
         "Loose clothes in motion that training did not show, a synthetic woman",
         "The long skirt of `woman_casual`, mm over all 12 held-out frames; exact "
         "poses. Vertexwise: frame-0 correspondences. Rows differ by where the simulation starts. Milliseconds of CPU a "
-        "step on a busy machine; the solver alone takes about 3 on a quiet one.",
+        "step on a busy machine; the solver alone takes about 3 (least of 15).",
     ),
     Part(
         "loose_cloth_woman_casual_noisy",

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
+from scipy.sparse.csgraph import dijkstra
 
 from smplxpp.cloth.cloth_mesh import edge_graph
 from smplxpp.cloth.fabric import Fabric
@@ -173,8 +174,6 @@ def _tethers(
 
     A way along edges zigzags: where the straight one is much shorter, that and a little more is what holds.
     """
-    from scipy.sparse.csgraph import dijkstra
-
     n = rest.vertex_count
     if not fixed.any():
         return np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n)
