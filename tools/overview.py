@@ -66,7 +66,7 @@ def held_out_view(
     """Return the photograph, one frame's Gaussians and the student in the last novel view that the evaluation shows."""
     manifest = read_manifest(run / EVALUATE_STAGE)
     numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]
-    views = [shown for shown in numbers["views"] if shown["set"] == "novel_view"]
+    views = [shown for shown in numbers["views"] if (shown["set"], shown.get("chosen")) == ("novel_view", "evenly")]
     models = list(numbers["models"])
     if not views or not {"reference-fit", "student"} <= set(models):
         raise InputError(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
+from avatar.evaluation.gallery import Gallery, ShownSurface, ShownView
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
 from avatar.evaluation.summary import SPREAD_CONVENTION
@@ -52,7 +53,7 @@ class EvaluationConfig:
         metric: perceptual distance: "st-lpips", "lpips" or "none".
         samples, seed: of the surfaces; 0 samples: no surface is measured.
         speed_size: width and height of the pictures that are timed. speed_pictures: how many; 0: no speed.
-        shown: views of each set whose pictures are kept.
+        shown: views of each set whose pictures are kept, evenly; the worst one comes on top. 0: none.
         eps2d: the rasteriser's blur, pixels squared, as in training.
     """
 
@@ -68,38 +69,6 @@ class EvaluationConfig:
     def __post_init__(self) -> None:
         for name in ("samples", "seed", "speed_pictures", "shown"):
             require_at_least(f"evaluation: {name}", getattr(self, name), 0)
-
-
-@dataclass(frozen=True, eq=False)
-class ShownView:
-    """Pictures of one view on the capture's background.
-
-    Attributes:
-        set: of views, among `protocol.SETS`.
-        truth: the photograph. rendered: by model. head: box of the head, None where it is not in the image.
-    """
-
-    set: str
-    camera: str
-    frame: int
-    truth: UInt8[np.ndarray, "H W 3"]
-    rendered: dict[str, UInt8[np.ndarray, "H W 3"]]
-    head: Box | None
-
-
-@dataclass(frozen=True, eq=False)
-class ShownSurface:
-    """Meshes of one frame.
-
-    Attributes:
-        set: "training" or "held_out". truth: the true surface.
-        posed: by model, "skinning alone" first; without the models whose mesh follows its joints alone.
-    """
-
-    set: str
-    frame: int
-    truth: TriangleMesh
-    posed: dict[str, TriangleMesh]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +133,9 @@ class _Run:
         self.views: dict[str, dict[str, dict[str, ViewQuality]]] = {name: {s: {} for s in sets} for name in models}
         self.surfaces: dict[str, dict[int, SurfaceQuality]] = {name: {} for name in models}
         self.skinning_alone: dict[int, SurfaceQuality] = {}
-        self.shown: dict[tuple[str, str, int], ShownView] = {}
+        self.gallery = Gallery(sets, config.shown)
         self.meshes: dict[str, ShownSurface] = {}
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
-        self._kept = {(name, *pair) for name, one in sets.items() for pair in one.spread(config.shown)}
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
         self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
 
@@ -190,11 +158,12 @@ class _Run:
                 self.meshes[part] = ShownSurface(part, frame, truth, {SKINNING_ALONE: mesh})
         # A frame that only its surface is measured of is posed for any eye: the mesh does not depend on it.
         camera_centers = camera_centers_of(views) if views else skinned.new_zeros(1, 3)
+        pictures: list[dict[str, UInt8[np.ndarray, "H W 3"]]] = [{} for _ in views]
         for name, model in self.models.items():
             with at_rest(model):
                 posed = model(_motion(model, sequence, frame), camera_centers)
                 for index, (view, head) in enumerate(zip(views, heads, strict=True)):
-                    self._see(name, posed, index, view=view, frame=frame, head=head)
+                    pictures[index][name] = self._see(name, posed, index, view=view, frame=frame, head=head)
             if truth is not None and alone is not None:
                 if model.rig is sequence.rig and torch.equal(posed.vertices, skinned):
                     self.surfaces[name][frame] = alone
@@ -203,6 +172,8 @@ class _Run:
                 self.surfaces[name][frame] = self._surface(mesh, model.rig, truth)
                 if frame in self._middle:
                     self.meshes[self._middle[frame]].posed[name] = mesh
+        for view, head, rendered in zip(views, heads, pictures, strict=True):
+            self._show(view, frame, head, rendered)
 
     def result(self, files: Mapping[str, Path]) -> Evaluation:
         """Make the report of all frames, with speed and size."""
@@ -225,24 +196,29 @@ class _Run:
             **({"speed": SPEED_CONVENTION} if self.config.speed_pictures else {}),
         }
         report = EvalReport(self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions)
-        order = list(self.sets)
-        shown = sorted(self.shown.values(), key=lambda one: (order.index(one.set), one.frame, one.camera))
-        return Evaluation(report, tuple(shown), tuple(self.meshes[name] for name in self.truths))
+        return Evaluation(report, self.gallery.views(), tuple(self.meshes[name] for name in self.truths))
 
-    def _see(self, name: str, posed: PosedAvatar, index: int, *, view: View, frame: int, head: Box | None) -> None:
-        """Draw one view of a model and compare it, for every set that has the view."""
+    def _see(
+        self, name: str, posed: PosedAvatar, index: int, *, view: View, frame: int, head: Box | None
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Draw one view of a model and compare it, for every set that has the view; return the picture."""
         background = self.sequence.background
         drawn = render_view(posed, index, view, background, eps2d=self.config.eps2d)
         quality = view_quality(view, drawn.image, drawn.alpha, background, head=head, metric=self.metric)
-        pair = (view.name, frame)
-        for part in (part for part, one in self.sets.items() if pair in one.views):
-            self.views[name][part][view_key(*pair)] = quality
-            key = (part, *pair)
-            if key in self._kept:
-                if key not in self.shown:
-                    truth = eight_bit(view.composited(background)).numpy()
-                    self.shown[key] = ShownView(*key, truth=truth, rendered={}, head=head)
-                self.shown[key].rendered[name] = eight_bit(drawn.image).numpy()
+        for part in self._sets_of(view, frame):
+            self.views[name][part][view_key(view.name, frame)] = quality
+        return eight_bit(drawn.image).numpy()
+
+    def _show(self, view: View, frame: int, head: Box | None, rendered: dict[str, UInt8[np.ndarray, "H W 3"]]) -> None:
+        """Offer a view that all models have drawn to the gallery."""
+        truth = eight_bit(view.composited(self.sequence.background)).numpy()
+        last = list(self.models)[-1]
+        for part in self._sets_of(view, frame):
+            psnr = self.views[last][part][view_key(view.name, frame)].psnr
+            self.gallery.pass_by(ShownView(part, view.name, frame, truth, rendered, head), psnr)
+
+    def _sets_of(self, view: View, frame: int) -> list[str]:
+        return [part for part, one in self.sets.items() if (view.name, frame) in one.views]
 
     def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
         if id(rig) not in self._head_faces:

@@ -232,13 +232,15 @@ def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> 
             atomic_write_text(folder / "tables" / f"{name}.{ending}", text)
     views, surfaces = [], []
     for view in found.views:
-        file = f"pictures/{view.set}_{view_key(view.camera, view.frame)}.png"
+        worst = view.chosen == "worst"
+        file = f"pictures/{'worst_' if worst else ''}{view.set}_{view_key(view.camera, view.frame)}.png"
         write_tiles(folder / file, view.truth, list(view.rendered.values()))
         views.append(
             {
                 "file": file,
                 "set": view.set,
-                "title": f"{SETS[view.set]}, {view.camera}, frame {view.frame}",
+                "chosen": view.chosen,
+                "title": f"{'worst of ' if worst else ''}{SETS[view.set]}, {view.camera}, frame {view.frame}",
                 "head": view.head,
             }
         )

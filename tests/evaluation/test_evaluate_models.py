@@ -71,8 +71,11 @@ def test_surfaces_beside_skinning_alone(found):
 
 
 def test_pictures_of_each_set_and_meshes_of_a_frame(found):
-    assert [view.set for view in found.views] == list(SETS)
+    assert [(view.set, view.chosen) for view in found.views] == [(k, c) for k in SETS for c in ("evenly", "worst")]
     for view in found.views:
+        if view.chosen == "worst":
+            quality = found.report.models["grown"].views[view.set]
+            assert quality[view_key(view.camera, view.frame)].psnr == min(one.psnr for one in quality.values())
         np.testing.assert_array_equal(view.truth, doll().images[view.camera])
         assert list(view.rendered) == ["still", "grown"]
         assert all(image.shape == view.truth.shape and image.dtype == np.uint8 for image in view.rendered.values())
