@@ -198,9 +198,13 @@ class BodyModel:
         vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
         return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
 
+    def axis_angles(self, params: BodyParams) -> Float64[np.ndarray, "T J 3"]:
+        """Every joint's axis-angle vector relative to its parent's frame, hands complete (mean and PCA included)."""
+        return self._axis_angles(_checked_arrays(params), params.flat_hand_mean)
+
     def joint_rotations(self, params: BodyParams) -> Float64[np.ndarray, "T J 3 3"]:
         """Every joint's rotation relative to its parent's frame, hands complete (mean and PCA included)."""
-        return matrix_from_rotvec(self._axis_angles(_checked_arrays(params), params.flat_hand_mean))
+        return matrix_from_rotvec(self.axis_angles(params))
 
     def rest_joints(self, params: BodyParams | Mapping[str, Array]) -> Float[Array, "T J 3"]:
         """The joints of the shaped body before posing, metres."""

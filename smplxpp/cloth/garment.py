@@ -94,6 +94,22 @@ class Garment:
         t = np.clip((self.vertex_depth - self.config.pin_depth) / self.config.band, 0.0, 1.0)
         return np.where(np.isfinite(self.vertex_depth), t * t * (3.0 - 2.0 * t), 0.0).astype(np.float32)
 
+    def with_vertices_at(self, place: Int64[np.ndarray, " V"]) -> Garment:
+        """Return the garment over other vertices: `place` says where each of the template's is, -1 where it is no more.
+
+        Particles and collider must be there still; of what the garment carries, what is left is.
+        """
+        kept = np.flatnonzero(place[self.vertices] >= 0)
+        own = self.embedding
+        return replace(
+            self,
+            particles=place[self.particles],
+            vertices=place[self.vertices[kept]],
+            vertex_depth=self.vertex_depth[kept],
+            embedding=Embedding(own.corners[kept], own.weights[kept], own.offset[kept]),
+            collider=replace(self.collider, vertices=place[self.collider.vertices]),
+        )
+
     def with_config(self, config: GarmentConfig) -> Garment:
         """Return the garment with another material or pin depth; spacings stay what they were cut with."""
         return replace(self, config=config)

@@ -49,8 +49,14 @@ _INDICES = {"particles": "V", "vertices": "V", "collider_vertices": "V", "rest_f
 
 def save_garments(path: str | Path, garments: Sequence[Garment]) -> None:
     """Write garments, whole or not at all; none is a file too."""
+    arrays, about = garments_to_arrays(garments)
+    write_arrays(path, {_ABOUT: np.array(json.dumps(about)), **arrays})
+
+
+def garments_to_arrays(garments: Sequence[Garment]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return the arrays of garments by name, and what else a file has to say of them, as JSON."""
     about = [{"part": g.part, "config": asdict(g.config)} for g in garments]
-    arrays: dict[str, np.ndarray] = {_ABOUT: np.array(json.dumps({"schema": SCHEMA, "garments": about}))}
+    arrays: dict[str, np.ndarray] = {}
     for k, garment in enumerate(garments):
         own = {
             "particles": garment.particles,
@@ -70,7 +76,7 @@ def save_garments(path: str | Path, garments: Sequence[Garment]) -> None:
         }
         arrays |= {f"{k}.{name}": np.asarray(own[name], dtype=kind) for name, (kind, _) in _ARRAYS.items()}
         arrays |= {f"{k}.params.{name}": np.asarray(v) for name, v in garment.reference.as_dict().items()}
-    write_arrays(path, arrays)
+    return arrays, {"schema": SCHEMA, "garments": about}
 
 
 def load_garments(path: str | Path, template: Template) -> list[Garment]:
@@ -85,6 +91,17 @@ def load_garments(path: str | Path, template: Template) -> list[Garment]:
     if text is None or text.shape != () or text.dtype.kind != "U":
         raise InputError(subject, expected="a file of garments", received="another npz", remedy=_REMEDY)
     about = as_object(parse_json(str(text.item()), subject=subject, remedy=_REMEDY), subject=subject)
+    return garments_from_arrays(arrays, about, template, subject=subject)
+
+
+def garments_from_arrays(
+    arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], template: Template, *, subject: str
+) -> list[Garment]:
+    """Return the garments that `garments_to_arrays` took apart.
+
+    Raises:
+        InputError: arrays that are missing or do not fit, a newer version, or another template.
+    """
     schema = as_number(about.get("schema"), subject=f"{subject}: schema", least=1)
     if schema > SCHEMA:
         raise InputError(

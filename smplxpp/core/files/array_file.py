@@ -36,7 +36,7 @@ _FREELY_UNPACKED, _MOST_UNPACKING = 1 << 29, 200
 _PIECE = 1 << 20
 _SUFFIX = ".npy"
 # Everything that a damaged archive makes the standard library raise.
-_DAMAGED = (
+DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
@@ -173,7 +173,7 @@ def _errors_said(subject: str, expected: str, remedy: str) -> Iterator[None]:
         raise
     except OSError as error:
         raise InputError(subject, expected="a readable file", received=str(error), remedy=remedy) from None
-    except _DAMAGED as error:
+    except DAMAGED as error:
         received = f"{type(error).__name__}: {str(error)[:200]}"
         raise InputError(subject, expected=expected, received=received, remedy=remedy) from None
 

@@ -1,0 +1,348 @@
+"""A trained student as a bundle for players: what driving needs and nothing else, its numbers as coarse as nobody sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+
+from avatar.export.bundle_numbers import Tensors, blended, halves, rounded, signed, unsigned
+from avatar.models.networks.blend_shapes import BlendShapes
+from avatar.models.networks.control_points import template_control_points
+from avatar.models.networks.local_pose import BODY_JOINTS
+from avatar.models.student import Student
+from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, save_bundle
+from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.garment_file import garments_to_arrays
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
+from smplxpp.template.template import Template
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleConfig:
+    """How coarse the numbers of a bundle are.
+
+    Attributes:
+        exact: store float32 throughout; else halves and integers as follows.
+        position_step, color_step: of a blend shape times its coefficient's usual size: metres, and sRGB in [0, 1].
+        basis_step: of the body's expressions and pose correctives, metres.
+    """
+
+    exact: bool = False
+    position_step: float = 5e-5
+    color_step: float = 1e-3
+    basis_step: float = 2e-5
+
+    def __post_init__(self) -> None:
+        for name in ("position_step", "color_step", "basis_step"):
+            require_positive(f"bundle: {name}", getattr(self, name))
+
+    @property
+    def reductions(self) -> dict[str, str]:
+        """What is done, by piece, in words."""
+        if self.exact:
+            return {"all": "float32"}
+        return {
+            "surface": "vertices float32, skin weights 16 bits, expressions and pose correctives 8 bits of the vertices "
+            f"that they move by more than {500 * self.basis_step:g} mm",
+            "field": "float16, interpolation 8 bits",
+            "gaussians": "float16; barycentric coordinates and opacities 16 bits, rotations and harmonics 8",
+            "blend": f"8 bits in steps of {1000 * self.position_step:g} mm and {self.color_step:g}, columns that a gate "
+            "closes left out, networks float16",
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleExtras:
+    """What goes into a bundle beside the student.
+
+    Attributes:
+        name, licence, provenance: see `AboutAvatar`.
+        garments: the loose clothes. motion: something to play.
+    """
+
+    name: str
+    licence: str = ""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    garments: Sequence[Garment] = ()
+    motion: BodyParams | None = None
+
+
+def write_bundle(
+    path: str | Path, student: Student, extras: BundleExtras, config: BundleConfig | None = None
+) -> dict[str, int]:
+    """Write a student as a bundle, whole or not at all.
+
+    Returns:
+        Bytes of each piece in the file, and "total".
+    """
+    config = config or BundleConfig()
+    template = student.rig.template
+    bound = student.gaussians.snapshot()
+    order = torch.argsort(bound.face_index, stable=True)
+    bound = bound.select(order)
+    faces, per_face = np.unique(bound.face_index.numpy(), return_counts=True)
+    cut = _Cut.of(template, faces, extras.garments)
+    pieces: dict[str, tuple[Tensors, Mapping[str, Any]]] = {
+        "skeleton": (_skeleton(template), {}),
+        "surface": (_surface(template, cut, config), {}),
+        "gaussians": (_gaussians(bound.tensors, per_face, config), {}),
+    }
+    if student.field is not None and student.codes is not None:
+        pieces["field"] = (_field(student, cut, config), {})
+    if student.blend_shapes is not None:
+        usual = usual_coefficients(student, extras.motion)
+        pieces["blend"] = (_blend(student.blend_shapes, order, usual, config), {})
+    if student.pose_gate is not None:
+        known = {"known": student.pose_gate.poses, "scale": student.pose_gate.scale}
+        pieces["poses"] = ({name: value.cpu().numpy() for name, value in known.items()}, {})
+    if extras.garments:
+        pieces[GARMENTS] = _garments(extras.garments, cut)
+    if extras.motion is not None:
+        stored = {
+            name: np.asarray(value, np.float32) for name, value in extras.motion.without_shape().as_dict().items()
+        }
+        pieces[MOTION] = (stored, {})
+    codes = student.codes
+    about = AboutAvatar(
+        name=extras.name,
+        licence=extras.licence,
+        provenance=extras.provenance,
+        joint_names=template.body.joint_names,
+        expression_names=template.body.expression_names,
+        part_names=template.part_names,
+        frames=student.frames,
+        null_code_shown=codes is not None and codes.null_code_shown,
+        jaw=student.blend_shapes is not None and student.blend_shapes.config.jaw,
+        reductions=config.reductions,
+    )
+    return save_bundle(path, about, pieces)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Which of a template's vertices and faces a player needs.
+
+    Attributes:
+        vertices: increasing. faces: those that carry Gaussians, of indices into the vertices.
+        place: where each of the template's vertices is among them, -1 where it is not.
+    """
+
+    vertices: Int64[np.ndarray, " V"]
+    faces: Int64[np.ndarray, "F 3"]
+    place: Int64[np.ndarray, " W"]
+
+    @staticmethod
+    def of(template: Template, faces: Int64[np.ndarray, " F"], garments: Sequence[Garment]) -> _Cut:
+        used = [template.faces[faces].ravel()]
+        for garment in garments:
+            used += [garment.particles, garment.collider.vertices]
+        vertices = np.unique(np.concatenate(used))
+        place = np.full(template.vertex_count, -1, dtype=np.int64)
+        place[vertices] = np.arange(len(vertices))
+        return _Cut(vertices, place[template.faces[faces]], place)
+
+
+def _skeleton(template: Template) -> Tensors:
+    body = template.body
+    moved = np.einsum("jv,vce->jce", body.joint_regressor, body.exprdirs)
+    optional = ("left_hand_mean", "right_hand_mean", "left_hand_components", "right_hand_components")
+    return {
+        "parents": np.asarray(body.parents, np.int16),
+        "joints": template.joints.astype(np.float32),
+        "expression": moved.astype(np.float32),
+        **{name: np.float32(getattr(body, name)) for name in optional if getattr(body, name) is not None},
+    }
+
+
+def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
+    at, body = cut.vertices, template.body
+    skin = at[at < body.vertex_count]
+    index, weights = template.weights.joint_indices[at], template.weights.joint_weights[at]
+    # The heaviest first, and no slots that nobody uses.
+    order = np.argsort(-weights, axis=1, kind="stable")
+    used = max(1, int((weights > 0).sum(axis=1).max()))
+    index, weights = (np.take_along_axis(array, order, axis=1)[:, :used] for array in (index, weights))
+    out: Tensors = {
+        "vertices": template.vertices[at].astype(np.float32),
+        "faces": cut.faces.astype(np.uint16 if len(at) <= 1 << 16 else np.uint32),
+        "parts": template.vertex_part[at].astype(np.uint8),
+        "labels": template.vertex_labels[at].astype(np.uint8),
+        "colors": template.vertex_colors[at],
+        "joint_indices": index.astype(np.uint8),
+    }
+    out |= {"joint_weights": weights.astype(np.float32)} if config.exact else unsigned("joint_weights", weights, 16)
+    for name, basis in (("expression", body.exprdirs), ("pose", body.posedirs)):
+        if basis is None or (name == "pose" and not basis.shape[2]):
+            continue
+        own = basis[skin]
+        rows = np.flatnonzero((np.abs(own) > (0.0 if config.exact else 0.5 * config.basis_step)).any(axis=(1, 2)))
+        out[f"{name}_rows"] = rows.astype(np.int32)
+        out |= {name: own[rows].astype(np.float32)} if config.exact else rounded(name, own[rows], config.basis_step)
+    return out
+
+
+def _gaussians(tensors: Mapping[str, Tensor], per_face: Int64[np.ndarray, " F"], config: BundleConfig) -> Tensors:
+    own = {name: value.numpy() for name, value in tensors.items()}
+    offset = own["offset"].copy()
+    offset[:, 0] += own["normal_offset"]
+    opacities = torch.sigmoid(tensors["opacity_logits"].double()).numpy()
+    quats = own["quats"] / np.linalg.norm(own["quats"], axis=1, keepdims=True)
+    counts: Tensors = {"per_face": per_face.astype(np.uint8 if per_face.max(initial=0) < 256 else np.uint32)}
+    plain = {"offset": offset, "log_scales": own["log_scales"], "dc": own["dc"]}
+    fine = {"barycentric": own["barycentric"], "opacities": opacities}
+    if config.exact:
+        every = {**plain, **fine, "quats": quats, "sh": own["sh"]}
+        return counts | {name: value.astype(np.float32) for name, value in every.items()}
+    for name, value in fine.items():
+        counts |= unsigned(name, np.clip(value, 0.0, 1.0), 16)
+    return (
+        counts | halves(plain) | signed("quats", quats, np.float32(1.0)) | signed("sh", own["sh"], _largest(own["sh"]))
+    )
+
+
+def _largest(sh: Float[np.ndarray, "N K 3"]) -> Float[np.ndarray, "K 3"]:
+    return np.maximum(np.abs(sh).max(axis=0, initial=0.0), 1e-6)
+
+
+def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
+    net, codes, template = student.field, student.codes, student.rig.template
+    assert net is not None and codes is not None
+    points = net.points.cpu().numpy()
+    if net.rows is None:  # evaluated at every vertex: those of the bundle are enough
+        points, kept = cut.vertices, cut.vertices
+        neighbours, weights = np.arange(len(kept))[:, None], np.ones((len(kept), 1))
+    else:
+        kept = np.arange(len(points))
+        control = template_control_points(template, student.config.control_points)
+        neighbours, weights = control.neighbours[cut.vertices], control.weights[cut.vertices]
+    clothes = template.cloth_mask[points]
+    sets, member = _seen(net.sets, net.member, kept)
+    small = np.uint16 if len(points) <= 1 << 16 else np.uint32
+    out: Tensors = {
+        "points": template.vertices[points].astype(np.float32),
+        "neighbours": neighbours.astype(small),
+        "cloth": np.flatnonzero(clothes).astype(small),
+        "sets": sets.astype(np.uint8),
+        "member": member.astype(small),
+    }
+    out |= {"weights": weights.astype(np.float32)} if config.exact else unsigned("weights", weights, 8)
+    floats: Tensors = {"codes": _numbers(codes.codes)}
+    for name, network in (("body", net.body), ("cloth", net.cloth)):
+        hidden = [layer for layer in network.hidden if isinstance(layer, nn.Linear)]
+        width = network.last.in_features
+        floats |= {
+            f"{name}.of_point.weight": _numbers(network.of_point.weight),
+            f"{name}.of_frame.weight": _numbers(network.of_frame.weight),
+            f"{name}.of_frame.bias": _numbers(network.of_frame.bias),
+            f"{name}.hidden.weight": _stacked([layer.weight for layer in hidden], (width, width)),
+            f"{name}.hidden.bias": _stacked([layer.bias for layer in hidden], (width,)),
+            f"{name}.last.weight": _numbers(network.last.weight),
+            f"{name}.last.bias": _numbers(network.last.bias),
+        }
+    return out | (floats if config.exact else halves(floats))
+
+
+def _seen(
+    sets: Tensor | None, member: Tensor | None, kept: Int64[np.ndarray, " C"]
+) -> tuple[Bool[np.ndarray, "S 21"], Int64[np.ndarray, " C"]]:
+    """Return the sets of joints that points see, and each point's; one set of all joints where they see the whole pose."""
+    if sets is None or member is None:
+        return np.ones((1, BODY_JOINTS), dtype=bool), np.zeros(len(kept), dtype=np.int64)
+    return sets.cpu().numpy()[:, ::3] > 0.5, member.cpu().numpy().argmax(axis=1)[kept]
+
+
+def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return the usual size of each blend shape's coefficients, by side: what its steps are measured by.
+
+    Those of the body are taken in the poses that training saw, those of the head in the motion, and of expressions at
+    random where there is none. None counts as smaller than a fifth of the largest.
+    """
+    shapes = student.blend_shapes
+    assert shapes is not None
+    config, rng = shapes.config, np.random.default_rng(0)
+    body = rng.normal(size=(64, config.pose_size)) * 0.2
+    if student.pose_gate is not None:
+        body = student.pose_gate.poses.cpu().numpy()
+    elif motion is not None:
+        body = motion.body_pose
+    head = rng.uniform(0.0, 0.5, (256, config.head_inputs))
+    if motion is not None and np.abs(motion.expression).max(initial=0.0) > 0.0:
+        width = min(config.expression_size, motion.expression.shape[1])
+        of_motion = np.zeros((len(motion), config.head_inputs))
+        of_motion[:, :width] = motion.expression[:, :width]
+        if config.jaw:
+            of_motion[:, config.expression_size :] = motion.jaw_pose
+        head = np.concatenate([head, of_motion])
+    out = {}
+    for side, inputs, network in (("head", head, shapes.head), ("body", body, shapes.body)):
+        with torch.no_grad():
+            z = network(torch.tensor(inputs, dtype=torch.float32, device=shapes.U.device)).unflatten(
+                1, (config.parts, -1)
+            )
+        size = z.square().mean(dim=(0, 1)).sqrt().cpu().numpy()
+        out[side] = np.maximum(size, max(0.2 * float(size.max(initial=0.0)), 1e-3))
+    return out
+
+
+def _blend(
+    shapes: BlendShapes, order: Int64[Tensor, " N"], usual: Mapping[str, np.ndarray], config: BundleConfig
+) -> Tensors:
+    """Return blend shapes in the bundle's order of Gaussians, each side with the rows alone that its gate lets through."""
+    count, n = shapes.count, shapes.config.head_shapes
+    place = np.full(count, -1, dtype=np.int64)
+    place[shapes.active.cpu().numpy()] = np.arange(len(shapes.active))
+    place = place[order.numpy()]
+    both = torch.cat([shapes.U, shapes.C], dim=1).detach().cpu().numpy()  # (M, 6, n)
+    head = np.ones(count) if shapes.head_weight is None else shapes.head_weight.cpu().numpy()[order.numpy()]
+    gates = {"head": head, "body": np.ones(count) if shapes.head_weight is None else 1.0 - head}
+    networks, columns = {"head": shapes.head, "body": shapes.body}, {"head": slice(0, n), "body": slice(n, None)}
+    out: Tensors = {}
+    if shapes.part is not None:
+        out["part"] = shapes.part.cpu().numpy()[order.numpy()].astype(np.uint16)
+    for side, gate in gates.items():
+        rows = np.flatnonzero((gate > 0) & (place >= 0))
+        values = (both[place[rows]][:, :, columns[side]] * gate[rows, None, None]).transpose(2, 1, 0)
+        if len(rows) < count:
+            out[f"{side}.rows"] = rows.astype(np.int32)
+        if config.exact:
+            out[f"{side}.values"] = values.astype(np.float32)
+        else:
+            steps = np.repeat([[config.position_step, config.color_step]], 3, axis=1) / usual[side][:, None]
+            out |= blended(side, values, steps)
+        layers = [layer for layer in networks[side] if isinstance(layer, nn.Linear)]
+        first, *hidden, last = layers
+        width = last.in_features
+        floats = {
+            f"{side}.first.weight": _numbers(first.weight),
+            f"{side}.first.bias": _numbers(first.bias),
+            f"{side}.hidden.weight": _stacked([layer.weight for layer in hidden], (width, width)),
+            f"{side}.hidden.bias": _stacked([layer.bias for layer in hidden], (width,)),
+            f"{side}.last.weight": _numbers(last.weight),
+            f"{side}.last.bias": _numbers(last.bias),
+        }
+        out |= floats if config.exact else halves(floats)
+    return out
+
+
+def _garments(garments: Sequence[Garment], cut: _Cut) -> tuple[Tensors, Mapping[str, Any]]:
+    """Return garments over the bundle's vertices; float32 is enough for what float64 is kept in elsewhere."""
+    own = [garment.with_vertices_at(cut.place) for garment in garments]
+    arrays, about = garments_to_arrays(own)
+    narrow = {name: value.astype(np.float32) for name, value in arrays.items() if value.dtype == np.float64}
+    return {**arrays, **narrow}, about
+
+
+def _numbers(value: Tensor) -> Float[np.ndarray, ...]:
+    return value.detach().cpu().numpy()
+
+
+def _stacked(values: Sequence[Tensor], shape: tuple[int, ...]) -> Float[np.ndarray, ...]:
+    return np.stack([_numbers(value) for value in values]) if values else np.zeros((0, *shape), np.float32)

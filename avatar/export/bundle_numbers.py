@@ -1,0 +1,59 @@
+"""Numbers of a bundle: halves, and integers with the steps that make them numbers again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+Tensors = dict[str, np.ndarray]
+_LARGEST = 127
+_MOST_HALF = 65504.0
+
+
+def halves(tensors: Mapping[str, np.ndarray]) -> Tensors:
+    """Return tensors in float16; those that it could not hold stay as they are."""
+    return {
+        name: value.astype(np.float16 if np.abs(value).max(initial=0.0) < _MOST_HALF else np.float32)
+        for name, value in tensors.items()
+    }
+
+
+def unsigned(name: str, values: Float[np.ndarray, "*N"], bits: int) -> Tensors:
+    """Return values of [0, 1] in whole steps of so many bits, 8 or 16."""
+    most = (1 << bits) - 1
+    return {
+        name: np.rint(values * most).astype(np.uint8 if bits == 8 else np.uint16),
+        f"{name}.step": np.float32(1.0 / most).reshape(()),
+    }
+
+
+def signed(name: str, values: Float[np.ndarray, "*N"], largest: np.ndarray | np.float32) -> Tensors:
+    """Return values within `largest`, one for all or one for each place of the last axes, in 8 bits."""
+    step = np.asarray(largest, np.float32) / _LARGEST
+    return {
+        name: np.clip(np.rint(values / step), -_LARGEST, _LARGEST).astype(np.int8),
+        f"{name}.step": np.asarray(step),
+    }
+
+
+def rounded(name: str, basis: Float[np.ndarray, "R 3 E"], step: float) -> Tensors:
+    """Return a basis in 8 bits: in this step, or in what a direction's largest number needs."""
+    return signed(name, basis, np.maximum(np.abs(basis).max(axis=(0, 1), initial=0.0), _LARGEST * step))
+
+
+def blended(side: str, values: Float[np.ndarray, "n 6 M"], steps: Float[np.ndarray, "n 6"]) -> Tensors:
+    """Return blend shapes in 8 bits: `steps 2^exponent` a unit, the exponent a Gaussian's own where it needs one.
+
+    Nearly all numbers are a few steps: zip's entropy code takes them to some three bits each.
+    """
+    units = values / steps[:, :, None]
+    largest = np.abs(units).max(axis=(0, 1), initial=0.0)
+    exponent = np.ceil(np.log2(np.maximum(largest / _LARGEST, 1.0))).astype(np.uint8)
+    units = np.rint(units / 2.0**exponent)
+    return {
+        f"{side}.values": np.clip(units, -_LARGEST, _LARGEST).astype(np.int8),
+        f"{side}.step": steps.astype(np.float32),
+        f"{side}.exponent": exponent,
+    }

@@ -1,0 +1,288 @@
+"""An avatar for players: its tensors by piece, what they are of, and its file `NAME.avatar`. Neither torch nor trainer."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.runtime.layout import MOST_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decoded
+from smplxpp.body.layout import JOINT_NAMES
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
+from smplxpp.core.files.package_file import read_package, write_package
+from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
+
+FORMAT, VERSION = "smplxpp-avatar", 1
+SUFFIX = ".avatar"
+GARMENTS, MOTION = "garments", "motion"
+_MANIFEST = "manifest.json"
+_EXPECTED = "an avatar that `smplxpp export` wrote"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AboutAvatar:
+    """What a bundle says of its avatar.
+
+    Attributes:
+        name: of the person or the run. licence: of the avatar. provenance: short texts: what it was made from, and by what.
+        joint_names, expression_names, part_names: of the skeleton, its expressions, the parts of the surface.
+        frames: those that have a code, in the order of the codes. null_code_shown: new poses take the zero code, else
+            the first frame's.
+        jaw: the jaw's rotation drives the head's blend shapes too.
+        eps2d: pixels squared by which splats were blurred in training.
+        reductions: what was done to the numbers, by piece.
+    """
+
+    name: str
+    licence: str = ""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    joint_names: tuple[str, ...]
+    expression_names: tuple[str, ...] = ()
+    part_names: tuple[str, ...] = ()
+    frames: tuple[int, ...] = ()
+    null_code_shown: bool = False
+    jaw: bool = False
+    eps2d: float = 0.1
+    reductions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class AvatarBundle:
+    """An avatar as a file holds it, decoded.
+
+    Attributes:
+        about: what it is.
+        tensors: by "piece.name" (`avatar.runtime.layout.PIECES`), float32 and int32; blend shapes may stay int8.
+        sizes: numbers of joints J, vertices V, faces F, Gaussians N, expressions E and of what the table names.
+        garments, motion: arrays of the loose clothes and of a motion, as their own readers take them; empty: none.
+        garments_about: what the garments' file says of them.
+    """
+
+    about: AboutAvatar
+    tensors: Mapping[str, np.ndarray]
+    sizes: Mapping[str, int]
+    garments: Mapping[str, np.ndarray] = field(default_factory=dict)
+    garments_about: Mapping[str, Any] = field(default_factory=dict)
+    motion: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __contains__(self, piece: str) -> bool:
+        return any(name.startswith(f"{piece}.") for name in self.tensors)
+
+
+def save_bundle(
+    path: str | Path, about: AboutAvatar, pieces: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[str, Any]]]
+) -> dict[str, int]:
+    """Write a bundle, whole or not at all; the same content gives the same bytes.
+
+    Args:
+        pieces: tensors as they are to be stored and what else a piece says, by the piece's name.
+
+    Returns:
+        Bytes of each piece in the file, and of all of it as "total".
+    """
+    data = {f"{name}.safetensors": pack_tensors(tensors, said) for name, (tensors, said) in pieces.items()}
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "model": asdict(about),
+        "pieces": {
+            file.split(".")[0]: {"file": file, "bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
+            for file, value in data.items()
+        },
+    }
+    text = json.dumps(manifest, indent=1).encode()
+    packed = write_package(path, {_MANIFEST: text, **data})
+    return {**{file.split(".")[0]: size for file, size in packed.items()}, "total": Path(path).stat().st_size}
+
+
+def load_bundle(path: str | Path) -> AvatarBundle:
+    """Read what `save_bundle` wrote, every piece held against its digest and every tensor against the table.
+
+    The digests tell damage; who changes a piece and the manifest alike is not found out.
+
+    Raises:
+        InputError: a missing, damaged, changed or foreign file, one of a newer version, one that would unpack to more
+            than half a GiB, numbers that are not finite or do not fit each other.
+    """
+    subject = f"avatar {path}"
+    data = read_package(path, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
+    if _MANIFEST not in data:
+        raise InputError(subject, expected=_EXPECTED, received=f"a zip without {_MANIFEST}", remedy=REMEDY)
+    manifest = as_object(
+        parse_json(data.pop(_MANIFEST), subject=f"{subject}: manifest"), subject=f"{subject}: manifest"
+    )
+    _check_version(manifest, subject)
+    raw = _checked_pieces(manifest, data, subject)
+    about = _about(as_object(manifest.get("model"), subject=f"{subject}: model"), f"{subject}: model")
+    tensors: dict[str, np.ndarray] = {}
+    there = tuple(piece for piece in PIECES if piece in raw or piece in NEEDED)
+    for piece in there:
+        own = decoded(raw.get(piece, ({}, {}))[0], piece, f"{subject}: {piece}")
+        tensors |= {f"{piece}.{name}": value for name, value in own.items()}
+    sizes = check_shapes(tensors, there, subject)
+    _check_sense(about, tensors, sizes, subject)
+    garments, garments_about = raw.get(GARMENTS, ({}, {}))
+    return AvatarBundle(about, tensors, sizes, garments, garments_about, raw.get(MOTION, ({}, {}))[0])
+
+
+def _check_version(manifest: Mapping[str, Any], subject: str) -> None:
+    if manifest.get("format") != FORMAT:
+        raise InputError(subject, expected=_EXPECTED, received="a manifest of another format", remedy=REMEDY)
+    version = as_integer(manifest.get("version"), subject=f"{subject}: version", least=1)
+    if version > VERSION:
+        raise InputError(
+            subject,
+            expected=f"version {VERSION} or older",
+            received=f"version {version}",
+            remedy="update smplxpp to the version that wrote it",
+        )
+
+
+def _checked_pieces(
+    manifest: Mapping[str, Any], data: Mapping[str, bytes], subject: str
+) -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    entries = as_object(manifest.get("pieces"), subject=f"{subject}: pieces")
+    out, files = {}, set()
+    for name, value in entries.items():
+        entry = as_object(value, subject=f"{subject}: piece {name}")
+        file = as_text(entry.get("file"), subject=f"{subject}: piece {name}")
+        files.add(file)
+        content = data.get(file)
+        if content is None or name not in (*PIECES, GARMENTS, MOTION):
+            raise InputError(
+                f"{subject}: piece {name}",
+                expected="one of its version, in the file",
+                received="none" if content is None else "another",
+                remedy=REMEDY,
+            )
+        digest = hashlib.sha256(content).hexdigest()
+        if entry.get("bytes") != len(content) or entry.get("sha256") != digest:
+            raise InputError(
+                f"{subject}: piece {name}",
+                expected=f"the {entry.get('bytes')!r} bytes that the manifest's digest is of",
+                received=f"{len(content)} bytes with SHA-256 {digest[:16]}...",
+                remedy="it was changed or damaged since: take the file as it was written",
+            )
+        out[name] = unpack_tensors(content, subject=f"{subject}: {name}", remedy=REMEDY)
+    if set(data) - files:
+        raise InputError(
+            subject,
+            expected="the pieces of its manifest alone",
+            received=f"{min(set(data) - files)} beside them",
+            remedy=REMEDY,
+        )
+    return out
+
+
+def _about(stored: Mapping[str, Any], subject: str) -> AboutAvatar:
+    def texts(name: str) -> tuple[str, ...]:
+        return tuple(
+            as_text(one, subject=f"{subject}: {name}")
+            for one in as_list(stored.get(name), subject=f"{subject}: {name}")
+        )
+
+    def notes(name: str) -> dict[str, str]:
+        values = as_object(stored.get(name), subject=f"{subject}: {name}")
+        return {key: as_text(value, subject=f"{subject}: {name}") for key, value in values.items()}
+
+    for name in ("null_code_shown", "jaw"):
+        if not isinstance(stored.get(name), bool):
+            raise InputError(f"{subject}: {name}", expected="true or false", received=repr(stored.get(name))[:80])
+    frames = as_list(stored.get("frames"), subject=f"{subject}: frames")
+    return AboutAvatar(
+        name=as_text(stored.get("name"), subject=f"{subject}: name"),
+        licence=as_text(stored.get("licence"), subject=f"{subject}: licence"),
+        provenance=notes("provenance"),
+        joint_names=texts("joint_names"),
+        expression_names=texts("expression_names"),
+        part_names=texts("part_names"),
+        frames=tuple(as_integer(frame, subject=f"{subject}: frames", least=0) for frame in frames),
+        null_code_shown=stored["null_code_shown"],
+        jaw=stored["jaw"],
+        eps2d=as_number(stored.get("eps2d"), subject=f"{subject}: eps2d", least=0.0, most=100.0),
+        reductions=notes("reductions"),
+    )
+
+
+def _check_sense(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], subject: str) -> None:
+    """What shapes alone do not say."""
+
+    def require(condition: bool, what: str, expected: str, received: object) -> None:
+        if not condition:
+            raise InputError(f"{subject}: {what}", expected=expected, received=str(received)[:200], remedy=REMEDY)
+
+    parents, faces, count = tensors["skeleton.parents"], tensors["gaussians.per_face"], sizes["N"]
+    require(sizes["J"] in JOINT_NAMES, "joints", f"{' or '.join(map(str, JOINT_NAMES))} of them", sizes["J"])
+    ordered = parents[0] == -1 and bool((parents[1:] >= 0).all() and (parents[1:] < np.arange(1, sizes["J"])).all())
+    require(ordered, "skeleton.parents", "the root first, every parent before its children", parents.tolist())
+    for what, names, letter in (
+        ("joint_names", about.joint_names, "J"),
+        ("expression_names", about.expression_names, "E"),
+    ):
+        require(len(names) == sizes[letter], what, f"{sizes[letter]} names", len(names))
+    require(0 < count <= MOST_GAUSSIANS, "gaussians", f"1 to {MOST_GAUSSIANS}", count)
+    require(
+        bool((faces >= 0).all()) and int(faces.sum()) == count, "gaussians.per_face", f"counts of {count}", "others"
+    )
+    require(sizes["K"] in (0, 3, 8, 15), "gaussians.sh", "0, 3, 8 or 15 coefficients", sizes["K"])
+    require(
+        bool((np.square(tensors["gaussians.quats"]).sum(1) > 1e-6).all()), "gaussians.quats", "lengths above 0", "0"
+    )
+    opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
+    require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")
+    sums = weights.sum(1)
+    positive = bool((weights >= 0).all() and (np.abs(sums - 1.0) < 0.01).all())
+    require(positive, "surface.joint_weights", "rows that sum to 1", "others")
+    for name, most in (("parts", len(about.part_names)), ("labels", 256), ("colors", 256)):
+        value = tensors[f"surface.{name}"]
+        require(
+            not value.size or (value.min() >= 0 and value.max() < most),
+            f"surface.{name}",
+            f"values in [0, {most})",
+            "others",
+        )
+    body_first = bool((np.diff(tensors["surface.parts"]) >= 0).all())
+    require(body_first, "surface.parts", "the parts one after the other", "another order")
+    if "P" in sizes:
+        require(sizes["P"] == 9 * (sizes["J"] - 1), "surface.pose", f"{9 * (sizes['J'] - 1)} directions", sizes["P"])
+    if "field.points" in tensors:
+        bands, inputs = sizes["X"] - 3, 63 + sizes["Z"]
+        require(bands % 6 == 0 and 0 <= bands <= 96, "field", "bands of sines and cosines", f"{bands} inputs")
+        require(sizes["Y"] == inputs, "field of_frame", f"{inputs} inputs", sizes["Y"])
+        require(sizes["T"] == len(about.frames) > 0, "field.codes", f"{len(about.frames)} codes", sizes["T"])
+    if "blend.head.values" in tensors:
+        _check_blend(about, tensors, sizes, require)
+
+
+def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], require: Any) -> None:
+    part = tensors.get("blend.part")
+    parts = 1 if part is None else int(part.max()) + 1
+    require(part is None or part.min() >= 0, "blend.part", "no negative number", "one")
+    inputs = {"head": None if about.jaw else sizes["head_i"], "body": 63}
+    if about.jaw:
+        inputs["head"] = max(sizes["head_i"], 4)
+    for side in ("head", "body"):
+        shapes, rows = sizes[f"{side}_n"], tensors.get(f"blend.{side}.rows")
+        outputs, values = sizes[f"{side}_o"], tensors[f"blend.{side}.values"]
+        fits = outputs % max(shapes, 1) == 0 and outputs >= parts * shapes
+        require(fits, f"blend.{side}", f"{parts} x {shapes} coefficients", outputs)
+        require(sizes[f"{side}_i"] == inputs[side], f"blend.{side}", f"{inputs[side]} inputs", sizes[f"{side}_i"])
+        if rows is None:
+            require(sizes[f"{side}_m"] == sizes["N"], f"blend.{side}", f"{sizes['N']} rows", sizes[f"{side}_m"])
+        else:
+            require(bool((np.diff(rows) > 0).all()), f"blend.{side}.rows", "increasing numbers", "others")
+        steps = tensors.get(f"blend.{side}.step")
+        require((values.dtype == np.int8) == (steps is not None), f"blend.{side}.step", "steps of integers", "others")
+        exponents = tensors.get(f"blend.{side}.exponent")
+        require(
+            exponents is None or bool(((exponents >= 0) & (exponents <= 24)).all()),
+            f"blend.{side}.exponent",
+            "0 to 24",
+            "others",
+        )
