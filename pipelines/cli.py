@@ -72,7 +72,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "export": (
         "pipelines.commands.export",
         "Export",
-        "a finished template as one closed, printable solid: STL, 3MF, PLY or GLB, posed or in the T-pose",
+        "a trained student as one file for players, or a template as one closed, printable solid",
     ),
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
     "synth": ("pipelines.commands.synth", "Synth", "make a synthetic capture of a clothed person with moving cloth"),

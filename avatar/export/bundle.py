@@ -1,4 +1,4 @@
-"""A trained student as a bundle for players: what driving needs and nothing else, its numbers as coarse as nobody sees."""
+"""A trained student as a bundle for players: what driving needs and nothing else, no number finer than it shows."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ class BundleConfig:
         if self.exact:
             return {"all": "float32"}
         return {
-            "surface": "vertices float32, skin weights 16 bits, expressions and pose correctives 8 bits of the vertices "
-            f"that they move by more than {500 * self.basis_step:g} mm",
+            "surface": "vertices float32, skin weights 16 bits, expressions and pose correctives 8 bits where they "
+            f"move a vertex by more than {500 * self.basis_step:g} mm",
             "field": "float16, interpolation 8 bits",
             "gaussians": "float16; barycentric coordinates and opacities 16 bits, rotations and harmonics 8",
-            "blend": f"8 bits in steps of {1000 * self.position_step:g} mm and {self.color_step:g}, columns that a gate "
-            "closes left out, networks float16",
+            "blend": f"8 bits in steps of {1000 * self.position_step:g} mm and {self.color_step:g}, without what a "
+            "gate closes, networks float16",
         }
 
 
@@ -253,13 +253,13 @@ def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
 def _seen(
     sets: Tensor | None, member: Tensor | None, kept: Int64[np.ndarray, " C"]
 ) -> tuple[Bool[np.ndarray, "S 21"], Int64[np.ndarray, " C"]]:
-    """Return the sets of joints that points see, and each point's; one set of all joints where they see the whole pose."""
+    """Return the sets of joints that points see, and each point's set; one of all joints where all are seen."""
     if sets is None or member is None:
         return np.ones((1, BODY_JOINTS), dtype=bool), np.zeros(len(kept), dtype=np.int64)
     return sets.cpu().numpy()[:, ::3] > 0.5, member.cpu().numpy().argmax(axis=1)[kept]
 
 
-def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str, Float[np.ndarray, " n"]]:
+def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str, np.ndarray]:
     """Return the usual size of each blend shape's coefficients, by side: what its steps are measured by.
 
     Those of the body are taken in the poses that training saw, those of the head in the motion, and of expressions at
@@ -284,9 +284,8 @@ def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str,
     out = {}
     for side, inputs, network in (("head", head, shapes.head), ("body", body, shapes.body)):
         with torch.no_grad():
-            z = network(torch.tensor(inputs, dtype=torch.float32, device=shapes.U.device)).unflatten(
-                1, (config.parts, -1)
-            )
+            z = network(torch.tensor(inputs, dtype=torch.float32, device=shapes.U.device))
+            z = z.unflatten(1, (config.parts, -1))
         size = z.square().mean(dim=(0, 1)).sqrt().cpu().numpy()
         out[side] = np.maximum(size, max(0.2 * float(size.max(initial=0.0)), 1e-3))
     return out
@@ -295,7 +294,7 @@ def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str,
 def _blend(
     shapes: BlendShapes, order: Int64[Tensor, " N"], usual: Mapping[str, np.ndarray], config: BundleConfig
 ) -> Tensors:
-    """Return blend shapes in the bundle's order of Gaussians, each side with the rows alone that its gate lets through."""
+    """Return blend shapes in the bundle's order of Gaussians, each side with the rows that its gate lets through."""
     count, n = shapes.count, shapes.config.head_shapes
     place = np.full(count, -1, dtype=np.int64)
     place[shapes.active.cpu().numpy()] = np.arange(len(shapes.active))
@@ -318,7 +317,7 @@ def _blend(
             steps = np.repeat([[config.position_step, config.color_step]], 3, axis=1) / usual[side][:, None]
             out |= blended(side, values, steps)
         layers = [layer for layer in networks[side] if isinstance(layer, nn.Linear)]
-        first, *hidden, last = layers
+        first, hidden, last = layers[0], layers[1:-1], layers[-1]
         width = last.in_features
         floats = {
             f"{side}.first.weight": _numbers(first.weight),
@@ -340,9 +339,9 @@ def _garments(garments: Sequence[Garment], cut: _Cut) -> tuple[Tensors, Mapping[
     return {**arrays, **narrow}, about
 
 
-def _numbers(value: Tensor) -> Float[np.ndarray, ...]:
+def _numbers(value: Tensor) -> Float[np.ndarray, "*N"]:
     return value.detach().cpu().numpy()
 
 
-def _stacked(values: Sequence[Tensor], shape: tuple[int, ...]) -> Float[np.ndarray, ...]:
+def _stacked(values: Sequence[Tensor], shape: tuple[int, ...]) -> Float[np.ndarray, "*N"]:
     return np.stack([_numbers(value) for value in values]) if values else np.zeros((0, *shape), np.float32)

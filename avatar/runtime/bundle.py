@@ -1,4 +1,4 @@
-"""An avatar for players: its tensors by piece, what they are of, and its file `NAME.avatar`. Neither torch nor trainer."""
+"""An avatar for players: its tensors by piece, what they are of, and its file `NAME.avatar`; torch is not needed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class AboutAvatar:
     """What a bundle says of its avatar.
 
     Attributes:
-        name: of the person or the run. licence: of the avatar. provenance: short texts: what it was made from, and by what.
+        name: of the person or the run. licence: of the avatar. provenance: short texts: what it was made from, and how.
         joint_names, expression_names, part_names: of the skeleton, its expressions, the parts of the surface.
         frames: those that have a code, in the order of the codes. null_code_shown: new poses take the zero code, else
             the first frame's.

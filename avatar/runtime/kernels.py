@@ -102,7 +102,7 @@ class FieldKernel:
 
     def __init__(
         self,
-        tensors: dict[str, Float32[np.ndarray, ...]],
+        tensors: dict[str, np.ndarray],
         encodings: Float32[np.ndarray, "C X"],
         member: Int32[np.ndarray, " C"],
         at: Int32[np.ndarray, " C"] | None = None,

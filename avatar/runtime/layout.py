@@ -1,4 +1,4 @@
-"""What a bundle holds: every tensor by piece and name, its kind and its shape; docs/runtime.md has the table in words."""
+"""What a bundle holds: every tensor by piece and name, its kind and its shape; docs/runtime.md says it in words."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from smplxpp.core.errors import InputError
 
 REMEDY = "export the avatar anew with `smplxpp export RUN --out NAME.avatar`"
 
-# Piece -> tensor -> kind, shape, bound. Kinds: f floats (or integers with a step), i integers, q integers with steps that
-# stay so, or floats. Letters are sizes, the same in all pieces; `<J` bounds indices; a question mark: may be missing.
+# Piece -> tensor -> kind, shape, bound. Kinds: f floats (or integers with a step), i integers, q integers that stay so
+# with their steps, or floats. Letters are sizes, the same in all pieces; `<J`
+# bounds indices; a question mark: may be missing.
 _NETWORK = {
     "of_point.weight": "f W X",
     "of_frame.weight": "f W Y",
@@ -92,7 +93,7 @@ MOST_GAUSSIANS = 1 << 22
 
 
 def decoded(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict[str, np.ndarray]:
-    """Return a piece's tensors as what they stand for: floats in float32, `start + step q` of integers, indices in int32.
+    """Return a piece's tensors as what they stand for: floats in float32, `step q + start` of integers, int32 indices.
 
     Raises:
         InputError: a tensor of another kind, one that is not known, numbers that are not finite.

@@ -52,12 +52,13 @@ class AvatarPlayer:
         self._sides = [BlendSide(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
         self._clothes = Clothes(self.bundle, cloth) if self.bundle.garments else None
         weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
-        interpolated = None if self._field is None else self._field.interpolation
+        neighbours, shares = (None, None) if self._field is None else self._field.interpolation
         self._surface = SurfaceKernel(
             sizes["J"],
             t["surface.joint_indices"],
             weights,
-            *((None, None) if interpolated is None else interpolated),
+            neighbours,
+            shares,
             sizes.get("C", 0),
         )
         self._rest = t["surface.vertices"]
@@ -73,15 +74,16 @@ class AvatarPlayer:
             thickness=THICKNESS,
         )
         count = sizes["N"]
-        self._out = tuple(np.empty((count, width), np.float32) for width in (3, 4, 3, 3))
-        self._rotations = np.empty((sizes["F"], 3, 3), np.float32)
+        means, quats, scales, dc = (np.empty((count, width), np.float32) for width in (3, 4, 3, 3))
         self._splats = WorldSplats(
-            *self._out[:3],
+            means,
+            quats,
+            scales,
             np.ascontiguousarray(t["gaussians.opacities"]),
-            self._out[3],
+            dc,
             np.ascontiguousarray(t["gaussians.sh"]),
             self._face_of,
-            self._rotations,
+            np.empty((sizes["F"], 3, 3), np.float32),
         )
         self._splatter = Splatter()
         self._eps2d = about.eps2d
@@ -141,8 +143,9 @@ class AvatarPlayer:
         displaced = None if cloth is None else self._over_all(cloth)
         self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         added = self._added(theta, expression, params.jaw_pose[0], frame, displaced)
-        self._world(self._posed, added, (*self._out, self._rotations), self.threads)
-        return self._splats
+        out = self._splats
+        self._world(self._posed, added, (out.means, out.quats, out.scales, out.dc, out.rotations), self.threads)
+        return out
 
     def draw(
         self, camera: Camera, *, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -162,7 +165,7 @@ class AvatarPlayer:
     def joints(
         self, params: BodyParams
     ) -> tuple[Float32[np.ndarray, "J 3 4"], Float32[np.ndarray, " P"] | None, Float32[np.ndarray, " E"]]:
-        """Return transforms of the joints, what drives pose correctives (None where there are none), and the expression."""
+        """Return transforms of the joints, what drives pose correctives (None: there are none), and the expression."""
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
         size, given = self.bundle.sizes["E"], params.expression.shape[1]

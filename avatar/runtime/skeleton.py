@@ -1,4 +1,4 @@
-"""The skeleton of a bundle as a body model, and its surface as a template: what takes parameters, and what clothes need."""
+"""The skeleton of a bundle as a body model, its surface as a template: what takes parameters, what clothes need."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ def _body(
     weights: np.ndarray,
 ) -> BodyModel:
     count = len(vertices)
-    hands = {
-        name: None if value is None else value.astype(np.float64)
-        for name in ("left_hand_components", "right_hand_components", "left_hand_mean", "right_hand_mean")
-        for value in [bundle.tensors.get(f"skeleton.{name}")]
-    }
+
+    def of_hands(name: str) -> np.ndarray | None:
+        value = bundle.tensors.get(f"skeleton.{name}")
+        return None if value is None else value.astype(np.float64)
+
     return BodyModel(
         name=bundle.about.name,
         v_template=vertices,
@@ -102,5 +102,8 @@ def _body(
         part_labels=np.zeros(count, np.int64),
         part_label_names=("body",),
         expression_names=bundle.about.expression_names,
-        **hands,
+        left_hand_components=of_hands("left_hand_components"),
+        right_hand_components=of_hands("right_hand_components"),
+        left_hand_mean=of_hands("left_hand_mean"),
+        right_hand_mean=of_hands("right_hand_mean"),
     )

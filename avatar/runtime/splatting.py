@@ -109,7 +109,7 @@ class Splatter:
             raise InputError(f"camera {camera.name!r}", expected="a pinhole", received="an orthographic one")
         check_size(camera.width, camera.height, "picture")
         count, size = len(splats.means), (camera.height, camera.width)
-        colors = splats.colors(np.float32(camera.position), threads=threads)
+        colors = splats.colors(camera.position.astype(np.float32), threads=threads)
         view = np.ascontiguousarray(camera.cam_from_world, dtype=np.float32)
         K, behind = np.ascontiguousarray(camera.K, dtype=np.float32), np.array(background, dtype=np.float32)
         gaussians = (splats.means, splats.quats, splats.scales, splats.opacities, colors)

@@ -1,4 +1,4 @@
-"""`smplxpp export RUN --solid OUT`: body and clothes as one closed surface, for a printer."""
+"""`smplxpp export RUN`: the student as a bundle for players (--out), or a closed surface for a printer (--solid)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import OptionalFloat, OptionalPath
+from pipelines.commands.export_bundle import check_bundle_path, export_bundle
+from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
 from pipelines.commands.templates import load_params_for, load_run_template
 from smplxpp.clean import SolidConfig, solid_of_parts
 from smplxpp.core.errors import InputError
@@ -29,11 +30,20 @@ class Export:
     """Options of `smplxpp export`."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` wrote."""
-    solid: Path
+    """Folder that `smplxpp build` (and for --out `smplxpp train`) wrote."""
+    out: OptionalPath = None
+    """Write the trained student there for players: NAME.avatar, one file that needs neither torch nor this run."""
+    solid: OptionalPath = None
     """Write body and clothes as one closed surface there: .stl or .3mf (z up, on the bed), .ply or .glb (y up)."""
     params: OptionalPath = None
-    """Body parameters of the pose, any layout that `smplxpp params convert` reads; the T-pose without them."""
+    """Body parameters, any layout that `smplxpp params convert` reads: of the solid's pose, the T-pose without them; or
+    the motion that the bundle has to play, the poses that training saw without them."""
+    name: OptionalText = None
+    """Name of the avatar in the bundle; by default that of the run's folder."""
+    licence: str = ""
+    """Licence of the avatar, as the bundle is to say it."""
+    exact: bool = False
+    """Keep every number of the bundle in float32, at about four times the size."""
     frame: int = 0
     """Row of the parameters."""
     height_mm: OptionalFloat = None
@@ -48,8 +58,39 @@ class Export:
     """Print what was written as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Make the solid, measure it, write it whole or not at all."""
-        check_solid_path(self.solid)
+        """Write the bundle or the solid, whole or not at all."""
+        if self.solid is not None and self.out is None:
+            return self._solid(self.solid)
+        if self.out is not None and self.solid is None:
+            return self._bundle(self.out)
+        raise InputError(
+            "options out and solid",
+            expected="one of them",
+            received="none" if self.out is None else "both",
+            remedy="`--out me.avatar` writes the student for players, `--solid me.stl` a body to print",
+        )
+
+    def _bundle(self, out: Path) -> dict[str, Any]:
+        check_bundle_path(out)
+        report = export_bundle(
+            self.run_folder,
+            out,
+            name=self.name,
+            licence=self.licence,
+            params=self.params,
+            exact=self.exact,
+        )
+        if not self.json:
+            console = Console()
+            console.print(f"{out}: {report['bytes']['total'] / 1e6:.2f} MB", markup=False, soft_wrap=True)
+            for piece, size in report["bytes"].items():
+                if piece != "total":
+                    console.print(f"  {piece:10} {size / 1e3:9.1f} kB", markup=False)
+        return report
+
+    def _solid(self, solid: Path) -> dict[str, Any]:
+        """Make the solid, measure it, write it."""
+        check_solid_path(solid)
         for name in ("thickness_mm", "height_mm", "gap_mm"):
             if getattr(self, name) is not None:
                 require_positive(f"option {name}", getattr(self, name))
@@ -63,9 +104,9 @@ class Export:
         gap = _GAP_MM * scale if self.gap_mm is None else self.gap_mm
         config = SolidConfig(thickness=self.thickness_mm / MM, gap=gap / MM)
         made = solid_of_parts(parts.pop(BODY_PART), parts, config=config)
-        volume = write_solid(self.solid, made.mesh, units=self.units)
+        volume = write_solid(solid, made.mesh, units=self.units)
         report = {
-            "out": str(self.solid),
+            "out": str(solid),
             "scale": scale,
             "thickness_mm": self.thickness_mm,
             **made.report.as_dict(),

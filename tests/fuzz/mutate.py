@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import pickle
@@ -280,7 +281,7 @@ def _safetensors(data: bytes, rng: Rng) -> bytes:
     names = [name for name in header if name != "__metadata__"]
     name = names[int(rng.integers(len(names)))]
     begin, end = header[name]["data_offsets"]
-    match int(rng.integers(6)):
+    match int(rng.integers(0 if "__metadata__" in header else 2, 6)):
         case 0 | 1:
             about = header["__metadata__"]
             key = list(about)[int(rng.integers(len(about)))]
@@ -306,6 +307,33 @@ def _safetensors(data: bytes, rng: Rng) -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
+def _avatar(data: bytes, rng: Rng) -> bytes:
+    """A bundle again, one of its pieces changed; mostly under digests that are right."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    name = list(entries)[int(rng.integers(len(entries)))]
+    match int(rng.integers(8)):
+        case 0:
+            del entries[name]
+        case 1:
+            entries[f"../{name}"] = entries.pop(name)
+        case 2:
+            entries["manifest.json"] = _json(entries["manifest.json"], rng)
+        case _:
+            entries[name] = _json(entries[name], rng) if name.endswith("json") else _safetensors(entries[name], rng)
+    manifest = json.loads(entries["manifest.json"])
+    if rng.random() < 0.9:
+        for entry in manifest["pieces"].values():
+            content = entries[entry["file"]]
+            entry |= {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        entries["manifest.json"] = json.dumps(manifest).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for entry, content in entries.items():
+            archive.writestr(entry, content)
+    return stream.getvalue()
+
+
 def _safetensors_header(data: bytes, rng: Rng) -> bytes:
     return _with_json_header(data, rng, 8, 8)
 
@@ -324,6 +352,7 @@ _BY_SUFFIX: dict[str, tuple[Callable[[bytes, Rng], bytes], ...]] = {
     "pkl": (_pkl, _pkl, _bytes),
     "glb": (_glb, _glb, _bytes),
     "safetensors": (_safetensors, _safetensors, _safetensors, _safetensors_header),
+    "avatar": (_avatar, _avatar, _avatar, _avatar, _bytes),
     "ply": (_ply, _text),
     **dict.fromkeys(("csv", "yml", "txt", "obj", "mtl", "off"), (_text,)),
 }

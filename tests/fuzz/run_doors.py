@@ -41,6 +41,7 @@ from tests.fuzz.examine import Door
 from tests.models.test_model_file import make
 from tests.pipelines.test_evaluation_gates import surfaces, view
 from tests.runs.stages import stage_of
+from tests.runtime.bundles import play_dressed, write_dressed
 
 _VERTICES, _JOINTS = 60, 24
 
@@ -141,6 +142,7 @@ def run_doors() -> list[Door]:
     groups = {"scan": {"vertices": np.zeros((3, 3)), "faces": np.array([[0, 1, 2]])}, "hair": {"label": np.arange(3)}}
     return [
         Door("body npz", lambda folder: _write_body(folder / "b.npz"), lambda folder: load_body(folder / "b.npz")),
+        Door("avatar bundle", write_dressed, lambda folder: play_dressed(folder / "me.avatar")),
         Door(
             "garments",
             lambda folder: save_garments(folder / "g.npz", [garment()]),
