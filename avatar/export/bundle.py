@@ -316,7 +316,7 @@ def _blend(
         else:
             steps = np.repeat([[config.position_step, config.color_step]], 3, axis=1) / usual[side][:, None]
             out |= blended(side, values, steps)
-        layers = [layer for layer in networks[side] if isinstance(layer, nn.Linear)]
+        layers = [layer for layer in networks[side].children() if isinstance(layer, nn.Linear)]
         first, hidden, last = layers[0], layers[1:-1], layers[-1]
         width = last.in_features
         floats = {

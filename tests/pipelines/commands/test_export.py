@@ -1,4 +1,4 @@
-"""`smplxpp export --solid`: what it writes, what it says, what it refuses."""
+"""`smplxpp export --solid` and `--out`: what it writes, what it says, what it refuses."""
 
 from __future__ import annotations
 
@@ -10,13 +10,18 @@ import numpy as np
 import pytest
 import trimesh
 
+from avatar.models.model_file import save_avatar
+from avatar.runtime import AvatarPlayer, load_bundle
 from pipelines.cli import main
-from pipelines.runs.layout import TEMPLATE
+from pipelines.runs.digests import sha256_file
+from pipelines.runs.layout import STUDENT, TEMPLATE
 from smplxpp.body import load_body
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.template.template import Template
+from tests.dolls.dancing import dance, write_dance_run
+from tests.runtime.bundles import student
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +87,33 @@ def test_it_takes_the_pose_and_names_what_is_wrong(run: Path, tmp_path: Path, ca
     assert not (tmp_path / "b.stl").exists()
     status, report = answer(capsys, tmp_path, "--solid", tmp_path / "b.stl")
     assert status == 2 and "finished template" in report["error"]["message"]
+
+
+def test_one_of_out_and_solid_is_asked_for(run: Path, tmp_path: Path, capsys):
+    for options in ((), ("--out", tmp_path / "a.avatar", "--solid", tmp_path / "a.stl")):
+        status, report = answer(capsys, run, *options)
+        assert status == 2 and report["error"]["subject"] == "options out and solid"
+    status, report = answer(capsys, run, "--out", tmp_path / "a.glb")
+    assert status == 2 and ".avatar" in report["error"]["expected"]
+    status, report = answer(capsys, run, "--out", tmp_path / "a.avatar")
+    assert status == 2 and "smplxpp train" in report["error"]["remedy"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_student_is_exported_with_a_motion(tmp_path: Path, capsys):
+    run = write_dance_run(tmp_path / "run")
+    (run / STUDENT).parent.mkdir()
+    save_avatar(run / STUDENT, student("whole"))
+    dance().save(tmp_path / "motion.npz")
+    status, report = answer(
+        capsys, run, "--out", tmp_path / "a.avatar", "--params", tmp_path / "motion.npz", "--licence", "CC0-1.0"
+    )
+    assert status == 0 and report["bytes"]["total"] == (tmp_path / "a.avatar").stat().st_size
+    bundle = load_bundle(tmp_path / "a.avatar")
+    assert (bundle.about.name, bundle.about.licence) == ("run", "CC0-1.0")
+    assert bundle.about.provenance["student"] == sha256_file(run / STUDENT)
+    assert len(AvatarPlayer(bundle, threads=1).motion) == report["frames"] == len(dance())
+    status, report = answer(capsys, run, "--out", tmp_path / "b.avatar", "--exact", "--name", "Dancer")
+    assert status == 0 and report["frames"] == 4  # the poses that training saw
+    assert main(["export", str(run), "--out", str(tmp_path / "c.avatar")]) == 0
+    assert "blend" in capsys.readouterr().out
