@@ -7,7 +7,6 @@ photographs would give them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import igl
@@ -18,54 +17,16 @@ from jaxtyping import Bool, Float
 from avatar.data.sequence import AvatarSequence
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians, world_from_local
-from pipelines.synth.textures import band, mix
+from pipelines.synth.skirt_patterns import PATTERNS, around_and_along
 from smplxpp.capture import Capture
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster.zbuffer import rasterize_mesh
 from smplxpp.template.template import Template
 
-LIGHT, DARK = (222, 214, 196), (58, 40, 92)
 LAMP = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])
 AMBIENT = 0.6
 NEAR = 5e-3
 """Metres from the template's part within which vertices of the true surface are the part's."""
-
-Pattern = Callable[[Float[np.ndarray, "N 2"]], Float[np.ndarray, "N 3"]]
-
-
-def _plain(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    return mix(LIGHT, DARK, np.full(len(at), 0.5))
-
-
-def _stripes(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    return mix(LIGHT, DARK, band(at[:, 0], period=0.06, width=0.03))
-
-
-def _hoops(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    return mix(LIGHT, DARK, band(at[:, 1], period=0.06, width=0.03))
-
-
-def _dots(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Dots of 24 mm, every other row between those of the row before, 50 mm apart."""
-    row = np.round(at[:, 1] / 0.05)
-    along = at[:, 0] / 0.05 + 0.5 * (row % 2)
-    away = 0.05 * np.hypot(along - np.round(along), at[:, 1] / 0.05 - row)
-    return mix(DARK, LIGHT, np.clip((0.015 - away) / 0.006, 0.0, 1.0))
-
-
-def _plaid(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    across, along = (band(at[:, k], period=0.08, width=0.035) for k in (0, 1))
-    return mix(LIGHT, DARK, 0.5 * (across + along))
-
-
-PATTERNS: dict[str, Pattern] = {
-    "plain": _plain,
-    "stripes": _stripes,
-    "hoops": _hoops,
-    "dots": _dots,
-    "plaid": _plaid,
-}
-"""Colours, 0 to 255, at metres around and along the cloth. Stripes run along it, hoops around."""
 
 
 class RepaintedSequence(AvatarSequence):
@@ -74,7 +35,7 @@ class RepaintedSequence(AvatarSequence):
     Args:
         capture: with true surfaces whose vertices are the same points in all frames. template: of the person.
         posed: the template's vertices in the `frame` that it was built from, metres.
-        part: of the template. pattern: among `PATTERNS`.
+        part: of the template. pattern: among the synthetic skirt's.
     """
 
     def __init__(
@@ -85,8 +46,7 @@ class RepaintedSequence(AvatarSequence):
         assert truth is not None  # the benchmark measures against it, and has looked
         own = np.unique(template.faces[template.part_faces(part)])
         self._posed, self._part, self._pattern = posed, part, PATTERNS[pattern]
-        self._centre = centre = posed[own].mean(axis=0)
-        self._radius = float(np.hypot(*(posed[own] - centre)[:, [0, 2]].T).mean())
+        self._centre = posed[own].mean(axis=0)
         faces = template.part_faces(part)
         to_part, to_others = (
             igl.point_mesh_squared_distance(truth.vertices, posed, template.faces[of])[0] for of in (faces, ~faces)
@@ -135,6 +95,5 @@ class RepaintedSequence(AvatarSequence):
 
     def _colors(self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]) -> np.ndarray:
         """(N, 3) lit colours of points of the reference frame."""
-        x, y, z = (points - self._centre).T
         shade = AMBIENT + (1.0 - AMBIENT) * np.maximum(normals @ LAMP, 0.0)
-        return self._pattern(np.stack([self._radius * np.arctan2(x, z), y], axis=1)) * shade[:, None]
+        return self._pattern(around_and_along(points - self._centre)) * shade[:, None]

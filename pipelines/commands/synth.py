@@ -37,6 +37,8 @@ class Synth:
     """Width of body images in pixels, in eights; 4/5 of the height (talking: 3/5)."""
     clothes: OptionalText = None
     """What she wears below the shirt: skirt (loose) or trousers (tight); a skirt (talking: trousers)."""
+    skirt_pattern: OptionalText = None
+    """Of a skirt: plaid (if left out), stripes (down), hoops (around), dots or plain."""
     seed: int = 0
     """Seed of the motion, the cameras and all noise."""
     fps: float = 10.0
@@ -93,6 +95,8 @@ class Synth:
             require_at_least("--width", self.width, 8)
         clothes = kind.clothes if self.clothes is None else self.clothes
         require_choice("--clothes", clothes, CLOTHES)
+        if self.skirt_pattern is not None and clothes != "skirt":
+            raise InputError("--skirt-pattern", expected="clothes with a skirt", received=f"--clothes {clothes}")
         return SynthConfig(
             cameras=kind.cameras if self.cameras is None else self.cameras,
             frames=self.frames,
@@ -106,6 +110,7 @@ class Synth:
             scan_faces=self.scan_faces,
             motion=self.motion,
             clothes=clothes,
+            skirt_pattern=self.skirt_pattern or SynthConfig.skirt_pattern,
             aspect=kind.aspect if self.width is None else self.width / self.size,
             texel=kind.texel,
         )

@@ -24,13 +24,13 @@ relaxed A-pose, neutral face, cloth settled.
 `manifest.json` has the splits and the protocols `exact` and `tracked`, `checks.json` figures measured at its making.
 """
 _WORN = {
-    "skirt": "she wears a striped half-loose shirt and a loose skirt, both simulated",
+    "skirt": "she wears a striped half-loose shirt and a loose skirt (pattern: {pattern}), both simulated",
     "trousers": "she wears a striped half-loose shirt, simulated, over tight trousers that follow the skin",
 }
 
 
-def capture_readme(manifest: dict, *, motion: str, clothes: str, scan: bool) -> str:
-    """Return the README of a capture with the given manifest."""
+def capture_readme(manifest: dict, *, motion: str, clothes: str, pattern: str, scan: bool) -> str:
+    """Return the README of a capture with the given manifest; the pattern is a skirt's."""
     train, novel = manifest["train_frames"], manifest.get("novel_pose_frames")
     split = f"Frames {train[0]} to {train[1]} are for training"
     split += f", {novel[0]} to {novel[1]} are held out as new poses." if novel else ", none is held out."
@@ -41,7 +41,7 @@ def capture_readme(manifest: dict, *, motion: str, clothes: str, scan: bool) -> 
         fps=manifest["fps"],
         seed=manifest["seed"],
         cameras=len(manifest["images"]),
-        worn=_WORN[clothes],
+        worn=_WORN[clothes].format(pattern=pattern),
         split=split,
         normals=_every(next(iter(manifest["normals"].values()))),
         truth=_every(manifest["truth_frames"]),

@@ -22,6 +22,7 @@ from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
 from pipelines.synth.person_file import person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
+from pipelines.synth.skirt_patterns import PATTERNS
 from pipelines.synth.soft_light import LightConfig, vertex_light
 from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
 from pipelines.synth.tracker import tracker_noise
@@ -57,7 +58,7 @@ class SynthConfig:
         quality: of JPEG files.
         truth_step, normals_step: truth meshes and normal maps of every n-th frame.
         scan_faces: of the reference frame's scan; 0 makes none.
-        motion, clothes: what she does and wears, by name.
+        motion, clothes: what she does and wears, by name. skirt_pattern: of a skirt, among `PATTERNS`.
         texel: colours are painted once on cells of this side, metres (the head's are finer), instead of computed at
             every sample: several times as fast, 46 dB and more from the computed ones; 0: computed.
         simulation, light: see there; `simulation.fps` is replaced by `fps`.
@@ -79,6 +80,7 @@ class SynthConfig:
     scan_faces: int = 80_000
     motion: str = "turning"
     clothes: str = "skirt"
+    skirt_pattern: str = "plaid"
     aspect: float = 0.8
     texel: float = 0.0
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -95,6 +97,7 @@ class SynthConfig:
         require_at_least("texel", self.texel, 0.0)
         require_choice("--layout", self.layout, ("simple", "actorshq"))
         require_choice("--clothes", self.clothes, CLOTHES)
+        require_choice("--skirt-pattern", self.skirt_pattern, tuple(PATTERNS))
 
 
 def make_capture(
@@ -115,7 +118,7 @@ def make_capture(
         InputError: no person there.
     """
     layers = read_layers(topology_file, config.clothes)
-    person = person_of(layers, config.clothes)
+    person = replace(person_of(layers, config.clothes), skirt_pattern=config.skirt_pattern)
     motion = motion_kind(config.motion).make(
         betas=person.betas,
         expression_names=person.body.expression_names,
@@ -151,7 +154,13 @@ def make_capture(
                 progress("scan", 1.0)
             manifest = _manifest(out, rig, config)
             atomic_write_text(root / "manifest.json", json.dumps(manifest, indent=1) + "\n")
-            words = capture_readme(manifest, motion=config.motion, clothes=config.clothes, scan=config.scan_faces > 0)
+            words = capture_readme(
+                manifest,
+                motion=config.motion,
+                clothes=config.clothes,
+                pattern=config.skirt_pattern,
+                scan=config.scan_faces > 0,
+            )
             atomic_write_text(root / "README.md", words)
         _write_views(images, _lit_frames(person, take, hidden, config.light), painted, rig, config, progress)
         if config.layout == "simple":

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
+from pipelines.synth.skirt_patterns import skirt_colors
 from smplxpp.body import BodyModel
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -35,6 +36,7 @@ class Person:
         body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
         face: landmarks on the T-pose, for the colours.
         clothes: what the part "lower" is.
+        skirt_pattern: among `skirt_patterns.PATTERNS`.
     """
 
     tpose: TriangleMesh
@@ -46,6 +48,7 @@ class Person:
     body: BodyModel
     face: textures.FaceMarks
     clothes: str = "skirt"
+    skirt_pattern: str = "plaid"
 
     def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
@@ -73,7 +76,7 @@ class Person:
                 out[own] = textures.shirt_colors(points[own], joint["left_shoulder"])
             elif name == "lower":
                 if self.clothes == "skirt":
-                    out[own] = textures.skirt_colors(points[own], joint["pelvis"][2])
+                    out[own] = skirt_colors(points[own], joint["pelvis"][2], self.skirt_pattern)
                 else:
                     out[own] = textures.trouser_colors(points[own], joint["left_hip"], joint["left_ankle"])
             elif name == "shoes":

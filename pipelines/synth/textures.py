@@ -16,7 +16,6 @@ HAIR, HAIR_LIGHT = (62, 38, 24), (112, 72, 44)
 SHOE, SOLE = (124, 74, 46), (232, 226, 214)
 SHIRT, STRIPE = (240, 236, 226), (44, 62, 110)
 DENIM, WORN, SEAM = (52, 74, 108), (104, 128, 158), (198, 148, 88)
-PLAID = ((150, 34, 44), (28, 60, 66), (236, 204, 120))
 
 Color = tuple[int, int, int]
 
@@ -40,22 +39,7 @@ def shirt_colors(points: Float[np.ndarray, "N 3"], shoulder: Float[np.ndarray, "
     on_sleeve = (np.abs(x) > start) & (y > shoulder[1] - 0.13)
     along = np.where(on_sleeve, np.abs(x) - start, y)
     colors = mix(SHIRT, STRIPE, band(along, period=0.048, width=0.02))
-    return colors * (1.0 + 0.045 * _weave(points, seed=11))[:, None]
-
-
-def skirt_colors(points: Float[np.ndarray, "N 3"], centre_z: float) -> Float[np.ndarray, "N 3"]:
-    """Paint a plaid: broad dark bands and thin light lines, around and along."""
-    x, y, z = points.T
-    around = np.arctan2(x, z - centre_z) * 0.21  # about metres on the skirt
-    period = 2 * np.pi * 0.21 / 12
-    dark = 0.5 * (band(around, period=period, width=0.044) + band(y, period=0.11, width=0.044))
-    colors = mix(PLAID[0], PLAID[1], dark)
-    line = np.maximum(
-        band(around + 0.5 * period, period=period, width=0.009), band(y + 0.055, period=0.11, width=0.009)
-    )
-    colors = colors + 0.8 * line[:, None] * (np.array(PLAID[2]) - colors)
-    # Wool: threads along and across, of uneven strength.
-    return colors * (1.0 + 0.09 * _weave(points, seed=12))[:, None]
+    return colors * (1.0 + 0.045 * weave(points, seed=11))[:, None]
 
 
 def trouser_colors(
@@ -75,7 +59,7 @@ def trouser_colors(
     side = ramp(np.abs(front + 0.01), 0.006, 0.003) * ramp(outside, 0.02, 0.035)
     knee = band(y - 0.5 * (hip[1] + ankle[1]), period=0.05, width=0.005) * ramp(np.abs(along - 0.5), 0.06, 0.04)
     colors = colors + (0.8 * np.maximum(side, knee))[:, None] * (np.array(SEAM) - colors)
-    return colors * (1.0 + 0.08 * _weave(points, seed=14))[:, None]
+    return colors * (1.0 + 0.08 * weave(points, seed=14))[:, None]
 
 
 def hair_colors(points: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:
@@ -167,7 +151,7 @@ def _off_curve(points: Float[np.ndarray, "N 2"], curve: Float[np.ndarray, "L 2"]
     return np.hypot(y - np.interp(x, curve[:, 0], curve[:, 1]), beside)
 
 
-def _weave(points: Float[np.ndarray, "N 3"], *, seed: int) -> Float[np.ndarray, " N"]:
+def weave(points: Float[np.ndarray, "N 3"], *, seed: int) -> Float[np.ndarray, " N"]:
     """Return noise of about unit size: threads along and across, uneven, so that no moire shows from afar."""
     along = smooth_noise(points, scale=(0.0006, 0.010, 0.0006), seed=seed)
     across = smooth_noise(points, scale=(0.010, 0.0006, 0.010), seed=seed + 1)
