@@ -3,7 +3,7 @@
     python -m benchmarks.training --run RUN --capture DIR
 
 reads what `smplxpp train` and `smplxpp evaluate` left in RUN, and takes a few steps of every stage again under a
-profiler. Times are of the process alone on the machine or they mean little.
+profiler. Times are of the process alone on the machine or they mean little: `--no-profile` where it is shared.
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ class TrainingBenchmark:
     """Folder of its capture."""
     preset: Literal["paper-small", "cpu", "demo"] = "cpu"
     """That it was trained with."""
+    profile: bool = True
+    """Take a few steps of every stage again, to see where their time goes."""
 
     def run(self) -> None:
         """Read, profile, print, store."""
@@ -70,16 +72,23 @@ class TrainingBenchmark:
             "stages": {name: stage_figures(self.run_folder / name) for name in STAGES},
             **evaluation_conditions(self.run_folder / "95_evaluate" / "metrics.json"),
             "evaluation": evaluation_figures(self.run_folder / "95_evaluate" / "metrics.json"),
-            "share_of_a_step": profiles(self.run_folder, self.capture, training_preset(self.preset)),
         }
+        preset = training_preset(self.preset)
+        if self.profile:
+            figures["share_of_a_step"] = profiles(self.run_folder, self.capture, preset)
         figures["minutes"] = round(sum(stage["seconds"] for stage in figures["stages"].values()) / 60.0, 2)
         print(json.dumps(figures, indent=1))
         protocol = figures["inputs"]["name"]
-        name = f"training_{open_capture(self.capture).name}_{self.preset}" + (
-            f"_{TRACKED}" if protocol == TRACKED else ""
+        share = figures["stages"]["90_compensate"]["iterations"] / preset.compensate.iterations
+        of_all = "" if share == 1 else f" --iterations-share {share:g}"
+        name = f"training_{open_capture(self.capture).name}_{self.preset}"
+        name += ("" if share == 1 else f"_times_{share:g}") + (f"_{TRACKED}" if protocol == TRACKED else "")
+        commands = (
+            f"smplxpp train --run RUN --capture DIR --preset {self.preset}{of_all}",
+            "smplxpp evaluate RUN --capture DIR",
+            f"python -m benchmarks.training --run RUN --capture DIR --preset {self.preset}",
         )
-        command = f"smplxpp train --run RUN --capture DIR --preset {self.preset}; smplxpp evaluate RUN --capture DIR; "
-        path = store_results(name, command + "python -m benchmarks.training --run RUN --capture DIR", figures)
+        path = store_results(name, "; ".join(commands) + ("" if self.profile else " --no-profile"), figures)
         print(f"stored {path.name}")
 
 
