@@ -1,0 +1,158 @@
+"""Headless Chromium, driven over the pipe of its own protocol (CDP): nothing but the standard library."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Chromium reads commands from descriptor 3 and writes to 4; this puts our pipes there.
+_SHIM = "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
+_SWIFTSHADER = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-unsafe-swiftshader")
+LIMIT = 900.0
+_ABOVE = 10
+
+
+def find_chromium() -> str | None:
+    """Return the program, or None where there is none."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+
+
+class Page:
+    """One page of a headless Chromium of its own; what its console says is kept.
+
+    Args:
+        folder: for the browser's profile. size: of the window, pixels.
+    """
+
+    def __init__(self, folder: Path, size: tuple[int, int] = (960, 640)) -> None:
+        program = find_chromium()
+        assert program is not None
+        self.errors: list[str] = []
+        self._next, self._buffer, self._replies = 0, b"", {}
+        to_read, self._to = os.pipe()
+        self._from, to_write = os.pipe()
+        ends = [fcntl.fcntl(end, fcntl.F_DUPFD, _ABOVE) for end in (to_read, to_write)]
+        for end in (to_read, to_write):
+            os.close(end)
+        self._browser = subprocess.Popen(
+            [
+                *(sys.executable, "-c", _SHIM, *map(str, ends), program),
+                *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--mute-audio"),
+                *("--remote-debugging-pipe", f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"),
+                *_SWIFTSHADER,
+                "about:blank",
+            ],
+            pass_fds=ends,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for end in ends:
+            os.close(end)
+        self._session: str | None = None
+        try:
+            target = self.send("Target.createTarget", url="about:blank")["targetId"]
+            self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+            for domain in ("Runtime", "Page", "Log"):
+                self.send(f"{domain}.enable")
+            self.resize(*size)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the browser: it goes when its pipe does."""
+        os.close(self._to)
+        os.close(self._from)
+        try:
+            self._browser.wait(30)
+        except subprocess.TimeoutExpired:
+            self._browser.kill()
+            self._browser.wait(LIMIT)
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page another size, CSS pixels."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 640
+        )
+
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """Ask for one thing and wait for the answer."""
+        self._next += 1
+        message: dict[str, Any] = {"id": self._next, "method": method, "params": params}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._to, json.dumps(message).encode() + b"\0")
+        answer = self._wait(self._next)
+        assert "error" not in answer, f"{method}: {answer['error']}"
+        return answer["result"]
+
+    def go(self, address: str) -> None:
+        """Open a page and wait until its player is there and has opened what it was given."""
+        self.send("Page.navigate", url=address)
+        self.evaluate(
+            "new Promise(done => { const look = () => window.smplxppPlayer || document.querySelector('.failed')"
+            " ? done() : setTimeout(look, 50); look(); }).then(() => window.smplxppPlayer?.ready)"
+        )
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of an expression, that of a promise when it is there."""
+        result = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in result, result["exceptionDetails"]
+        return result["result"].get("value")
+
+    def picture(self, view: dict[str, Any]) -> np.ndarray:
+        """Return what the player draws of a view, (H, W, 3) bytes."""
+        import base64
+
+        text = self.evaluate(f"window.smplxppPlayer.picture({json.dumps(view)})")
+        shape = (view["camera"]["height"], view["camera"]["width"], 4)
+        return np.frombuffer(base64.b64decode(text), np.uint8).reshape(shape)[..., :3]
+
+    def screenshot(self, path: Path) -> None:
+        """Write what the window shows as a PNG."""
+        import base64
+
+        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+
+    def _wait(self, number: int) -> dict[str, Any]:
+        end = time.monotonic() + LIMIT
+        while number not in self._replies:
+            left = end - time.monotonic()
+            assert left > 0, f"no answer in {LIMIT:g} s"
+            assert self._browser.poll() is None, "the browser ended"
+            if not select.select([self._from], [], [], min(left, 1.0))[0]:
+                continue
+            *messages, self._buffer = (self._buffer + os.read(self._from, 1 << 20)).split(b"\0")
+            for message in map(json.loads, messages):
+                if "id" in message:
+                    self._replies[message["id"]] = message
+                else:
+                    self._note(message)
+        return self._replies.pop(number)
+
+    def _note(self, event: dict[str, Any]) -> None:
+        """Keep what went wrong: uncaught errors, and errors and warnings of the console."""
+        method, params = event.get("method"), event.get("params", {})
+        if method == "Runtime.exceptionThrown":
+            self.errors.append(str(params["exceptionDetails"].get("exception", params["exceptionDetails"])))
+        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning", "assert"):
+            self.errors.append(str([argument.get("value") for argument in params["args"]]))
+        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.errors.append(params["entry"]["text"])

@@ -1,0 +1,26 @@
+// Builds the player into one file, its worker inside: pipelines/web/assets/player.js. With --tests: what the tests import.
+import { readFileSync } from "node:fs";
+import { fileURLToPath } from "node:url";
+import { build } from "esbuild";
+
+const here = (path) => fileURLToPath(new URL(path, import.meta.url));
+const shared = { bundle: true, minify: true, target: "es2022", legalComments: "none", charset: "ascii" };
+const asText = { loader: { ".css": "text" } };
+
+if (process.argv.includes("--tests")) {
+  await build({
+    entryPoints: [here("test/modules.ts")], outfile: here("build/modules.mjs"), bundle: true, format: "esm",
+    target: "es2022", platform: "neutral",
+  });
+} else {
+  const outfile = process.argv[2] ?? here("../pipelines/web/assets/player.js");
+  const worker = await build({
+    ...shared, entryPoints: [here("src/worker/worker.ts")], format: "iife", write: false,
+  });
+  const licence = "/* smplxpp player, Apache-2.0; sources in web/ of the project */";
+  await build({
+    ...shared, ...asText, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
+    define: { WORKER_SOURCE: JSON.stringify(worker.outputFiles[0].text) },
+  });
+  console.log(`${outfile}: ${readFileSync(outfile).length} bytes`);
+}

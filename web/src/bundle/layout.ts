@@ -1,0 +1,138 @@
+/** What a bundle holds, tensor by tensor (`avatar/runtime/layout.py`), and the check of a file against it. */
+
+import { BundleError, EXPORT_AGAIN } from "./errors.ts";
+import type { Tensor } from "./tensors.ts";
+
+const NETWORK = {
+  "of_point.weight": "f W X", "of_frame.weight": "f W Y", "of_frame.bias": "f W",
+  "hidden.weight": "f H W W", "hidden.bias": "f H W", "last.weight": "f 3 W", "last.bias": "f 3",
+};
+const shapes = (side: string) =>
+  prefixed(side, {
+    rows: `i? ${side}m <N`, values: `q ${side}n 6 ${side}m`, step: `f? ${side}n 6`, exponent: `i? ${side}m`,
+    "first.weight": `f ${side}w ${side}i`, "first.bias": `f ${side}w`,
+    "hidden.weight": `f ${side}h ${side}w ${side}w`, "hidden.bias": `f ${side}h ${side}w`,
+    "last.weight": `f ${side}o ${side}w`, "last.bias": `f ${side}o`,
+  });
+
+/**
+ * Piece, tensor: kind, shape, bound. Kinds: f floats, or integers with a step and a start; i integers; q integers with
+ * steps that stay so, or floats. Letters are sizes, the same in all pieces; `<J` bounds indices; ?: may be missing.
+ */
+const PIECES: Record<string, Record<string, string>> = {
+  skeleton: {
+    parents: "i J", joints: "f J 3", expression: "f J 3 E", left_hand_mean: "f? 45", right_hand_mean: "f? 45",
+    left_hand_components: "f? l 45", right_hand_components: "f? r 45",
+  },
+  surface: {
+    vertices: "f V 3", faces: "i F 3 <V", parts: "i V", labels: "i V", colors: "i V 3", joint_indices: "i V k <J",
+    joint_weights: "f V k", expression_rows: "i R <V", expression: "f R 3 E", pose_rows: "i? Q <V", pose: "f? Q 3 P",
+  },
+  gaussians: {
+    per_face: "i F", barycentric: "f N 2", offset: "f N 3", log_scales: "f N 2", quats: "f N 4", opacities: "f N",
+    dc: "f N 3", sh: "f N K 3",
+  },
+  field: {
+    points: "f C 3", neighbours: "i V n <C", weights: "f V n", cloth: "i c <C", sets: "i S 21", member: "i C <S",
+    codes: "f T Z", ...prefixed("body", NETWORK), ...prefixed("cloth", NETWORK),
+  },
+  blend: { ...shapes("head"), ...shapes("body"), part: "i? N" },
+  poses: { known: "f D 63", scale: "f" },
+};
+const NEEDED = ["skeleton", "surface", "gaussians"];
+
+function prefixed(side: string, specs: Record<string, string>): Record<string, string> {
+  return Object.fromEntries(Object.entries(specs).map(([name, spec]) => [`${side}.${name}`, spec]));
+}
+
+/** The tensors of a bundle, checked; by "piece.name". */
+export class Tensors {
+  /** Sizes by letter. */
+  readonly sizes: Record<string, number> = {};
+  private readonly all = new Map<string, Tensor>();
+
+  constructor(pieces: Map<string, Map<string, Tensor>>) {
+    for (const [piece, specs] of Object.entries(PIECES)) {
+      const tensors = pieces.get(piece);
+      if (!tensors) {
+        if (NEEDED.includes(piece)) throw new BundleError("the avatar", `a piece ${piece}`, "none", EXPORT_AGAIN);
+        continue;
+      }
+      for (const [name, spec] of Object.entries(specs)) this.take(`${piece}.${name}`, name, spec, tensors);
+    }
+    this.checkBounds();
+  }
+
+  has(name: string): boolean {
+    return this.all.has(name);
+  }
+
+  /** A tensor of floats. */
+  floats(name: string): Float32Array {
+    return this.all.get(name)!.values as Float32Array;
+  }
+
+  /** A tensor of integers. */
+  ints(name: string): Int32Array {
+    return this.all.get(name)!.values as Int32Array;
+  }
+
+  /** The values of blend shapes, as they are stored. */
+  steps(name: string): Float32Array | Int8Array {
+    return this.all.get(name)!.values as Float32Array | Int8Array;
+  }
+
+  private take(full: string, name: string, spec: string, tensors: Map<string, Tensor>): void {
+    const [kind, ...letters] = spec.split(" ");
+    const found = tensors.get(name);
+    if (!found) {
+      if (!kind.endsWith("?")) throw new BundleError(full, "a tensor", "none", EXPORT_AGAIN);
+      return;
+    }
+    const dimensions = letters.filter((letter) => !letter.startsWith("<"));
+    const fits = dimensions.length === found.shape.length && dimensions.every((letter, axis) => {
+      const known = /^\d/.test(letter) ? Number(letter) : (this.sizes[letter] ??= found.shape[axis]);
+      return known === found.shape[axis];
+    });
+    const floating = found.dtype.startsWith("F");
+    const numbers = kind.startsWith("i") ? !floating : floating || kind === "q" || tensors.has(`${name}.step`);
+    if (!fits || !numbers) {
+      throw new BundleError(full, `${kind[0] === "i" ? "integers" : "numbers"} of shape (${dimensions.join(", ")})`,
+        `${found.dtype} of shape (${found.shape.join(", ")})`, EXPORT_AGAIN);
+    }
+    let values = found.values;
+    if (kind.startsWith("i")) values = values instanceof Int32Array ? values : Int32Array.from(values);
+    else if (!(kind === "q" && values instanceof Int8Array)) values = decoded(full, found, tensors, name);
+    this.all.set(full, { ...found, values });
+  }
+
+  private checkBounds(): void {
+    for (const [piece, specs] of Object.entries(PIECES)) {
+      for (const [name, spec] of Object.entries(specs)) {
+        const bound = spec.split("<")[1], full = `${piece}.${name}`;
+        if (!bound || !this.has(full)) continue;
+        const most = this.sizes[bound];
+        if (this.ints(full).some((index) => index < 0 || index >= most)) {
+          throw new BundleError(full, `indices below ${most}`, "others", EXPORT_AGAIN);
+        }
+      }
+    }
+  }
+}
+
+/** `start + step q`, steps for the last axes; plain floats as they are. */
+function decoded(full: string, tensor: Tensor, tensors: Map<string, Tensor>, name: string): Float32Array {
+  const out = Float32Array.from(tensor.values);
+  for (const word of ["step", "start"] as const) {
+    const other = tensors.get(`${name}.${word}`)?.values;
+    if (!other) continue;
+    if (!other.length || out.length % other.length) {
+      throw new BundleError(`${full}.${word}`, `numbers for the last axes`, `${other.length}`, EXPORT_AGAIN);
+    }
+    for (let i = 0, k = 0; i < out.length; ++i, k = k + 1 === other.length ? 0 : k + 1) {
+      out[i] = word === "step" ? out[i] * other[k] : out[i] + other[k];
+    }
+  }
+  if (!out.every(Number.isFinite)) throw new BundleError(full, "finite numbers", "NaN or infinity", EXPORT_AGAIN);
+  return out;
+}

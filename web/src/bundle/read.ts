@@ -1,0 +1,229 @@
+/** A bundle, `NAME.avatar`, to an avatar that can be posed. */
+
+import type { Avatar, BlendShapes, BlendSide, Field, FieldNetwork, Gaussians, Layer } from "../avatar/avatar.ts";
+import { encodedPoints } from "../avatar/networks.ts";
+import { BundleError, EXPORT_AGAIN } from "./errors.ts";
+import { Tensors } from "./layout.ts";
+import { readMotion } from "./motion.ts";
+import { sha256 } from "./sha256.ts";
+import { unpackTensors, type Tensor } from "./tensors.ts";
+import { unzip } from "./zip.ts";
+
+const FORMAT = "smplxpp-avatar", VERSION = 1;
+/** Scale of every Gaussian along its normal, in mean edge lengths of its triangle. */
+const THICKNESS = 0.01;
+
+interface Manifest {
+  format?: string;
+  version?: number;
+  model?: {
+    name?: string;
+    licence?: string;
+    provenance?: Record<string, string>;
+    joint_names?: string[];
+    expression_names?: string[];
+    part_names?: string[];
+    null_code_shown?: boolean;
+    jaw?: boolean;
+    eps2d?: number;
+  };
+  pieces?: Record<string, { file?: string; bytes?: number; sha256?: string }>;
+}
+
+/**
+ * Reads a bundle, every piece held against its size and digest, every tensor against the layout.
+ *
+ * @throws BundleError a damaged, changed or foreign file, or one of a newer version.
+ */
+export async function readBundle(data: Uint8Array<ArrayBuffer>): Promise<Avatar> {
+  const pieces = await unzip(data);
+  const manifest = parsed(pieces.get("manifest.json"));
+  if (manifest.version! > VERSION) {
+    throw new BundleError("the avatar", `version ${VERSION} or older`, `version ${manifest.version}`,
+      "open it with the player of the smplxpp that wrote it");
+  }
+  const tensors = new Map<string, Map<string, Tensor>>();
+  for (const [name, { file = "", bytes, sha256: digest }] of Object.entries(manifest.pieces ?? {})) {
+    const content = pieces.get(file);
+    if (!content) throw new BundleError("the avatar", `a piece ${file}`, "none", EXPORT_AGAIN);
+    if (content.length !== bytes || (await sha256(content)) !== digest) {
+      throw new BundleError(`piece ${name}`, "the bytes that the manifest's digest is of",
+        "others: the file is damaged or was changed", EXPORT_AGAIN);
+    }
+    // Cloth is simulated by the desktop's runtime alone.
+    if (name !== "garments") tensors.set(name, unpackTensors(content, `piece ${name}`));
+  }
+  return assembled(manifest, new Tensors(tensors), tensors.get("motion"), data.length);
+}
+
+function parsed(text: Uint8Array | undefined): Manifest {
+  let manifest: Manifest | undefined;
+  try {
+    manifest = text && (JSON.parse(new TextDecoder().decode(text)) as Manifest);
+  } catch {
+    // What is no JSON is no manifest.
+  }
+  if (manifest?.format !== FORMAT || !Number.isInteger(manifest.version)) {
+    throw new BundleError("the file", "an avatar that smplxpp export wrote", "another archive", EXPORT_AGAIN);
+  }
+  return manifest;
+}
+
+function assembled(
+  manifest: Manifest, t: Tensors, motion: Map<string, Tensor> | undefined, bytes: number,
+): Avatar {
+  const { J, E, V } = t.sizes, model = manifest.model ?? {};
+  const parents = t.ints("skeleton.parents");
+  const ordered = parents[0] === -1 && parents.every((parent, j) => j === 0 || (parent >= 0 && parent < j));
+  if (!ordered) throw new BundleError("skeleton.parents", "every parent before its children", "another order", EXPORT_AGAIN);
+  const names = (list: string[] | undefined, count: number, word: string) =>
+    list?.length === count ? list.map(String) : Array.from({ length: count }, (_, k) => `${word} ${k + 1}`);
+  const parts = t.ints("surface.parts"), partCount = parts.reduce((most, part) => Math.max(most, part), 0) + 1;
+  const faces = t.ints("surface.faces");
+  const avatar: Avatar = {
+    name: String(model.name ?? "avatar"),
+    licence: String(model.licence ?? ""),
+    provenance: model.provenance ?? {},
+    partNames: names(model.part_names?.slice(0, partCount), partCount, "part"),
+    expressionNames: names(model.expression_names, E, "expression"),
+    blur: Number(model.eps2d ?? 0.1),
+    skeleton: {
+      names: names(model.joint_names, J, "joint"),
+      parents,
+      rest: t.floats("skeleton.joints"),
+      byExpression: t.floats("skeleton.expression"),
+    },
+    mesh: {
+      vertices: t.floats("surface.vertices"),
+      faces,
+      joints: t.ints("surface.joint_indices"),
+      weights: t.floats("surface.joint_weights"),
+      influences: t.sizes.k,
+      parts,
+      expressions: { rows: t.ints("surface.expression_rows"), basis: t.floats("surface.expression"), size: E },
+      correctives: t.has("surface.pose") && t.has("surface.pose_rows") && t.sizes.P === 9 * (J - 1)
+        ? { rows: t.ints("surface.pose_rows"), basis: t.floats("surface.pose"), size: t.sizes.P }
+        : null,
+    },
+    field: t.has("field.points") ? field(t, Boolean(model.null_code_shown), V) : null,
+    blendShapes: t.has("blend.head.values") ? blendShapes(t, Boolean(model.jaw)) : null,
+    known: t.has("poses.known") ? { poses: t.floats("poses.known"), scale: t.floats("poses.scale")[0] } : null,
+    gaussians: gaussians(t, faces, parts),
+    motion: null,
+    bytes,
+  };
+  if (motion) avatar.motion = readMotion(motion, avatar, t);
+  return avatar;
+}
+
+function layer(t: Tensors, name: string, part = 0, of = 1): Layer {
+  const weight = t.floats(`${name}.weight`), bias = t.floats(`${name}.bias`);
+  const outputs = bias.length / of, inputs = weight.length / of / outputs;
+  return {
+    inputs, outputs,
+    weight: weight.subarray(part * inputs * outputs, (part + 1) * inputs * outputs),
+    bias: bias.subarray(part * outputs, (part + 1) * outputs),
+  };
+}
+
+function hidden(t: Tensors, name: string, count: number): Layer[] {
+  return Array.from({ length: count }, (_, k) => layer(t, name, k, count));
+}
+
+function field(t: Tensors, nullCodeShown: boolean, vertices: number): Field {
+  const { Z, H, W, n } = t.sizes, points = t.floats("field.points");
+  const network = (name: string): FieldNetwork => ({
+    ofPoint: encodedPoints(points, t.floats(`field.${name}.of_point.weight`), W),
+    ofFrame: layer(t, `field.${name}.of_frame`),
+    hidden: hidden(t, `field.${name}.hidden`, H),
+    last: layer(t, `field.${name}.last`),
+  });
+  const body = network("body");
+  if (body.ofFrame.inputs !== 63 + Z || vertices * n !== t.ints("field.neighbours").length) {
+    throw new BundleError("field", `${63 + Z} inputs`, `${body.ofFrame.inputs}`, EXPORT_AGAIN);
+  }
+  return {
+    body,
+    cloth: network("cloth"),
+    clothPoints: t.ints("field.cloth"),
+    // What training showed of poses without a frame: zero; else the first frame's code.
+    code: nullCodeShown ? new Float32Array(Z) : t.floats("field.codes").slice(0, Z),
+    sets: Float32Array.from(t.ints("field.sets")),
+    setOf: t.ints("field.member"),
+    neighbours: t.ints("field.neighbours"),
+    weights: t.floats("field.weights"),
+    neighbourCount: n,
+  };
+}
+
+function blendShapes(t: Tensors, jaw: boolean): BlendShapes {
+  const side = (name: string): BlendSide => {
+    const own = (tensor: string) => `blend.${name}.${tensor}`;
+    const shapes = t.sizes[`${name}n`], rows = t.has(own("rows")) ? t.ints(own("rows")) : null;
+    if (!rows && t.sizes[`${name}m`] !== t.sizes.N) {
+      throw new BundleError(own("values"), `${t.sizes.N} rows`, `${t.sizes[`${name}m`]}`, EXPORT_AGAIN);
+    }
+    return {
+      layers: [layer(t, own("first")), ...hidden(t, own("hidden"), t.sizes[`${name}h`]), layer(t, own("last"))],
+      shapes, rows,
+      values: t.steps(own("values")),
+      step: t.has(own("step")) ? t.floats(own("step")) : null,
+      exponent: t.has(own("exponent")) ? t.ints(own("exponent")) : null,
+    };
+  };
+  const part = t.has("blend.part") ? t.ints("blend.part") : null;
+  const [head, body] = [side("head"), side("body")];
+  const most = part ? part.reduce((largest, one) => Math.max(largest, one), 0) + 1 : 1;
+  for (const { layers, shapes } of [head, body]) {
+    if (layers.at(-1)!.outputs < most * shapes) {
+      throw new BundleError("blend", `${most} x ${shapes} coefficients`, `${layers.at(-1)!.outputs}`, EXPORT_AGAIN);
+    }
+  }
+  return { head, body, jaw, part };
+}
+
+function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians {
+  const { N, K, F } = t.sizes;
+  const perFace = t.ints("gaussians.per_face"), face = new Int32Array(N), part = new Uint8Array(N);
+  let filled = 0;
+  for (let f = 0; f < F; ++f) {
+    face.fill(f, filled, filled + perFace[f]);
+    part.fill(parts[faces[3 * f]], filled, filled + perFace[f]);
+    filled += perFace[f];
+  }
+  if (filled !== N || perFace.some((count) => count < 0)) {
+    throw new BundleError("gaussians.per_face", `counts of ${N}`, `${filled}`, EXPORT_AGAIN);
+  }
+  return {
+    count: N, face, part,
+    barycentric: t.floats("gaussians.barycentric"),
+    offset: t.floats("gaussians.offset"),
+    covariance: covariances(t.floats("gaussians.quats"), t.floats("gaussians.log_scales")),
+    opacity: t.floats("gaussians.opacities"),
+    color: t.floats("gaussians.dc"),
+    harmonics: t.floats("gaussians.sh"),
+    harmonicCount: K,
+  };
+}
+
+/** (N, 6) of `R diag(s^2) R^T` with `s = [THICKNESS, exp, exp]`, in squared edge lengths. */
+function covariances(quats: Float32Array, logScales: Float32Array): Float32Array {
+  const count = quats.length / 4, out = new Float32Array(6 * count);
+  for (let i = 0; i < count; ++i) {
+    const length = Math.hypot(...quats.subarray(4 * i, 4 * i + 4));
+    const [w, x, y, z] = quats.subarray(4 * i, 4 * i + 4).map((value) => value / length);
+    const rows = [
+      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ];
+    const squares = [THICKNESS ** 2, Math.exp(2 * logScales[2 * i]), Math.exp(2 * logScales[2 * i + 1])];
+    let to = 6 * i;
+    for (let r = 0; r < 3; ++r) {
+      for (let c = r; c < 3; ++c) {
+        out[to++] = squares.reduce((sum, square, k) => sum + square * rows[r][k] * rows[c][k], 0);
+      }
+    }
+  }
+  return out;
+}

@@ -1,0 +1,67 @@
+/** The page: finds a renderer and a bundle, and plays it. */
+
+import style from "./style.css";
+import { Player, type View } from "./player.ts";
+import { makeRenderer } from "./render/choose.ts";
+import { App } from "./ui/app.ts";
+import { element } from "./ui/elements.ts";
+
+/** Where a page has its bundle: in it, in base64, or beside it, named by an attribute. */
+const INLINED = "avatar-data", BESIDE = "data-avatar";
+
+declare global {
+  interface Window {
+    /** For scripts on the page and for tests: the player, and pictures of single views. */
+    smplxppPlayer?: { player: Player; ready: Promise<void>; picture(view: View): Promise<string>; open(data: ArrayBuffer): Promise<void> };
+  }
+}
+
+async function start(): Promise<void> {
+  document.head.append(element("style", {}, style));
+  const stage = element("canvas", { class: "stage" });
+  document.body.append(stage);
+  const wanted = new URLSearchParams(location.search).get("renderer");
+  const player = new Player(await makeRenderer(stage, wanted), stage);
+  const app = new App(player, stage);
+  const data = find();
+  const ready = data ? app.open(data) : Promise.resolve(app.invite());
+  window.smplxppPlayer = {
+    player, ready,
+    open: (bytes) => app.open(bytes),
+    picture: async (view) => base64(await player.picture(view)),
+  };
+}
+
+function find(): Promise<ArrayBuffer> | ArrayBuffer | null {
+  const inlined = document.getElementById(INLINED);
+  if (inlined) {
+    const bytes = bytesOf(inlined.textContent ?? "");
+    inlined.remove();
+    return bytes;
+  }
+  const named = new URLSearchParams(location.search).get("avatar") ?? document.body.getAttribute(BESIDE);
+  return named ? download(named) : null;
+}
+
+async function download(address: string): Promise<ArrayBuffer> {
+  const reply = await fetch(address);
+  if (!reply.ok) throw new Error(`${address}: the server says ${reply.status} ${reply.statusText}`);
+  return reply.arrayBuffer();
+}
+
+function bytesOf(text: string): ArrayBuffer {
+  const plain = atob(text.trim()), bytes = new Uint8Array(plain.length);
+  for (let i = 0; i < plain.length; ++i) bytes[i] = plain.charCodeAt(i);
+  return bytes.buffer;
+}
+
+function base64(bytes: Uint8Array): string {
+  let plain = "";
+  for (let i = 0; i < bytes.length; i += 32768) plain += String.fromCharCode(...bytes.subarray(i, i + 32768));
+  return btoa(plain);
+}
+
+start().catch((error: Error) => {
+  document.body.append(element("div", { class: "welcome" }, element("div", { class: "card failed" },
+    element("h2", {}, "This browser cannot show the avatar"), element("p", {}, error.message))));
+});

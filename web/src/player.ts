@@ -1,0 +1,196 @@
+/** The player without its controls: an avatar in a worker, a renderer, and what is to be shown. */
+
+import type { Pose } from "./avatar/avatar.ts";
+import { RECORD } from "./avatar/deform.ts";
+import { duration, poseAt, restPose, turned } from "./avatar/motion.ts";
+import { orbitCamera, type Camera, type Orbit } from "./render/camera.ts";
+import type { Renderer } from "./render/renderer.ts";
+import type { Reply, Request, Summary } from "./worker/protocol.ts";
+
+declare const WORKER_SOURCE: string;
+
+export const BACKGROUND: readonly [number, number, number] = [0.071, 0.078, 0.094];
+/** How many pictures the shown rates are means over. */
+const MEMORY = 20;
+
+/** Milliseconds by part, pictures a second. */
+export interface Rates {
+  fps: number;
+  deform: number;
+  sort: number;
+  draw: number | null;
+}
+
+/** What one picture shows. */
+export interface View {
+  /** Seconds of the motion. */
+  time: number;
+  camera: Camera;
+  background?: readonly [number, number, number];
+}
+
+type Frame = Extract<Reply, { kind: "frame" }>;
+
+export class Player {
+  summary: Summary | null = null;
+  playing = true;
+  /** Seconds into the motion. */
+  time = 0;
+  speed = 1;
+  orbit: Orbit = { target: [0, 0, 0], distance: 3, azimuth: 0, elevation: 0 };
+  readonly hidden = new Set<number>();
+  /** Joints turned by hand, and expressions set by hand. */
+  readonly turns = new Map<number, readonly [number, number, number]>();
+  readonly expressions = new Map<number, number>();
+  readonly rates: Rates = { fps: 0, deform: 0, sort: 0, draw: null };
+  /** Called after each picture. */
+  onpicture: () => void = () => {};
+  onerror: (message: string) => void = () => {};
+
+  private readonly worker: Worker;
+  private readonly spare: ArrayBuffer[] = [];
+  private answer: (reply: Reply) => void = () => {};
+  /** Settled when the worker has nothing to do. */
+  private queue: Promise<unknown> = Promise.resolve();
+  private asked = 0;
+  private ready: Frame | null = null;
+  private changed = true;
+  private still = false;
+  private before = 0;
+  private lastDrawn = 0;
+  private tick = 0;
+
+  constructor(readonly renderer: Renderer, private readonly canvas: HTMLCanvasElement) {
+    const url = URL.createObjectURL(new Blob([WORKER_SOURCE], { type: "text/javascript" }));
+    this.worker = new Worker(url);
+    this.worker.onmessage = (event: MessageEvent<Reply>) => this.answer(event.data);
+    this.worker.onerror = (event) => this.answer({ kind: "failed", message: `the player failed: ${event.message}` });
+  }
+
+  /** Opens a bundle. @throws Error what is wrong with it. */
+  async open(data: ArrayBuffer): Promise<Summary> {
+    const reply = await this.ask({ kind: "open", data }, [data]);
+    if (reply.kind !== "opened") throw new Error(reply.kind === "failed" ? reply.message : "no avatar");
+    this.summary = reply.summary;
+    this.time = 0;
+    this.hidden.clear();
+    this.turns.clear();
+    this.expressions.clear();
+    this.spare.length = 0;
+    this.resetView();
+    if (!this.tick) this.tick = requestAnimationFrame(this.step);
+    return reply.summary;
+  }
+
+  /** Puts the whole person into the picture, seen from before. */
+  resetView(): void {
+    if (!this.summary) return;
+    const { middle, reach } = this.summary;
+    const tall = Math.min(1, this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
+    this.orbit = { target: [...middle], distance: (3.7 * reach) / Math.max(0.6, Math.sqrt(tall)), azimuth: 0.35, elevation: 0.06 };
+    this.update();
+  }
+
+  /** Something that is shown has changed. */
+  update(): void {
+    this.changed = true;
+  }
+
+  /** Draws one view, whatever else is going on, and returns its (H, W, 4) bytes from the top. */
+  async picture(view: View): Promise<Uint8Array> {
+    this.still = true;
+    try {
+      await this.queue;
+      this.ready = null;
+      const reply = await this.ask(this.request(view), []);
+      if (reply.kind !== "frame") throw new Error(reply.kind === "failed" ? reply.message : "no picture");
+      this.show(reply, view.background);
+      return await this.renderer.pixels();
+    } finally {
+      this.still = false;
+      this.update();
+    }
+  }
+
+  /** The pose at a time, with what was set by hand. */
+  pose(time: number): Pose {
+    const { motion, jointNames, expressionNames } = this.summary!;
+    const pose = motion ? poseAt(motion, time) : restPose(jointNames.length, expressionNames.length);
+    for (const [k, value] of this.expressions) pose.expression[k] = value;
+    return this.turns.size ? turned(pose, this.turns) : pose;
+  }
+
+  get duration(): number {
+    return this.summary?.motion ? duration(this.summary.motion) : 0;
+  }
+
+  private readonly step = (now: number): void => {
+    this.tick = requestAnimationFrame(this.step);
+    const passed = Math.min(0.25, (now - this.before) / 1000);
+    this.before = now;
+    if (this.playing && this.duration > 0) {
+      this.time = (this.time + passed * this.speed) % this.duration;
+      this.changed = true;
+    }
+    if (this.still || this.renderer.lost) {
+      this.changed = true;
+      return;
+    }
+    const frame = this.ready;
+    this.ready = null;
+    // The worker goes on while the page draws.
+    if (!this.asked && this.changed) {
+      this.changed = false;
+      this.ask(this.request({ time: this.time, camera: this.camera() }), []).then((reply) => {
+        if (reply.kind === "frame") this.ready = reply;
+        else if (reply.kind === "failed") this.onerror(reply.message);
+      });
+    }
+    if (frame) this.show(frame);
+  };
+
+  /** The orbit's camera, which follows the person, for the pixels that the page has. */
+  camera(): Camera {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    const { motion } = this.summary!, target = [...this.orbit.target] as Orbit["target"];
+    if (motion) {
+      const now = poseAt(motion, this.time).translation;
+      for (const axis of [0, 2]) target[axis] += now[axis] - motion.translation[axis];
+    }
+    return orbitCamera({ ...this.orbit, target }, width, height);
+  }
+
+  private request({ time, camera }: View): Request {
+    return {
+      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted: !this.renderer.sorts,
+      records: this.spare.pop() ?? null,
+    };
+  }
+
+  private ask(request: Request, moved: Transferable[]): Promise<Reply> {
+    if (request.kind === "frame" && request.records) moved.push(request.records);
+    ++this.asked;
+    const reply = this.queue.then(() => new Promise<Reply>((resolve) => {
+      this.answer = resolve;
+      this.worker.postMessage(request, moved);
+    }));
+    this.queue = reply;
+    return reply.finally(() => --this.asked);
+  }
+
+  private show(frame: Frame, background = BACKGROUND): void {
+    const records = new Float32Array(frame.records);
+    const { camera, count } = frame;
+    this.renderer.draw({ records, count, camera, background, blur: this.summary!.blur });
+    if (records.length === RECORD * this.summary!.count && this.spare.length < 2) this.spare.push(frame.records);
+    const now = performance.now(), rates = this.rates;
+    const mean = (old: number, value: number) => (old ? old + (value - old) / MEMORY : value);
+    if (this.lastDrawn && now - this.lastDrawn < 2000) rates.fps = 1000 / mean(rates.fps && 1000 / rates.fps, now - this.lastDrawn);
+    this.lastDrawn = now;
+    rates.deform = mean(rates.deform, frame.deform);
+    rates.sort = mean(rates.sort, frame.sort);
+    rates.draw = this.renderer.milliseconds;
+    this.onpicture();
+  }
+}

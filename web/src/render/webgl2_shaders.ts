@@ -1,0 +1,79 @@
+/** Projection and blending as `docs/rendering.md` says, in GLSL. */
+
+/** One Gaussian an instance, four corners: the ellipse where alpha reaches 1/255, along its own axes. */
+export const SPLAT_VERTEX = `#version 300 es
+precision highp float;
+layout(location = 0) in vec4 place;
+layout(location = 1) in vec4 covariance0;
+layout(location = 2) in vec2 covariance1;
+layout(location = 3) in vec4 color;
+uniform mat3 rotation;
+uniform vec3 translation;
+uniform vec4 pinhole;
+uniform vec2 size;
+uniform float blur;
+out vec2 at;
+flat out vec4 paint;
+flat out float reach;
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  vec3 p = rotation * place.xyz + translation;
+  reach = log(255.0 * place.w);
+  if (!(p.z >= 0.01) || !(reach > 0.0)) return;
+  vec2 focal = pinhole.xy, middle = pinhole.zw;
+  vec2 center = focal * p.xy / p.z + middle;
+
+  // The derivative is taken inside the picture, widened by 15 % on every side.
+  vec2 low = (-0.15 * size - middle) / focal, high = (1.15 * size - middle) / focal;
+  vec2 slope = clamp(p.xy / p.z, low, high);
+  vec3 jx = vec3(focal.x / p.z, 0.0, -focal.x * slope.x / p.z) * rotation;
+  vec3 jy = vec3(0.0, focal.y / p.z, -focal.y * slope.y / p.z) * rotation;
+  mat3 v = mat3(covariance0.x, covariance0.y, covariance0.z, covariance0.y, covariance0.w, covariance1.x,
+    covariance0.z, covariance1.x, covariance1.y);
+  vec3 vx = v * jx, vy = v * jy;
+  float a = dot(jx, vx) + blur, b = dot(jx, vy), c = dot(jy, vy) + blur;
+
+  float mean = 0.5 * (a + c), spread = sqrt(0.25 * (a - c) * (a - c) + b * b);
+  float angle = 0.5 * atan(2.0 * b, a - c);
+  vec2 along = vec2(cos(angle), sin(angle));
+  vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
+  // Half axes where sigma = reach: sqrt(2 reach lambda).
+  float longer = sqrt(2.0 * reach * (mean + spread)), shorter = sqrt(2.0 * reach * max(mean - spread, 1e-9));
+  vec2 pixel = center + corner.x * longer * along + corner.y * shorter * vec2(-along.y, along.x);
+  at = corner;
+  paint = vec4(color.rgb, place.w);
+  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
+}`;
+
+/** Front to back: the target holds colour so far, and in alpha what still shines through. */
+export const SPLAT_FRAGMENT = `#version 300 es
+precision highp float;
+in vec2 at;
+flat in vec4 paint;
+flat in float reach;
+out vec4 result;
+
+void main() {
+  float square = dot(at, at);
+  if (square > 1.0) discard;
+  float alpha = min(0.999, paint.a * exp(-reach * square));
+  result = vec4(paint.rgb * alpha, alpha);
+}`;
+
+/** Two triangles over everything. */
+export const WHOLE_VERTEX = `#version 300 es
+void main() {
+  gl_Position = vec4(4.0 * float(gl_VertexID & 1) - 1.0, 4.0 * float(gl_VertexID >> 1) - 1.0, 0.0, 1.0);
+}`;
+
+export const RESOLVE_FRAGMENT = `#version 300 es
+precision highp float;
+uniform sampler2D blended;
+uniform vec3 background;
+out vec4 result;
+
+void main() {
+  vec4 value = texelFetch(blended, ivec2(gl_FragCoord.xy), 0);
+  result = vec4(value.rgb + value.a * background, 1.0);
+}`;

@@ -1,0 +1,144 @@
+/** The page around the player. */
+
+import { BundleError } from "../bundle/errors.ts";
+import type { Player } from "../player.ts";
+import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
+import { listen } from "./gestures.ts";
+import { makePanel } from "./panel.ts";
+
+const SPEEDS = [1, 0.5, 0.25, 2];
+/** Milliseconds between changes of the numbers on the page. */
+const RATES_EVERY = 400;
+
+export class App {
+  private readonly title = element("header", { class: "title" });
+  private readonly rates = element("div", { class: "rates" });
+  private readonly welcome = element("div", { class: "welcome" });
+  private readonly playButton = iconButton("Pause", "play", ICONS.pause);
+  private readonly scrub = element("input", { type: "range", min: 0, max: 1, step: 0.001, "aria-label": "Time" });
+  private readonly clock = element("span", { class: "time" });
+  private readonly speed = element("button", { class: "speed", title: "Speed" }, "1×");
+  private readonly menu = iconButton("Settings", "menu", ICONS.settings);
+  private readonly bar: HTMLElement;
+  private panel: HTMLElement | null = null;
+  private lastRates = 0;
+
+  constructor(private readonly player: Player, stage: HTMLCanvasElement) {
+    this.bar = element("div", { class: "bar" }, this.playButton, this.scrub, this.clock, this.speed);
+    document.body.append(this.title, this.menu, this.rates, this.bar, this.welcome);
+    this.showControls(false);
+    listen(stage, player);
+    this.listenToControls();
+    this.listenToFiles();
+    new ResizeObserver(() => player.update()).observe(stage);
+    player.onpicture = () => this.refresh();
+    player.onerror = (message) => this.fail(message);
+  }
+
+  /** Opens a bundle's bytes and shows it; what is wrong with it is said on the page. */
+  async open(data: Promise<ArrayBuffer> | ArrayBuffer): Promise<void> {
+    this.say(element("div", { class: "spinner" }), element("h2", {}, "Opening the avatar"));
+    try {
+      const about = await this.player.open(await data);
+      this.welcome.replaceChildren();
+      document.title = about.name;
+      this.title.replaceChildren(element("h1", {}, about.name), element("p", {}, "SMPLX++ avatar"));
+      this.panel?.remove();
+      this.panel = makePanel(this.player);
+      this.title.after(this.panel);
+      setIcon(this.menu, ICONS.settings);
+      this.showControls(true);
+      this.bar.hidden = !this.player.duration;
+    } catch (error) {
+      this.fail(error instanceof BundleError || error instanceof Error ? error.message : String(error));
+    }
+  }
+
+  /** Says what went wrong, and offers another file. */
+  fail(message: string): void {
+    const card = this.say(element("h2", {}, "This avatar cannot be shown"), element("p", {}, message), this.chooser("Open another file"));
+    card.classList.add("failed");
+  }
+
+  /** Asks for a file. */
+  invite(): void {
+    this.say(element("h2", {}, "Open an avatar"), element("p", {}, "Drop a .avatar file here, or choose one."), this.chooser("Choose a file"));
+  }
+
+  private say(...content: Node[]): HTMLElement {
+    const card = element("div", { class: "card", role: "status" }, ...content);
+    this.welcome.replaceChildren(card);
+    return card;
+  }
+
+  private chooser(label: string): HTMLElement {
+    const input = element("input", { type: "file", accept: ".avatar,.zip", hidden: true });
+    input.addEventListener("change", () => input.files?.[0] && this.open(input.files[0].arrayBuffer()));
+    const button = element("button", { class: "button" }, label);
+    button.addEventListener("click", () => input.click());
+    return element("div", {}, button, input);
+  }
+
+  private showControls(shown: boolean): void {
+    for (const part of [this.bar, this.menu, this.rates]) part.hidden = !shown;
+  }
+
+  private listenToControls(): void {
+    const { player } = this;
+    const toggle = () => {
+      player.playing = !player.playing;
+      setIcon(this.playButton, player.playing ? ICONS.pause : ICONS.play);
+      this.playButton.title = player.playing ? "Pause" : "Play";
+    };
+    this.playButton.addEventListener("click", toggle);
+    window.addEventListener("keydown", (event) => {
+      if (event.key !== " " || event.target instanceof HTMLButtonElement || event.target instanceof HTMLInputElement) return;
+      event.preventDefault();
+      toggle();
+    });
+    this.scrub.addEventListener("input", () => {
+      player.time = Number(this.scrub.value) * player.duration;
+      player.update();
+    });
+    this.speed.addEventListener("click", () => {
+      player.speed = SPEEDS[(SPEEDS.indexOf(player.speed) + 1) % SPEEDS.length];
+      this.speed.textContent = `${player.speed}×`;
+    });
+    this.menu.addEventListener("click", () => {
+      if (!this.panel) return;
+      this.panel.hidden = !this.panel.hidden;
+      setIcon(this.menu, this.panel.hidden ? ICONS.settings : ICONS.close);
+    });
+  }
+
+  private listenToFiles(): void {
+    window.addEventListener("dragover", (event) => {
+      event.preventDefault();
+      document.body.classList.add("dropping");
+    });
+    window.addEventListener("dragleave", (event) => {
+      if (!event.relatedTarget) document.body.classList.remove("dropping");
+    });
+    window.addEventListener("drop", (event) => {
+      event.preventDefault();
+      document.body.classList.remove("dropping");
+      const file = event.dataTransfer?.files[0];
+      if (file) this.open(file.arrayBuffer());
+    });
+  }
+
+  private refresh(): void {
+    const { player } = this, whole = player.duration;
+    if (whole) {
+      this.scrub.value = String(player.time / whole);
+      paintShare(this.scrub);
+      this.clock.textContent = `${player.time.toFixed(1)} / ${whole.toFixed(1)} s`;
+    }
+    const now = performance.now();
+    if (now - this.lastRates < RATES_EVERY) return;
+    this.lastRates = now;
+    const { fps, deform, sort, draw } = player.rates;
+    const times = `pose ${deform.toFixed(1)}${player.renderer.sorts ? "" : `  sort ${sort.toFixed(1)}`}${draw === null ? "" : `  draw ${draw.toFixed(1)}`} ms`;
+    this.rates.replaceChildren(element("b", {}, `${fps.toFixed(0)} fps`), `  ·  ${times}  ·  ${player.renderer.name}  ·  ${(player.summary!.bytes / 1e6).toFixed(1)} MB`);
+  }
+}

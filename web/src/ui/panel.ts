@@ -1,0 +1,112 @@
+/** What can be set: parts, face, pose; and what the avatar is. */
+
+import type { Player } from "../player.ts";
+import { element, slider } from "./elements.ts";
+
+const TURN = { least: -90, most: 90, start: 0, step: 1 };
+const AXES = ["Bend", "Twist", "Tilt"];
+
+/** Makes the panel of the avatar that is open. */
+export function makePanel(player: Player): HTMLElement {
+  const about = player.summary!;
+  const pages: [string, HTMLElement][] = [];
+  if (about.partNames.length > 1) pages.push(["Parts", parts(player)]);
+  if (about.expressionNames.length) pages.push(["Face", face(player)]);
+  pages.push(["Pose", pose(player)], ["About", details(player)]);
+
+  const tabs = element("div", { class: "tabs", role: "tablist" });
+  const show = (chosen: number) => {
+    pages.forEach(([, page], k) => (page.hidden = k !== chosen));
+    [...tabs.children].forEach((tab, k) => tab.setAttribute("aria-selected", String(k === chosen)));
+  };
+  pages.forEach(([name], k) => {
+    const tab = element("button", { role: "tab" }, name);
+    tab.addEventListener("click", () => show(k));
+    tabs.append(tab);
+  });
+  const panel = element("section", { class: "panel", "aria-label": "Settings", hidden: true }, tabs, ...pages.map(([, page]) => page));
+  show(0);
+  return panel;
+}
+
+function page(...children: (Node | string)[]): HTMLElement {
+  return element("div", { class: "page", role: "tabpanel" }, ...children);
+}
+
+/** "left_up_arm" as people write it. */
+function readable(name: string): string {
+  const words = name.replaceAll("_", " ").replace(/([a-z])([A-Z])/g, "$1 $2").toLowerCase();
+  return words.charAt(0).toUpperCase() + words.slice(1);
+}
+
+function parts(player: Player): HTMLElement {
+  const rows = player.summary!.partNames.map((name, part) => {
+    const box = element("input", { type: "checkbox", checked: true });
+    box.addEventListener("change", () => {
+      if (box.checked) player.hidden.delete(part);
+      else player.hidden.add(part);
+      player.update();
+    });
+    return element("label", { class: "switch" }, readable(name), box);
+  });
+  return page(...rows);
+}
+
+function face(player: Player): HTMLElement {
+  const reset = element("button", { class: "button" }, "Back to the motion");
+  const rows = element("div");
+  const fill = () => rows.replaceChildren(...player.summary!.expressionNames.map((name, k) =>
+    slider(readable(name), { least: 0, most: 1, start: 0, step: 0.01 }, (value) => {
+      player.expressions.set(k, value);
+      player.update();
+    })));
+  reset.addEventListener("click", () => {
+    player.expressions.clear();
+    player.update();
+    fill();
+  });
+  fill();
+  return page(rows, reset);
+}
+
+function pose(player: Player): HTMLElement {
+  const names = player.summary!.jointNames;
+  const select = element("select", { "aria-label": "Joint" },
+    ...names.map((name, joint) => element("option", { value: joint }, readable(name))));
+  const rows = element("div");
+  const fill = () => {
+    const joint = Number(select.value);
+    const turn = [...(player.turns.get(joint) ?? [0, 0, 0])] as [number, number, number];
+    rows.replaceChildren(...AXES.map((axis, k) =>
+      slider(`${axis}, degrees`, { ...TURN, start: Math.round((turn[k] * 180) / Math.PI) }, (value) => {
+        turn[k] = (value * Math.PI) / 180;
+        if (turn.some((angle) => angle !== 0)) player.turns.set(joint, [...turn]);
+        else player.turns.delete(joint);
+        player.update();
+      })));
+  };
+  select.addEventListener("change", fill);
+  const shoulder = names.indexOf("left_shoulder");
+  if (shoulder >= 0) select.value = String(shoulder);
+  const reset = element("button", { class: "button" }, "Turn all joints back");
+  reset.addEventListener("click", () => {
+    player.turns.clear();
+    player.update();
+    fill();
+  });
+  fill();
+  return page(select, rows, reset);
+}
+
+function details(player: Player): HTMLElement {
+  const about = player.summary!, list = element("dl");
+  const say = (name: string, value: string) => list.append(element("dt", {}, name), element("dd", {}, value));
+  say("Name", about.name);
+  say("Gaussians", about.count.toLocaleString("en"));
+  say("File", `${(about.bytes / 1e6).toFixed(1)} MB`);
+  if (about.motion) say("Motion", `${about.motion.frames} frames, ${about.motion.framesPerSecond.toFixed(0)} a second`);
+  say("Renderer", player.renderer.name);
+  if (about.licence) say("Licence", about.licence);
+  for (const [name, value] of Object.entries(about.provenance)) say(readable(name), String(value));
+  return page(list);
+}

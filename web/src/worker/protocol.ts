@@ -1,0 +1,41 @@
+/** What page and worker tell each other. */
+
+import type { Motion, Pose } from "../avatar/avatar.ts";
+import type { Camera } from "../render/camera.ts";
+
+/** To the worker. */
+export type Request =
+  | { kind: "open"; data: ArrayBuffer }
+  | {
+      kind: "frame";
+      pose: Pose;
+      camera: Camera;
+      hidden: number[];
+      /** In the order of depth; else as they come, for a renderer that sorts. */
+      sorted: boolean;
+      /** Memory to fill, given back by the page. */
+      records: ArrayBuffer | null;
+    };
+
+/** What the page knows of an avatar; the worker keeps the rest. */
+export interface Summary {
+  name: string;
+  licence: string;
+  provenance: Record<string, string>;
+  partNames: string[];
+  expressionNames: string[];
+  jointNames: string[];
+  count: number;
+  bytes: number;
+  blur: number;
+  motion: Motion | null;
+  /** The middle and half the height of the first pose, metres. */
+  middle: [number, number, number];
+  reach: number;
+}
+
+/** From the worker. */
+export type Reply =
+  | { kind: "opened"; summary: Summary }
+  | { kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; deform: number; sort: number }
+  | { kind: "failed"; message: string };

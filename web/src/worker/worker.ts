@@ -1,0 +1,77 @@
+/** Poses, sorts and packs in a thread of its own. */
+
+import type { Avatar } from "../avatar/avatar.ts";
+import { Deformer, RECORD } from "../avatar/deform.ts";
+import { poseAt, restPose } from "../avatar/motion.ts";
+import { DepthSorter } from "../avatar/sort.ts";
+import { BundleError } from "../bundle/errors.ts";
+import { readBundle } from "../bundle/read.ts";
+import { eye, NEAR } from "../render/camera.ts";
+import type { Reply, Request, Summary } from "./protocol.ts";
+
+/** The thread, as TypeScript's library for pages does not know it. */
+const thread = self as unknown as {
+  onmessage: (event: MessageEvent<Request>) => void;
+  postMessage(message: Reply, moved: Transferable[]): void;
+};
+
+let deformer: Deformer | null = null;
+let sorter: DepthSorter | null = null;
+
+thread.onmessage = async (event) => {
+  try {
+    const [reply, moved] = event.data.kind === "open" ? await open(event.data.data) : frame(event.data);
+    thread.postMessage(reply, moved);
+  } catch (error) {
+    const message = error instanceof BundleError ? error.message : `the player failed: ${String(error)}`;
+    thread.postMessage({ kind: "failed", message }, []);
+  }
+};
+
+async function open(data: ArrayBuffer): Promise<[Reply, Transferable[]]> {
+  const avatar = await readBundle(new Uint8Array(data));
+  deformer = new Deformer(avatar);
+  sorter = new DepthSorter(avatar.gaussians.count);
+  return [{ kind: "opened", summary: summary(avatar, deformer) }, []];
+}
+
+function summary(avatar: Avatar, first: Deformer): Summary {
+  first.pose(avatar.motion ? poseAt(avatar.motion, 0) : restPose(avatar.skeleton.names.length, avatar.expressionNames.length));
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  first.centers.forEach((value, i) => {
+    low[i % 3] = Math.min(low[i % 3], value);
+    high[i % 3] = Math.max(high[i % 3], value);
+  });
+  return {
+    name: avatar.name,
+    licence: avatar.licence,
+    provenance: avatar.provenance,
+    partNames: avatar.partNames,
+    expressionNames: avatar.expressionNames,
+    jointNames: avatar.skeleton.names,
+    count: avatar.gaussians.count,
+    bytes: avatar.bytes,
+    blur: avatar.blur,
+    motion: avatar.motion,
+    middle: low.map((value, k) => (value + high[k]) / 2) as Summary["middle"],
+    reach: (high[1] - low[1]) / 2,
+  };
+}
+
+function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferable[]] {
+  if (!deformer || !sorter) throw new Error("no avatar is open");
+  const { camera } = request, { gaussians } = deformer.avatar;
+  const started = performance.now();
+  deformer.pose(request.pose);
+  const posed = performance.now();
+  const row = camera.view.slice(8, 12);
+  // Where the page sorts, this only leaves out what is hidden or behind the camera.
+  const order = sorter.sort(deformer.centers, row, NEAR, gaussians.part, new Set(request.hidden), request.sorted);
+  const sorted = performance.now();
+  const size = 4 * RECORD * gaussians.count;
+  const records = request.records?.byteLength === size ? request.records : new ArrayBuffer(size);
+  deformer.records(eye(camera), order, new Float32Array(records));
+  const packed = performance.now();
+  const deform = posed - started + (packed - sorted), sort = sorted - posed;
+  return [{ kind: "frame", records, count: order.length, camera, deform, sort }, [records]];
+}
