@@ -74,6 +74,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Export",
         "a trained student as one file for players, or a template as one closed, printable solid",
     ),
+    "web": (
+        "pipelines.commands.web",
+        "Web",
+        "a page that plays a trained student: a folder for any host, one file that opens from disk, a server",
+    ),
     "metrics": ("pipelines.commands.metrics", "Metrics", "distances between two meshes or two folders of frames"),
     "synth": ("pipelines.commands.synth", "Synth", "make a synthetic capture of a clothed person with moving cloth"),
     "capture check": (

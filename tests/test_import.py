@@ -51,6 +51,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"captures"},
         {"ablation"},
         {"viewer"},
+        {"web"},
         {"commands"},
         {"cli"},
     ),
@@ -61,6 +62,7 @@ NARROW = {
     "pipelines.synth": {"runs", "stages", "report"},
     "pipelines.captures": {"stages", "synth"},
     "pipelines.viewer": {"report", "synth", "captures", "ablation"},
+    "pipelines.web": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
 }
 
 

@@ -181,8 +181,8 @@ export class Player {
 
   private show(frame: Frame, background = BACKGROUND): void {
     const records = new Float32Array(frame.records);
-    const { camera, count } = frame;
-    this.renderer.draw({ records, count, camera, background, blur: this.summary!.blur });
+    const { camera, count, depths } = frame;
+    this.renderer.draw({ records, count, camera, background, depths, blur: this.summary!.blur });
     if (records.length === RECORD * this.summary!.count && this.spare.length < 2) this.spare.push(frame.records);
     const now = performance.now(), rates = this.rates;
     const mean = (old: number, value: number) => (old ? old + (value - old) / MEMORY : value);

@@ -4,6 +4,8 @@ const BINS = 65536;
 
 /** Sorts by depth in 16 bits, a counting sort; keeps its memory. */
 export class DepthSorter {
+  /** Least and largest depth of the last sort, metres. */
+  range: [number, number] = [0, 1];
   private readonly counts = new Uint32Array(BINS + 1);
   private readonly keys: Uint16Array;
   private readonly shown: Uint32Array;
@@ -38,6 +40,7 @@ export class DepthSorter {
       if (z < least) least = z;
       if (z > most) most = z;
     }
+    this.range = count ? [least, most] : [0, 1];
     if (!sorted) return shown.subarray(0, count);
     const scale = most > least ? (BINS - 1) / (most - least) : 0;
     counts.fill(0);

@@ -97,7 +97,7 @@ function assembled(
       vertices: t.floats("surface.vertices"),
       faces,
       joints: t.ints("surface.joint_indices"),
-      weights: t.floats("surface.joint_weights"),
+      weights: normalised(t.floats("surface.joint_weights"), t.sizes.k),
       influences: t.sizes.k,
       parts,
       expressions: { rows: t.ints("surface.expression_rows"), basis: t.floats("surface.expression"), size: E },
@@ -151,7 +151,7 @@ function field(t: Tensors, nullCodeShown: boolean, vertices: number): Field {
     sets: Float32Array.from(t.ints("field.sets")),
     setOf: t.ints("field.member"),
     neighbours: t.ints("field.neighbours"),
-    weights: t.floats("field.weights"),
+    weights: normalised(t.floats("field.weights"), n),
     neighbourCount: n,
   };
 }
@@ -204,6 +204,17 @@ function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians 
     harmonics: t.floats("gaussians.sh"),
     harmonicCount: K,
   };
+}
+
+/** Rows that sum to 1, as they do where they were not rounded. */
+function normalised(rows: Float32Array, width: number): Float32Array {
+  const out = new Float32Array(rows.length);
+  for (let at = 0; at < rows.length; at += width) {
+    let sum = 0;
+    for (let k = 0; k < width; ++k) sum += rows[at + k];
+    for (let k = 0; k < width; ++k) out[at + k] = rows[at + k] / Math.max(sum, 1e-12);
+  }
+  return out;
 }
 
 /** (N, 6) of `R diag(s^2) R^T` with `s = [THICKNESS, exp, exp]`, in squared edge lengths. */

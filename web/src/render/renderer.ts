@@ -11,6 +11,8 @@ export interface Picture {
   background: readonly [number, number, number];
   /** Pixels squared. */
   blur: number;
+  /** The least and the largest depth, metres. */
+  depths: readonly [number, number];
 }
 
 export interface Renderer {
@@ -26,6 +28,3 @@ export interface Renderer {
   close(): void;
 }
 
-/** Alpha below which a Gaussian is not drawn, and above which it is cut: the rules of `avatar.render`. */
-export const LEAST_ALPHA = 1 / 255;
-export const MOST_ALPHA = 0.999;

@@ -37,5 +37,5 @@ export interface Summary {
 /** From the worker. */
 export type Reply =
   | { kind: "opened"; summary: Summary }
-  | { kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; deform: number; sort: number }
+  | { kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; depths: [number, number]; deform: number; sort: number }
   | { kind: "failed"; message: string };

@@ -73,5 +73,5 @@ function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferab
   deformer.records(eye(camera), order, new Float32Array(records));
   const packed = performance.now();
   const deform = posed - started + (packed - sorted), sort = sorted - posed;
-  return [{ kind: "frame", records, count: order.length, camera, deform, sort }, [records]];
+  return [{ kind: "frame", records, count: order.length, camera, depths: sorter.range, deform, sort }, [records]];
 }

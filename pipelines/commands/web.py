@@ -1,0 +1,117 @@
+"""`smplxpp web`: a page that plays a trained student: a folder for any host, one file that opens from disk, a server."""
+
+from __future__ import annotations
+
+import tempfile
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from pipelines.commands.export_bundle import SUFFIX, export_bundle
+from pipelines.commands.options import OptionalPath, OptionalText
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.validation import require_between
+
+_LARGEST_PORT = 65535
+_MOST_BYTES = 1 << 30
+_PAGES = (".html", ".htm")
+
+
+@dataclass(frozen=True)
+class Web:
+    """Options of `smplxpp web`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
+    """Folder that `smplxpp train` wrote, or a file that `smplxpp export RUN --out NAME.avatar` wrote."""
+    out: OptionalPath = None
+    """Write a folder there that any static host serves."""
+    single_file: OptionalPath = None
+    """Write one HTML file there, with player and avatar in it, that opens from disk."""
+    serve: bool = False
+    """Serve the page to browsers on this machine until Ctrl-C."""
+    port: int = 8090
+    """Port to serve at; the next free one where it is taken."""
+    no_browser: bool = False
+    """Open no browser, print the address alone."""
+    params: OptionalPath = None
+    """Motion of a run's avatar, any layout that `smplxpp params convert` reads; the poses that training saw without it."""
+    name: OptionalText = None
+    """Name of a run's avatar; by default that of the run's folder."""
+    licence: str = ""
+    """Licence of a run's avatar, as the page is to say it."""
+    json: bool = False
+    """Print what was written as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Write what was asked for, each file whole or not at all; then serve."""
+        self._check()
+        bundle, name = self._bundle()
+        from pipelines.web.page import page_files, single_page, write_page_folder
+
+        console = Console(stderr=self.json)
+        written: dict[str, int] = {}
+        if self.out is not None:
+            written |= {str(path): path.stat().st_size for path in write_page_folder(self.out, bundle, name=name)}
+        if self.single_file is not None:
+            page = single_page(bundle, name=name)
+            atomic_write_bytes(self.single_file, page)
+            written[str(self.single_file)] = len(page)
+        for path, size in written.items():
+            console.print(f"{path}: {size / 1e6:.2f} MB", markup=False, soft_wrap=True)
+        if self.serve:
+            self._serve(page_files(bundle, name=name), console)
+        return {"written": written, "bundle_bytes": len(bundle)}
+
+    def _check(self) -> None:
+        require_between("option port", self.port, 1, _LARGEST_PORT)
+        if self.out is None and self.single_file is None and not self.serve:
+            raise InputError(
+                "options out, single-file and serve", expected="one of them at least", received="none",
+                remedy="`--single-file player.html` writes a page that opens from disk",
+            )
+        if self.out is not None and self.out.exists() and not self.out.is_dir():
+            raise InputError(f"output {self.out}", expected="a folder, or nothing yet", received="a file")
+        if self.single_file is not None and self.single_file.suffix.lower() not in _PAGES:
+            raise InputError(
+                f"output {self.single_file}",
+                expected="a name that ends with .html",
+                received=self.single_file.suffix or "no suffix",
+            )
+
+    def _bundle(self) -> tuple[bytes, str]:
+        """The bytes of the bundle, one that can be opened, and the avatar's name."""
+        from avatar.runtime import load_bundle
+
+        if self.source.is_dir():
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"me{SUFFIX}"
+                export_bundle(
+                    self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False
+                )
+                return read_bytes(path, subject="avatar"), self.name or self.source.resolve().name
+        given = [option for option in ("params", "name", "licence") if getattr(self, option)]
+        if given:
+            raise InputError(
+                f"option {given[0]}", expected="a run", received=f"{self.source}, which says it already",
+                remedy=f"give it to `smplxpp export RUN --out NAME{SUFFIX}`",
+            )
+        data = read_bytes(self.source, subject="avatar", most=_MOST_BYTES)
+        return data, load_bundle(self.source).about.name
+
+    def _serve(self, files: dict[str, bytes], console: Console) -> None:
+        from pipelines.web.server import PageServer
+
+        with PageServer(files, port=self.port) as server:
+            console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
+            if not self.no_browser:
+                webbrowser.open_new_tab(server.address)
+            try:
+                server.serve_forever()
+            except KeyboardInterrupt:
+                pass

@@ -1,0 +1,254 @@
+/** Gaussians by WebGPU: projected, sorted by radix and drawn on the GPU, in any order that they come. */
+
+import { RECORD } from "../avatar/deform.ts";
+import type { Picture, Renderer } from "./renderer.ts";
+import {
+  COUNT, DIGITS, DRAW, KEY_BITS, PASSES, PROJECT, RESOLVE, SCAN, SCATTER, SCENE_BYTES, TILE_KEYS,
+} from "./webgpu_shaders.ts";
+
+const BLENDED: GPUTextureFormat = "rgba16float", READ: GPUTextureFormat = "rgba8unorm";
+const SPLAT_BYTES = 32, PROJECT_THREADS = 64, ROW_ALIGNMENT = 256;
+
+/** What the number of Gaussians decides. */
+interface Buffers {
+  count: number;
+  records: GPUBuffer;
+  counts: GPUBuffer;
+  project: GPUBindGroup;
+  count_: GPUBindGroup[];
+  scan: GPUBindGroup;
+  scatter: GPUBindGroup[];
+  draw: GPUBindGroup;
+}
+
+interface Pipelines {
+  project: GPUComputePipeline;
+  count: GPUComputePipeline;
+  scan: GPUComputePipeline;
+  scatter: GPUComputePipeline;
+  draw: GPURenderPipeline;
+  resolve: GPURenderPipeline;
+  resolveToRead: GPURenderPipeline;
+}
+
+export class WebGPURenderer implements Renderer {
+  readonly name = "WebGPU";
+  readonly sorts = true;
+  lost = false;
+  milliseconds: number | null = null;
+  private closed = false;
+  private device!: GPUDevice;
+  private pipelines!: Pipelines;
+  private scene!: GPUBuffer;
+  private background!: GPUBuffer;
+  private shifts: GPUBuffer[] = [];
+  private buffers: Buffers | null = null;
+  private target: GPUTexture | null = null;
+
+  private constructor(private readonly canvas: HTMLCanvasElement, private readonly context: GPUCanvasContext) {}
+
+  /** Makes one; null where the browser has no WebGPU. */
+  static async make(canvas: HTMLCanvasElement): Promise<WebGPURenderer | null> {
+    const device = await freshDevice();
+    if (!device || !(await canShow(device))) return null;
+    // A canvas has one kind of context for ever: asked for once a device is there.
+    const context = canvas.getContext("webgpu");
+    if (!context) return null;
+    const renderer = new WebGPURenderer(canvas, context);
+    await renderer.start(device);
+    return renderer;
+  }
+
+  draw({ records, count, camera, background, blur, depths }: Picture): void {
+    if (this.lost) return;
+    const { device, pipelines } = this, { width, height, view } = camera;
+    this.fit(width, height);
+    const own = this.sized(records.length / RECORD), tiles = Math.max(1, Math.ceil(count / TILE_KEYS));
+    const scene = new ArrayBuffer(SCENE_BYTES);
+    new Float32Array(scene).set([...view, camera.fx, camera.fy, camera.cx, camera.cy, width, height, blur]);
+    new Uint32Array(scene)[19] = count;
+    new Float32Array(scene).set(depths, 20);
+    new Uint32Array(scene)[22] = tiles;
+    device.queue.writeBuffer(this.scene, 0, scene);
+    device.queue.writeBuffer(this.background, 0, new Float32Array([...background, 1]));
+    device.queue.writeBuffer(own.records, 0, records.buffer, records.byteOffset, 4 * RECORD * count);
+
+    const encoder = device.createCommandEncoder();
+    const compute = encoder.beginComputePass();
+    const run = (pipeline: GPUComputePipeline, group: GPUBindGroup, workgroups: number) => {
+      compute.setPipeline(pipeline);
+      compute.setBindGroup(0, group);
+      compute.dispatchWorkgroups(workgroups);
+    };
+    run(pipelines.project, own.project, Math.max(1, Math.ceil(count / PROJECT_THREADS)));
+    for (let pass = 0; pass < PASSES; ++pass) {
+      run(pipelines.count, own.count_[pass], tiles);
+      run(pipelines.scan, own.scan, 1);
+      run(pipelines.scatter, own.scatter[pass], tiles);
+    }
+    compute.end();
+    const blended = this.target!.createView();
+    const splats = encoder.beginRenderPass({
+      colorAttachments: [{ view: blended, loadOp: "clear", storeOp: "store", clearValue: [0, 0, 0, 1] }],
+    });
+    splats.setPipeline(pipelines.draw);
+    splats.setBindGroup(0, own.draw);
+    if (count) splats.draw(4, count);
+    splats.end();
+    this.resolve(encoder, pipelines.resolve, this.context.getCurrentTexture().createView());
+    const submitted = performance.now();
+    device.queue.submit([encoder.finish()]);
+    device.queue.onSubmittedWorkDone().then(() => (this.milliseconds = performance.now() - submitted));
+  }
+
+  async pixels(): Promise<Uint8Array> {
+    const { device, canvas: { width, height } } = this;
+    const row = Math.ceil((4 * width) / ROW_ALIGNMENT) * ROW_ALIGNMENT;
+    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC;
+    const texture = device.createTexture({ size: [width, height], format: READ, usage });
+    const buffer = device.createBuffer({ size: row * height, usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ });
+    const encoder = device.createCommandEncoder();
+    this.resolve(encoder, this.pipelines.resolveToRead, texture.createView());
+    encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow: row }, [width, height]);
+    device.queue.submit([encoder.finish()]);
+    await buffer.mapAsync(GPUMapMode.READ);
+    const padded = new Uint8Array(buffer.getMappedRange()), out = new Uint8Array(4 * width * height);
+    for (let y = 0; y < height; ++y) out.set(padded.subarray(y * row, y * row + 4 * width), 4 * y * width);
+    buffer.destroy();
+    texture.destroy();
+    return out;
+  }
+
+  close(): void {
+    this.closed = true;
+    this.device.destroy();
+  }
+
+  /** Loses the device, as a driver that restarts does: for tests. */
+  lose(): void {
+    this.device.destroy();
+  }
+
+  private resolve(encoder: GPUCommandEncoder, pipeline: GPURenderPipeline, view: GPUTextureView): void {
+    const pass = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });
+    pass.setPipeline(pipeline);
+    pass.setBindGroup(0, this.device.createBindGroup({
+      layout: pipeline.getBindGroupLayout(0),
+      entries: [
+        { binding: 0, resource: this.target!.createView() },
+        { binding: 1, resource: { buffer: this.background } },
+      ],
+    }));
+    pass.draw(3);
+    pass.end();
+  }
+
+  private async start(device: GPUDevice): Promise<void> {
+    this.device = device;
+    device.lost.then(() => this.recover());
+    const format = navigator.gpu.getPreferredCanvasFormat();
+    this.context.configure({ device, format, alphaMode: "opaque" });
+    const uniform = (size: number) => device.createBuffer({ size, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
+    this.scene = uniform(SCENE_BYTES);
+    this.background = uniform(16);
+    this.shifts = Array.from({ length: PASSES }, (_, pass) => {
+      const buffer = uniform(16);
+      device.queue.writeBuffer(buffer, 0, new Uint32Array([(pass * KEY_BITS) / PASSES]));
+      return buffer;
+    });
+    this.buffers = null;
+    this.target = null;
+    this.pipelines = await makePipelines(device, format);
+    this.lost = false;
+  }
+
+  /** A new device in the place of one that is lost, as long as there is one to be had. */
+  private async recover(): Promise<void> {
+    if (this.closed) return;
+    this.lost = true;
+    const device = await freshDevice();
+    if (device) await this.start(device);
+  }
+
+  private fit(width: number, height: number): void {
+    const { canvas } = this;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    if (this.target?.width === width && this.target.height === height) return;
+    this.target?.destroy();
+    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.TEXTURE_BINDING;
+    this.target = this.device.createTexture({ size: [width, height], format: BLENDED, usage });
+  }
+
+  /** Buffers for so many Gaussians. */
+  private sized(count: number): Buffers {
+    if (this.buffers?.count === count) return this.buffers;
+    const { device, pipelines, scene } = this;
+    const storage = (size: number) =>
+      device.createBuffer({ size: Math.max(size, 16), usage: GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_DST });
+    const records = storage(4 * RECORD * count), splats = storage(SPLAT_BYTES * count);
+    const keys = [storage(4 * count), storage(4 * count)], order = [storage(4 * count), storage(4 * count)];
+    const counts = storage(4 * DIGITS * Math.max(1, Math.ceil(count / TILE_KEYS)));
+    const group = (pipeline: GPUComputePipeline | GPURenderPipeline, ...buffers: GPUBuffer[]) =>
+      device.createBindGroup({
+        layout: pipeline.getBindGroupLayout(0),
+        entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })),
+      });
+    const passes = this.shifts.map((shift, pass) => ({ shift, from: pass % 2, to: 1 - (pass % 2) }));
+    // An even number of passes ends where it began.
+    this.buffers = {
+      count, records, counts,
+      project: group(pipelines.project, scene, records, splats, keys[0], order[0]),
+      count_: passes.map(({ shift, from }) => group(pipelines.count, scene, shift, keys[from], counts)),
+      scan: group(pipelines.scan, scene, counts),
+      scatter: passes.map(({ shift, from, to }) =>
+        group(pipelines.scatter, scene, shift, counts, keys[from], order[from], keys[to], order[to])),
+      draw: group(pipelines.draw, scene, splats, order[0]),
+    };
+    return this.buffers;
+  }
+}
+
+async function freshDevice(): Promise<GPUDevice | null> {
+  const adapter = await globalThis.navigator?.gpu?.requestAdapter({ powerPreference: "high-performance" });
+  return (await adapter?.requestDevice()) ?? null;
+}
+
+/** Some browsers compute and cannot show it: their device is lost at the first picture. Tried where nothing is lost. */
+async function canShow(device: GPUDevice): Promise<boolean> {
+  const context = document.createElement("canvas").getContext("webgpu");
+  if (!context) return false;
+  context.configure({ device, format: navigator.gpu.getPreferredCanvasFormat() });
+  const encoder = device.createCommandEncoder();
+  const view = context.getCurrentTexture().createView();
+  encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] }).end();
+  device.queue.submit([encoder.finish()]);
+  const shown = device.queue.onSubmittedWorkDone().then(() => true, () => false);
+  const lost = device.lost.then(() => false);
+  const result = await Promise.race([shown, lost]);
+  context.unconfigure();
+  return result;
+}
+
+async function makePipelines(device: GPUDevice, format: GPUTextureFormat): Promise<Pipelines> {
+  const compute = (code: string, entryPoint: string) =>
+    device.createComputePipelineAsync({ layout: "auto", compute: { module: device.createShaderModule({ code }), entryPoint } });
+  const render = (code: string, entries: [string, string], target: GPUColorTargetState, topology: GPUPrimitiveTopology) => {
+    const module = device.createShaderModule({ code });
+    return device.createRenderPipelineAsync({
+      layout: "auto", primitive: { topology },
+      vertex: { module, entryPoint: entries[0] },
+      fragment: { module, entryPoint: entries[1], targets: [target] },
+    });
+  };
+  const under: GPUBlendState = {
+    color: { srcFactor: "dst-alpha", dstFactor: "one", operation: "add" },
+    alpha: { srcFactor: "zero", dstFactor: "one-minus-src-alpha", operation: "add" },
+  };
+  const [project, count, scan, scatter, draw, resolve, resolveToRead] = await Promise.all([
+    compute(PROJECT, "project"), compute(COUNT, "count"), compute(SCAN, "scan"), compute(SCATTER, "scatter"),
+    render(DRAW, ["corner", "blend"], { format: BLENDED, blend: under }, "triangle-strip"),
+    render(RESOLVE, ["whole", "resolve"], { format }, "triangle-list"),
+    render(RESOLVE, ["whole", "resolve"], { format: READ }, "triangle-list"),
+  ]);
+  return { project, count, scan, scatter, draw, resolve, resolveToRead };
+}
