@@ -1,11 +1,21 @@
 // Builds the player into one file, its worker inside: pipelines/web/assets/player.js. With --tests: what the tests import.
-import { readFileSync } from "node:fs";
+import { createHash } from "node:crypto";
+import { readdirSync, readFileSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 
 const here = (path) => fileURLToPath(new URL(path, import.meta.url));
 const shared = { bundle: true, minify: true, target: "es2022", legalComments: "none", charset: "ascii" };
 const asText = { loader: { ".css": "text" } };
+
+/** Names and bytes of what the build reads, in one number: a test tells by it whether the built file is old. */
+function digestOfSources() {
+  const sha256 = (data) => createHash("sha256").update(data).digest("hex");
+  const entries = readdirSync(here("src"), { recursive: true, withFileTypes: true }).filter((entry) => entry.isFile());
+  const names = entries.map((entry) => `${entry.parentPath ?? entry.path}/${entry.name}`.slice(here(".").length));
+  const lines = [...names, "build.mjs", "package-lock.json"].sort().map((name) => `${name}\0${sha256(readFileSync(here(name)))}\n`);
+  return sha256(lines.join(""));
+}
 
 if (process.argv.includes("--tests")) {
   await build({
@@ -17,7 +27,7 @@ if (process.argv.includes("--tests")) {
   const worker = await build({
     ...shared, entryPoints: [here("src/worker/worker.ts")], format: "iife", write: false,
   });
-  const licence = "/* smplxpp player, Apache-2.0; sources in web/ of the project */";
+  const licence = `/* smplxpp player, Apache-2.0; web/ of the project has its sources ${digestOfSources()} */`;
   await build({
     ...shared, ...asText, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
     define: { WORKER_SOURCE: JSON.stringify(worker.outputFiles[0].text) },

@@ -42,6 +42,8 @@ export class Player {
   /** Joints turned by hand, and expressions set by hand. */
   readonly turns = new Map<number, readonly [number, number, number]>();
   readonly expressions = new Map<number, number>();
+  /** How many have been drawn. */
+  pictures = 0;
   readonly rates: Rates = { fps: 0, deform: 0, sort: 0, draw: null };
   /** Called after each picture. */
   onpicture: () => void = () => {};
@@ -191,6 +193,7 @@ export class Player {
     rates.deform = mean(rates.deform, frame.deform);
     rates.sort = mean(rates.sort, frame.sort);
     rates.draw = this.renderer.milliseconds;
+    ++this.pictures;
     this.onpicture();
   }
 }

@@ -25,6 +25,7 @@ export interface Renderer {
   pixels(): Promise<Uint8Array>;
   /** Milliseconds that the GPU took for a recent picture; null: not measured here. */
   readonly milliseconds: number | null;
-  close(): void;
+  /** Loses context or device, as a driver that restarts does: for tests. It comes back by itself. */
+  lose(): void;
 }
 

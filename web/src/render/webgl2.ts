@@ -101,8 +101,11 @@ export class WebGL2Renderer implements Renderer {
     return out;
   }
 
-  close(): void {
-    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  lose(): void {
+    const loser = this.gl.getExtension("WEBGL_lose_context");
+    this.lost = loser !== null;
+    loser?.loseContext();
+    setTimeout(() => loser?.restoreContext(), 100);
   }
 
   /** Asks for the time of this picture, if no older question is still open; says whether it did. */

@@ -36,7 +36,6 @@ export class WebGPURenderer implements Renderer {
   readonly sorts = true;
   lost = false;
   milliseconds: number | null = null;
-  private closed = false;
   private device!: GPUDevice;
   private pipelines!: Pipelines;
   private scene!: GPUBuffer;
@@ -119,13 +118,8 @@ export class WebGPURenderer implements Renderer {
     return out;
   }
 
-  close(): void {
-    this.closed = true;
-    this.device.destroy();
-  }
-
-  /** Loses the device, as a driver that restarts does: for tests. */
   lose(): void {
+    this.lost = true;
     this.device.destroy();
   }
 
@@ -164,7 +158,6 @@ export class WebGPURenderer implements Renderer {
 
   /** A new device in the place of one that is lost, as long as there is one to be had. */
   private async recover(): Promise<void> {
-    if (this.closed) return;
     this.lost = true;
     const device = await freshDevice();
     if (device) await this.start(device);
