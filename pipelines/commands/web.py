@@ -1,4 +1,4 @@
-"""`smplxpp web`: a page that plays a trained student: a folder for any host, one file that opens from disk, a server."""
+"""`smplxpp web`: a page that plays a trained student: a folder for any host, one file from disk, a server."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Web:
     no_browser: bool = False
     """Open no browser, print the address alone."""
     params: OptionalPath = None
-    """Motion of a run's avatar, any layout that `smplxpp params convert` reads; the poses that training saw without it."""
+    """Motion of a run's avatar, any layout that `smplxpp params convert` reads; without it what training saw."""
     name: OptionalText = None
     """Name of a run's avatar; by default that of the run's folder."""
     licence: str = ""
@@ -72,7 +72,9 @@ class Web:
         require_between("option port", self.port, 1, _LARGEST_PORT)
         if self.out is None and self.single_file is None and not self.serve:
             raise InputError(
-                "options out, single-file and serve", expected="one of them at least", received="none",
+                "options out, single-file and serve",
+                expected="one of them at least",
+                received="none",
                 remedy="`--single-file player.html` writes a page that opens from disk",
             )
         if self.out is not None and self.out.exists() and not self.out.is_dir():
@@ -91,14 +93,14 @@ class Web:
         if self.source.is_dir():
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"me{SUFFIX}"
-                export_bundle(
-                    self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False
-                )
+                export_bundle(self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False)
                 return read_bytes(path, subject="avatar"), self.name or self.source.resolve().name
         given = [option for option in ("params", "name", "licence") if getattr(self, option)]
         if given:
             raise InputError(
-                f"option {given[0]}", expected="a run", received=f"{self.source}, which says it already",
+                f"option {given[0]}",
+                expected="a run",
+                received=f"{self.source}, which says it already",
                 remedy=f"give it to `smplxpp export RUN --out NAME{SUFFIX}`",
             )
         data = read_bytes(self.source, subject="avatar", most=_MOST_BYTES)

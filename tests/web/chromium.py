@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 # Chromium reads commands from descriptor 3 and writes to 4; this puts our pipes there.
-_SHIM = "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
+_SHIM = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
+)
 # WebGPU computes without Vulkan, but cannot show what it drew.
 _SWIFTSHADER = (
     *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-unsafe-swiftshader"),

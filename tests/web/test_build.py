@@ -18,7 +18,11 @@ TOOLS = WEB / "node_modules" / ".bin"
 
 def digest_of_sources() -> str:
     """As `web/build.mjs` counts it: names and bytes of what the build reads."""
-    files = [*(path for path in (WEB / "src").rglob("*") if path.is_file()), WEB / "build.mjs", WEB / "package-lock.json"]
+    files = [
+        *(path for path in (WEB / "src").rglob("*") if path.is_file()),
+        WEB / "build.mjs",
+        WEB / "package-lock.json",
+    ]
     whole = hashlib.sha256()
     for name, path in sorted((path.relative_to(WEB).as_posix(), path) for path in files):
         whole.update(f"{name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())

@@ -46,7 +46,9 @@ def test_the_server_gives_the_page_and_the_bundle_and_isolates_them(server):
     assert head.content == b"" and head.headers["Content-Length"] == str(len(FILES["me.avatar"]))
 
 
-@pytest.mark.parametrize("path", ["/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/page.py", "/me.avatar/"])
+@pytest.mark.parametrize(
+    "path", ["/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/page.py", "/me.avatar/"]
+)
 def test_the_server_gives_nothing_else(server, path):
     assert get(server, path).status == 404
 

@@ -1,4 +1,4 @@
-"""The page in a real browser: it plays what Python plays, by WebGPU and by WebGL2, and says what is wrong with a file."""
+"""The page in a real browser: it plays what Python plays, by WebGPU and WebGL2, and says what is wrong with a file."""
 
 from __future__ import annotations
 

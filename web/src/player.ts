@@ -10,6 +10,10 @@ import type { Reply, Request, Summary } from "./worker/protocol.ts";
 declare const WORKER_SOURCE: string;
 
 export const BACKGROUND: readonly [number, number, number] = [0.071, 0.078, 0.094];
+/** CSS pixels at the bottom that the controls cover. */
+const COVERED = 64;
+/** Share of the picture's height that the person fills, and how wide she may reach, in her heights. */
+const FILLED = 0.78, ARMS = 0.62;
 /** How many pictures the shown rates are means over. */
 const MEMORY = 20;
 
@@ -87,9 +91,9 @@ export class Player {
   /** Puts the whole person into the picture, seen from before. */
   resetView(): void {
     if (!this.summary) return;
-    const { middle, reach } = this.summary;
-    const tall = Math.min(1, this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
-    this.orbit = { target: [...middle], distance: (3.7 * reach) / Math.max(0.6, Math.sqrt(tall)), azimuth: 0.35, elevation: 0.06 };
+    const { middle, reach } = this.summary, { width, height, fx } = this.camera();
+    const tall = (2 * reach * fx) / (FILLED * height), wide = (2 * ARMS * reach * fx) / width;
+    this.orbit = { target: [...middle], distance: Math.max(tall, wide), azimuth: 0.35, elevation: 0.06 };
     this.update();
   }
 
@@ -160,7 +164,8 @@ export class Player {
       const now = poseAt(motion, this.time).translation;
       for (const axis of [0, 2]) target[axis] += now[axis] - motion.translation[axis];
     }
-    return orbitCamera({ ...this.orbit, target }, width, height);
+    const camera = orbitCamera({ ...this.orbit, target }, width, height);
+    return { ...camera, cy: camera.cy - 0.5 * COVERED * ratio };
   }
 
   private request({ time, camera }: View): Request {

@@ -56,7 +56,14 @@ export class App {
 
   /** Says what went wrong, and offers another file. */
   fail(message: string): void {
-    const card = this.say(element("h2", {}, "This avatar cannot be shown"), element("p", {}, message), this.chooser("Open another file"));
+    const said = message.charAt(0).toUpperCase() + message.slice(1);
+    const buttons = this.chooser("Open another file");
+    if (this.player.summary) {
+      const back = element("button", { class: "button" }, "Back");
+      back.addEventListener("click", () => this.welcome.replaceChildren());
+      buttons.prepend(back);
+    }
+    const card = this.say(element("h2", {}, "This avatar cannot be shown"), element("p", {}, `${said}.`), buttons);
     card.classList.add("failed");
   }
 
@@ -138,7 +145,11 @@ export class App {
     if (now - this.lastRates < RATES_EVERY) return;
     this.lastRates = now;
     const { fps, deform, sort, draw } = player.rates;
-    const times = `pose ${deform.toFixed(1)}${player.renderer.sorts ? "" : `  sort ${sort.toFixed(1)}`}${draw === null ? "" : `  draw ${draw.toFixed(1)}`} ms`;
-    this.rates.replaceChildren(element("b", {}, `${fps.toFixed(0)} fps`), `  ·  ${times}  ·  ${player.renderer.name}  ·  ${(player.summary!.bytes / 1e6).toFixed(1)} MB`);
+    const parts = [`pose ${deform.toFixed(1)}`];
+    if (!player.renderer.sorts) parts.push(`sort ${sort.toFixed(1)}`);
+    if (draw !== null) parts.push(`draw ${draw.toFixed(1)}`);
+    const size = `${(player.summary!.bytes / 1e6).toFixed(1)} MB`;
+    this.rates.replaceChildren(element("b", {}, `${fps.toFixed(fps < 10 ? 1 : 0)} fps`),
+      ` · ${parts.join(" · ")} ms · ${player.renderer.name} · ${size}`);
   }
 }
