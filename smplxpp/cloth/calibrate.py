@@ -79,7 +79,7 @@ class Followed:
 
     Attributes:
         params: T frames, evenly spaced. fps: of them.
-        world: where the particles of a garment were found, metres; NaN rows are not looked at.
+        world: where the particles of a garment were found, metres; NaN rows are not looked at, and count for nothing.
     """
 
     params: BodyParams
@@ -108,23 +108,27 @@ def calibrate(
         The garment with the values, and what was found.
 
     Raises:
-        InputError: a surface of another number of particles or frames.
+        InputError: a surface of another number of particles or frames, or of no frame at all.
     """
     config = config or CalibrationConfig()
     expected = (len(followed.params), len(garment.particles), 3)
     if followed.world.shape != expected:
         raise InputError("followed surface", expected=f"shape {expected}", received=str(followed.world.shape))
+    followed_frames = np.isfinite(followed.world).all(axis=2).any(axis=1)
+    if not followed_frames.any():
+        raise InputError("followed surface", expected="particles in one frame at least", received="none")
     bodies = [template.posed_body(followed.params.frame(k)) for k in range(len(followed.params))]
     area = _particle_areas(garment) * (garment.depth > max(config.pin_depths))
     if not area.sum() > 0:
         area = _particle_areas(garment)
 
-    def errors(positions: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, " T"]:
-        apart = np.linalg.norm(np.stack(positions) - followed.world, axis=2)
+    def errors(positions: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, " L"]:
+        """Of the L frames in which the surface was followed."""
+        apart = np.linalg.norm((np.stack(positions) - followed.world)[followed_frames], axis=2)
         weight = area * np.isfinite(apart)
         return (np.minimum(np.nan_to_num(apart, nan=0.0), MOST) * weight).sum(1) / np.maximum(weight.sum(1), 1e-12)
 
-    def simulated(drag: float, pin: float) -> Float[np.ndarray, " T"]:
+    def simulated(drag: float, pin: float) -> Float[np.ndarray, " L"]:
         trial = with_values(garment, drag=drag, pin_depth=pin)
         player = ClothDriver(template, [trial], driver)
         positions = []
@@ -141,7 +145,7 @@ def calibrate(
         return garment, _found(garment, skinned, skinned, moves=False)
 
     pairs = list(product(config.drags, config.pin_depths))
-    table: dict[tuple[float, float], Float[np.ndarray, " T"]] = {}
+    table: dict[tuple[float, float], Float[np.ndarray, " L"]] = {}
     for done, pair in enumerate(pairs):
         progress(done, len(pairs) + 2)
         table[pair] = simulated(*pair)
@@ -152,7 +156,7 @@ def calibrate(
     best = min(table, key=lambda pair: table[pair].mean())
     if table[best].mean() > config.most_share * skinned.mean():
         return garment, _found(garment, skinned, table[best], moves=True)
-    blocks = np.array_split(np.arange(len(bodies)), config.blocks)
+    blocks = np.array_split(np.arange(int(followed_frames.sum())), config.blocks)
     best = _plainest(table, best, blocks, default=(garment.config.fabric.drag, garment.config.pin_depth))
     left_out = [_best_without(table, block) for block in blocks]
     spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
@@ -169,8 +173,8 @@ def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
 
 def _found(
     garment: Garment,
-    skinned: Float[np.ndarray, " T"],
-    simulated: Float[np.ndarray, " T"],
+    skinned: Float[np.ndarray, " L"],
+    simulated: Float[np.ndarray, " L"],
     *,
     moves: bool,
     spread: tuple[float, float] | None = None,
@@ -201,12 +205,12 @@ def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:
     return [float(np.sqrt(value * ordered[k])) for k in (at - 1, at + 1) if 0 <= k < len(ordered)]
 
 
-def _best_without(table: dict[tuple[float, float], Float[np.ndarray, " T"]], block: np.ndarray) -> tuple[float, float]:
+def _best_without(table: dict[tuple[float, float], Float[np.ndarray, " L"]], block: np.ndarray) -> tuple[float, float]:
     return min(table, key=lambda pair: np.delete(table[pair], block).mean())
 
 
 def _plainest(
-    table: dict[tuple[float, float], Float[np.ndarray, " T"]],
+    table: dict[tuple[float, float], Float[np.ndarray, " L"]],
     best: tuple[float, float],
     blocks: Sequence[np.ndarray],
     *,

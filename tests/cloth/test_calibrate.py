@@ -57,6 +57,16 @@ def test_frames_and_particles_that_were_not_followed_are_not_looked_at():
     assert (calibration.drag, calibration.pin_depth) == (8.0, 0.1)
 
 
+def test_a_garment_is_as_far_from_skinning_as_in_the_frames_that_were_followed():
+    truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
+    whole, every_fourth = (
+        calibrate(person(), garment(), Followed(swaying(), FPS, world), config=FEW, driver=QUICK)[1]
+        for world in (truth, np.where(np.arange(24)[:, None, None] % 4 == 0, truth, np.nan))
+    )
+    assert (whole.frames, every_fourth.frames) == (24, 6) and every_fourth.moves and every_fourth.fitted
+    assert every_fourth.skinned == pytest.approx(whole.skinned, rel=0.2)
+
+
 def test_a_surface_that_skinning_explains_is_left_to_it():
     found, calibration = calibrate(person(), garment(), Followed(swaying(), FPS, skinned()), config=FEW, driver=QUICK)
     assert not calibration.moves and not calibration.fitted and found is garment()
@@ -74,6 +84,8 @@ def test_surfaces_and_choices_that_cannot_be_are_refused():
     for world in (np.zeros((23, len(garment().particles), 3)), np.zeros((24, 5, 3))):
         with pytest.raises(InputError, match="followed surface"):
             calibrate(person(), garment(), Followed(swaying(), FPS, world), config=FEW)
+    with pytest.raises(InputError, match="in one frame at least"):
+        calibrate(person(), garment(), Followed(swaying(), FPS, np.full_like(skinned(), np.nan)), config=FEW)
     for name, value in (("drags", ()), ("pin_depths", (0.0,)), ("most_share", 1.5), ("blocks", 1)):
         with pytest.raises(InputError, match=name):
             CalibrationConfig(**{name: value})
