@@ -1,4 +1,4 @@
-"""`make demo`: the embedded person, from scan and photographs to a template, a trained student, a report and a film."""
+"""`make demo`: the embedded person, from scan and photographs to a template, a student, a report, a film and a page."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from pipelines.commands.animate import Animate
 from pipelines.commands.build import Build
 from pipelines.commands.evaluate import Evaluate
 from pipelines.commands.train import Train
+from pipelines.commands.web import Web
 from pipelines.runs.layout import REFINED_PARAMS
 from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.errors import InputError
 
 # Below what the small scan has, so that simplification has something to do.
 BUDGETS = {"upper": 8_000, "lower": 8_000}
+NAME, LICENCE = "The embedded person", "CC0-1.0"
 FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 
 
 @dataclass(frozen=True)
 class Demo:
     """Register the embedded person's body to what a tracker and a detector saw of it, build the template, refine the
-    poses on the photographs, train teacher and student, measure both, animate the template, say where the report lies.
+    poses on the photographs, train teacher and student, measure both, animate the template, write a page that plays
+    the student, say where they lie.
 
     Nothing exact goes in: its protocol is `tracked`. The truth is looked at in measuring alone.
     """
@@ -38,7 +41,7 @@ class Demo:
     """Capture to build; the embedded person by default."""
 
     def run(self) -> Path:
-        """Build, train, evaluate and animate; returns the path of the report.
+        """Build, train, evaluate, animate and write the page; returns the path of the report.
 
         Raises:
             InputError: the fixture is not there (an installed package does not hold it).
@@ -51,10 +54,12 @@ class Demo:
         Evaluate(run_folder=self.out, capture=self.capture).run()
         film = self.out / "motion.mp4"
         Animate(run_folder=self.out, params=self.out / REFINED_PARAMS, out=film, height=540).run()
+        page = self.out / "player.html"
+        Web(source=self.out, single_file=page, params=self.out / REFINED_PARAMS, name=NAME, licence=LICENCE).run()
         report = self.out / "report.html"
-        console.print(
-            f"\nreport  {report.resolve()}\nfilm    {film.resolve()}", highlight=False, soft_wrap=True, markup=False
-        )
+        where = {"report": report, "film": film, "player": page}
+        lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
+        console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
         return report
 
 

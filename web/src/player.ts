@@ -13,7 +13,7 @@ export const BACKGROUND: readonly [number, number, number] = [0.071, 0.078, 0.09
 /** CSS pixels at the bottom that the controls cover. */
 const COVERED = 64;
 /** Share of the picture's height that the person fills, and how wide she may reach, in her heights. */
-const FILLED = 0.78, ARMS = 0.62;
+const FILLED = 0.78, ARMS = 0.72;
 /** How many pictures the shown rates are means over. */
 const MEMORY = 20;
 
@@ -142,6 +142,8 @@ export class Player {
       this.changed = true;
       return;
     }
+    // Pictures that wait for a GPU that is behind would only be old ones.
+    if (this.renderer.busy) return;
     const frame = this.ready;
     this.ready = null;
     // The worker goes on while the page draws.

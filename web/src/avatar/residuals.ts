@@ -39,16 +39,24 @@ export class Residuals {
     const sum = new Float32Array(used);
     for (let c = 0; c < 6; ++c) {
       sum.fill(0);
-      for (let k = 0; k < shapes; ++k) {
-        const unit = share * (step ? step[6 * k + c] : 1);
-        const at = (6 * k + c) * used;
-        if (part) {
+      const unit = (k: number) => share * (step ? step[6 * k + c] : 1);
+      if (part) {
+        for (let k = 0; k < shapes; ++k) {
+          const at = (6 * k + c) * used, factor = unit(k);
           for (let m = 0; m < used; ++m) {
-            sum[m] += values[at + m] * unit * coefficients[part[rows ? rows[m] : m] * shapes + k];
+            sum[m] += values[at + m] * factor * coefficients[part[rows ? rows[m] : m] * shapes + k];
           }
-        } else {
-          const factor = unit * coefficients[k];
-          for (let m = 0; m < used; ++m) sum[m] += values[at + m] * factor;
+        }
+      } else {
+        // Four shapes at a time: the sum is read and written once for them. Past the last one the factor is 0.
+        const factor = (k: number) => (k < shapes ? unit(k) * coefficients[k] : 0);
+        const start = (k: number) => (6 * Math.min(k, shapes - 1) + c) * used;
+        for (let k = 0; k < shapes; k += 4) {
+          const [f0, f1, f2, f3] = [factor(k), factor(k + 1), factor(k + 2), factor(k + 3)];
+          const [a0, a1, a2, a3] = [start(k), start(k + 1), start(k + 2), start(k + 3)];
+          for (let m = 0; m < used; ++m) {
+            sum[m] += f0 * values[a0 + m] + f1 * values[a1 + m] + f2 * values[a2 + m] + f3 * values[a3 + m];
+          }
         }
       }
       for (let m = 0; m < used; ++m) {

@@ -31,7 +31,7 @@ export interface Orbit {
 
 const FIELD_OF_VIEW = 0.6;
 
-/** The pinhole camera of an orbit for a picture of so many pixels; the smaller side sees about 34 degrees. */
+/** The pinhole camera of an orbit for a picture of so many pixels; upright it sees about 34 degrees. */
 export function orbitCamera(orbit: Orbit, width: number, height: number): Camera {
   const { azimuth: a, elevation: e, distance, target } = orbit;
   const back = [Math.sin(a) * Math.cos(e), Math.sin(e), Math.cos(a) * Math.cos(e)];
@@ -45,7 +45,7 @@ export function orbitCamera(orbit: Orbit, width: number, height: number): Camera
   ];
   const place = target.map((value, k) => value + distance * back[k]);
   const view = [right, down, forward].flatMap((row) => [...row, -row.reduce((sum, r, k) => sum + r * place[k], 0)]);
-  const focal = (0.5 * Math.min(width, height)) / Math.tan(0.5 * FIELD_OF_VIEW);
+  const focal = (0.5 * height) / Math.tan(0.5 * FIELD_OF_VIEW);
   return { view, fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
 }
 

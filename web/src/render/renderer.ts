@@ -20,6 +20,8 @@ export interface Renderer {
   readonly sorts: boolean;
   /** The device was lost, and is not back yet. */
   readonly lost: boolean;
+  /** The last pictures are not finished: another one would have to wait. */
+  readonly busy: boolean;
   draw(picture: Picture): void;
   /** (H, W, 4) bytes of the picture drawn last in this task, from the top. */
   pixels(): Promise<Uint8Array>;

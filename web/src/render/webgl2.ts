@@ -32,6 +32,7 @@ export class WebGL2Renderer implements Renderer {
   private readonly gl: WebGL2RenderingContext;
   private resources: Resources;
   private timer: Timer | null = null;
+  private fence: WebGLSync | null = null;
   private query: WebGLQuery | null = null;
 
   /** @throws Error no WebGL2 here. */
@@ -44,11 +45,17 @@ export class WebGL2Renderer implements Renderer {
       event.preventDefault();
       this.lost = true;
       this.query = null;
+      this.fence = null;
     });
     canvas.addEventListener("webglcontextrestored", () => {
       this.resources = this.make();
       this.lost = false;
     });
+  }
+
+  get busy(): boolean {
+    const { gl, fence } = this;
+    return fence !== null && !this.lost && gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED;
   }
 
   draw({ records, count, camera, background, blur }: Picture): void {
@@ -90,6 +97,9 @@ export class WebGL2Renderer implements Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
     if (timed) gl.endQuery(this.timer!.TIME_ELAPSED_EXT);
+    gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
   }
 
   async pixels(): Promise<Uint8Array> {

@@ -7,6 +7,8 @@ import {
 } from "./webgpu_shaders.ts";
 
 const BLENDED: GPUTextureFormat = "rgba16float", READ: GPUTextureFormat = "rgba8unorm";
+/** Pictures under way at once: one is drawn while the next is made ready. */
+const MOST_PENDING = 2;
 const SPLAT_BYTES = 32, PROJECT_THREADS = 64, ROW_ALIGNMENT = 256;
 
 /** What the number of Gaussians decides. */
@@ -36,6 +38,7 @@ export class WebGPURenderer implements Renderer {
   readonly sorts = true;
   lost = false;
   milliseconds: number | null = null;
+  private pending = 0;
   private device!: GPUDevice;
   private pipelines!: Pipelines;
   private scene!: GPUBuffer;
@@ -56,6 +59,10 @@ export class WebGPURenderer implements Renderer {
     const renderer = new WebGPURenderer(canvas, context);
     await renderer.start(device);
     return renderer;
+  }
+
+  get busy(): boolean {
+    return this.pending >= MOST_PENDING;
   }
 
   draw({ records, count, camera, background, blur, depths }: Picture): void {
@@ -97,7 +104,12 @@ export class WebGPURenderer implements Renderer {
     this.resolve(encoder, pipelines.resolve, this.context.getCurrentTexture().createView());
     const submitted = performance.now();
     device.queue.submit([encoder.finish()]);
-    device.queue.onSubmittedWorkDone().then(() => (this.milliseconds = performance.now() - submitted));
+    ++this.pending;
+    const done = () => {
+      --this.pending;
+      this.milliseconds = performance.now() - submitted;
+    };
+    device.queue.onSubmittedWorkDone().then(done, done);
   }
 
   async pixels(): Promise<Uint8Array> {
