@@ -408,6 +408,14 @@ PARTS = (
     ),
     Part("segmentation", "Labels of scans", "True labels to compare with; label maps as a parser would give them."),
     Part("rasterizer", "Rasteriser", "Synthetic clouds of Gaussians; milliseconds of forward and of both passes."),
+    Part(
+        "bundle_woman_casual",
+        "The student as a bundle",
+        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in held-out views by torch "
+        "from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of the person, dB; "
+        "`lost`: what the full student has more, mean and worst view; to the full student: the least PSNR of a picture "
+        "against torch's. Loose clothes are where the field has them, in new poses too.",
+    ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),

@@ -67,7 +67,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "animate": (
         "pipelines.commands.animate",
         "Animate",
-        "show a template moving: MP4, GIF, PNG frames or an animated GLB",
+        "show a template or a trained student moving: MP4, GIF, PNG frames or an animated GLB",
     ),
     "export": (
         "pipelines.commands.export",

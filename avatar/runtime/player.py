@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -20,6 +21,9 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.native import thread_count
 
+PARTS = ("pose", "field", "blend", "world", "draw")
+"""What a picture takes time for: joints and expression; displacements; blend shapes; skinning, frames of
+triangles and the way to the world; colours and drawing."""
 THICKNESS = 0.01
 """Scale of every Gaussian along its normal, in mean edge lengths of its triangle."""
 
@@ -31,6 +35,9 @@ class AvatarPlayer:
         bundle: the avatar, or its file.
         threads: of the kernels; None: up to 8, a CPU each.
         cloth: how loose clothes follow motions that are stepped through.
+
+    Attributes:
+        seconds: that the last pose and picture took, by `PARTS`.
 
     Example:
         >>> player = AvatarPlayer("me.avatar")
@@ -44,6 +51,7 @@ class AvatarPlayer:
     ) -> None:
         self.bundle = bundle if isinstance(bundle, AvatarBundle) else load_bundle(bundle)
         self.threads = thread_count(threads)
+        self.seconds: dict[str, float] = {}
         about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
         self._body = skeleton_body(self.bundle)
         self._parents = np.ascontiguousarray(t["skeleton.parents"], dtype=np.int32)
@@ -136,15 +144,21 @@ class AvatarPlayer:
         Raises:
             InputError: several frames, or parameters of another body.
         """
+        times = [perf_counter()]
         transforms, features, expression = self.joints(params)
         rest = self._shaped(expression, features)
         theta = params.body_pose[0].astype(np.float32)
+        times.append(perf_counter())
         moved = None if self._field is None else self._field.displacements(theta, frame, self.threads)
+        times.append(perf_counter())
         displaced = None if cloth is None else self._over_all(cloth)
-        self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         added = self._added(theta, expression, params.jaw_pose[0], frame, displaced)
+        times.append(perf_counter())
+        self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         out = self._splats
         self._world(self._posed, added, (out.means, out.quats, out.scales, out.dc, out.rotations), self.threads)
+        times.append(perf_counter())
+        self.seconds |= {part: b - a for part, a, b in zip(PARTS, times, times[1:], strict=False)}
         return out
 
     def draw(
@@ -155,7 +169,12 @@ class AvatarPlayer:
         Raises:
             InputError: what `Splatter.draw` refuses.
         """
-        return self._splatter.draw(self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads)
+        begin = perf_counter()
+        drawn = self._splatter.draw(
+            self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads
+        )
+        self.seconds["draw"] = perf_counter() - begin
+        return drawn
 
     @property
     def vertices(self) -> Float32[np.ndarray, "V 3"]:

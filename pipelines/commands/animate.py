@@ -1,4 +1,4 @@
-"""`smplxpp animate`: a finished template moving, as a film, pictures or an animated GLB."""
+"""`smplxpp animate`: a template or a trained student moving, as a film, pictures or (the template) an animated GLB."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
+from pipelines.commands.animate_student import StudentFilm, motion_for, open_student, student_frames
+from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
@@ -43,11 +45,17 @@ class Animate:
     """Options of `smplxpp animate`."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` wrote."""
+    """Folder that `smplxpp build` wrote, or a bundle NAME.avatar that `smplxpp export` wrote."""
     params: Path
     """Body parameters, any layout that `smplxpp params convert` reads. Their shape is ignored: the template has one."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
+    model: Literal["template", "student"] = "template"
+    """What moves: the textured template, or the trained student, drawn by the runtime; a bundle is a student."""
+    outside: Literal["keep", "clamp"] = "keep"
+    """Poses of a student beyond what its training saw: said and shown as they are, or held back joint by joint."""
+    interpolate: OptionalFloat = None
+    """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""
     fps: OptionalFloat = None
     """Frames a second; by default those of the parameters (or 20) over --step, so that the speed is true."""
     view: Literal["front", "side", "back", "three-quarter", "turntable"] = "front"
@@ -77,8 +85,10 @@ class Animate:
         """Pose the template frame by frame and write the result, whole or not at all."""
         suffix = self.out.suffix.lower()
         self._check_options(suffix)
+        if self._of_student:
+            return self._student_film()
         template = load_run_template(self.run_folder)
-        params, fps, before = self._load_params(template)
+        params, fps, before = self._chosen(load_params_for(template, self.params))
         garments = [] if self.cloth == "skin" or suffix == ".glb" else self._garments(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
@@ -91,15 +101,68 @@ class Animate:
             cameras = self._cameras(template, params)
             frames = self._frames(template, chain([first], posed), cameras)
             write_film(self.out, frames, fps=fps, size=(cameras[0].width, cameras[0].height))
-        if not self.json:
-            moved = f", simulated: {', '.join(garment.part for garment in garments)}" if garments else ""
-            Console().print(f"{self.out}: {len(params)} frames at {fps:g} a second{moved}", markup=False)
-            for sentence in self._said:
-                Console(stderr=True).print(sentence, markup=False)
         simulated = [garment.part for garment in garments]
+        if not self.json:
+            self._tell(len(params), fps, simulated)
         return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "said": self._said}
 
+    @property
+    def _of_student(self) -> bool:
+        return self.model == "student" or self.run_folder.suffix.lower() == BUNDLE
+
+    def _student_film(self) -> dict:
+        """Draw the student frame by frame and write the film."""
+        from avatar.runtime.motion import resampled
+
+        bundle = open_student(self.run_folder)
+        chosen, fps, whole = self._chosen(motion_for(bundle, self.params))
+        motion = replace(whole, fps=fps * self.step)
+        first = len(whole) - 1 - (len(chosen) - 1) * self.step
+        shown = range(first, len(whole), self.step)
+        if self.interpolate is not None:
+            motion = resampled(motion, self.interpolate)
+            shown = range(round(first / (fps * self.step) * self.interpolate), len(motion))
+            fps = self.interpolate
+        simulated = [] if self.cloth == "skin" else [row["part"] for row in bundle.garments_about.get("garments", [])]
+        film = StudentFilm(
+            view=self.view,
+            height=self.height,
+            width=self.width,
+            simulate=bool(simulated),
+            clamp=self.outside == "clamp",
+        )
+        cameras, frames = student_frames(bundle, motion, shown, film, self._said)
+        shown_frames = track(
+            frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json
+        )
+        write_film(self.out, shown_frames, fps=fps, size=(cameras[0].width, cameras[0].height))
+        if not self.json:
+            self._tell(len(shown), fps, simulated)
+        return {
+            "out": str(self.out),
+            "frames": len(shown),
+            "fps": fps,
+            "simulated": simulated,
+            "said": self._said,
+        }
+
+    def _tell(self, frames: int, fps: float, simulated: list[str]) -> None:
+        moved = f", simulated: {', '.join(simulated)}" if simulated else ""
+        Console().print(f"{self.out}: {frames} frames at {fps:g} a second{moved}", markup=False)
+        for sentence in self._said:
+            Console(stderr=True).print(sentence, markup=False)
+
     def _check_options(self, suffix: str) -> None:
+        if suffix == ".glb" and self._of_student:
+            raise InputError(f"output {self.out}", expected=".mp4, .gif or a folder for a student", received=".glb")
+        if self.interpolate is not None:
+            require_positive("option interpolate", self.interpolate)
+            if self.step != 1 or not self._of_student:
+                raise InputError(
+                    "option interpolate",
+                    expected="a student (--model student, or a bundle), without --step",
+                    received=f"the {self.model}, --step {self.step}",
+                )
         if suffix not in (*SUFFIXES, ".glb"):
             raise InputError(
                 f"output {self.out}",
@@ -123,12 +186,11 @@ class Animate:
                     received=f"{foreign[0]} in it" if self.out.is_dir() else "a file",
                 )
 
-    def _load_params(self, template: Template) -> tuple[BodyParams, float, BodyParams]:
-        """Read the chosen frames, how many of them a second shows, and the motion up to the last of them.
+    def _chosen(self, params: BodyParams) -> tuple[BodyParams, float, BodyParams]:
+        """Return the chosen frames, how many of them a second shows, and the motion up to the last of them.
 
         That has all frames, begins a moment before the first one, and is what loose clothes follow.
         """
-        params = load_params_for(template, self.params)
         count = len(params)
         chosen = range(count)[self.start : self.stop : self.step]
         if not len(chosen):

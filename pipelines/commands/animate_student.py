@@ -1,0 +1,122 @@
+"""A trained student moving: frames of a film that the runtime draws, from a run or from a bundle."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipelines.commands.export_bundle import SUFFIX, export_bundle
+from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
+from smplxpp.body import load_params
+from smplxpp.core.camera import Camera
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle, AvatarPlayer
+
+_BACKGROUND = (1.0, 1.0, 1.0)
+_FRAMING_POSES = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentFilm:
+    """What is shown of a student.
+
+    Attributes:
+        view: name of a view, or "turntable". height, width: pixels; no width: as wide as the motion needs.
+        simulate: the loose clothes. clamp: joints turn no farther than in training.
+    """
+
+    view: str
+    height: int
+    width: int | None
+    simulate: bool
+    clamp: bool
+
+
+def open_student(source: Path) -> AvatarBundle:
+    """Read a bundle, or make one of a run's student.
+
+    Raises:
+        InputError: neither.
+    """
+    from avatar.runtime import load_bundle
+
+    if source.suffix.lower() == SUFFIX:
+        return load_bundle(source)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"student{SUFFIX}"
+        export_bundle(source, path, name=None, licence="", params=None, exact=False)
+        return load_bundle(path)
+
+
+def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:
+    """Read a motion, in any layout, for a bundle's body."""
+    from avatar.runtime.skeleton import skeleton_body
+
+    return load_params(path, body=skeleton_body(bundle))
+
+
+def student_frames(
+    bundle: AvatarBundle, motion: BodyParams, shown: range, film: StudentFilm, said: list[str]
+) -> tuple[list[Camera], Iterator[UInt8[np.ndarray, "H W 3"]]]:
+    """Return the cameras of a film and its pictures, drawn as they are asked for.
+
+    Args:
+        motion: all frames that loose clothes follow, at the rate that it says. shown: those of the film.
+        said: takes what went otherwise than asked for.
+    """
+    from avatar.runtime import AvatarPlayer
+    from avatar.runtime.motion import PoseRange
+
+    limits = PoseRange.of(bundle)
+    if limits is not None:
+        outside = limits.outside(motion)[list(shown)].any(axis=1)
+        if outside.any():
+            done = "they were held back" if film.clamp else "`--outside clamp` holds them back"
+            said.append(
+                f"{int(outside.sum())} of {len(shown)} frames, the first at {int(np.argmax(outside))}, turn joints "
+                f"more than 10 degrees farther than training saw: {done}"
+            )
+        motion = limits.clamped(motion) if film.clamp else motion
+    player = AvatarPlayer(bundle)
+    cameras = _cameras(player, motion.select(list(shown)), film)
+    return cameras, _pictures(player, motion, shown, cameras, film, said)
+
+
+def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
+    some = spread(range(len(params)), _FRAMING_POSES)
+    points = np.concatenate([player.pose(params.frame(k)).means for k in some]).astype(np.float64)
+    height = film.height + film.height % 2  # h264 with 4:2:0 colour takes even sizes
+    width = None if film.width is None else film.width + film.width % 2
+    if film.view == "turntable":
+        return turntable_cameras(points, count=len(params), height=height, width=width)
+    return fit_cameras(points, directions=[VIEWS[film.view]], height=height, width=width) * len(params)
+
+
+def _pictures(
+    player: AvatarPlayer,
+    motion: BodyParams,
+    shown: range,
+    cameras: list[Camera],
+    film: StudentFilm,
+    said: list[str],
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    picture = dict(zip(shown, cameras, strict=True))
+    for k in range(len(motion)):
+        if film.simulate:
+            player.step(motion.frame(k), 1.0 / (motion.fps or 1.0))
+        if k not in picture:
+            continue
+        if not film.simulate:
+            player.pose(motion.frame(k))
+        image, _ = player.draw(picture[k], background=_BACKGROUND)
+        yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    said += player.said

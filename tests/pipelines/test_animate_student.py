@@ -1,0 +1,96 @@
+"""`smplxpp animate` of a student: from a run, from a bundle, at other rates, beyond what training saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from avatar.models.model_file import save_avatar
+from pipelines.commands.animate import Animate
+from pipelines.runs.layout import STUDENT
+from smplxpp.core.errors import InputError
+from tests.cloth.test_driver import swaying
+from tests.dolls.dancing import dance, write_dance_run
+from tests.runtime.bundles import student, write, write_dressed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A run with a student, the same as a bundle, and a motion."""
+    folder = tmp_path_factory.mktemp("students")
+    run = write_dance_run(folder / "run")
+    (run / STUDENT).parent.mkdir()
+    save_avatar(run / STUDENT, student("whole"))
+    write(folder / "me.avatar", student("whole"))
+    replace(dance(), fps=20.0).save(folder / "motion.npz")
+    return folder
+
+
+def pictures(out: Path) -> list[np.ndarray]:
+    return [np.asarray(Image.open(path)) for path in sorted(out.iterdir())]
+
+
+def film(folder: Path, out: Path, *, source: str = "me.avatar", **options) -> tuple[dict, list[np.ndarray]]:
+    command = Animate(folder / source, folder / "motion.npz", out, height=64, json=True, **options)
+    return command.run(), pictures(out)
+
+
+def test_a_run_and_its_bundle_give_the_same_film(folder, tmp_path):
+    answer, of_run = film(folder, tmp_path / "a", source="run", model="student")
+    _, of_bundle = film(folder, tmp_path / "b")
+    assert answer["frames"] == len(of_run) == len(of_bundle) == len(dance()) and answer["fps"] == 20.0
+    for a, b in zip(of_run, of_bundle, strict=True):
+        assert a.shape == b.shape and np.abs(a.astype(int) - b).mean() < 1.5  # their steps differ with the motion
+    shown = [(one < 250).any(axis=2).mean() for one in of_run]
+    assert min(shown) > 0.05 and max(shown) < 0.9  # a doll before white
+    assert np.abs(of_run[0].astype(int) - of_run[-1]).max() > 60
+
+
+def test_other_rates_keep_the_speed(folder, tmp_path):
+    _, given = film(folder, tmp_path / "a")
+    fast, fine = film(folder, tmp_path / "b", interpolate=90.0)
+    assert fast["fps"] == 90.0 and fast["frames"] == len(fine) == int(5 / 20 * 90) + 1
+    for at, k in ((0, 0), (9, 2)):  # the camera is fitted to some of the frames, others here
+        assert fine[at].shape == given[k].shape and np.abs(fine[at].astype(int) - given[k]).mean() < 4.0
+    assert np.abs(fine[9].astype(int) - given[5]).mean() > 8.0
+    some, _ = film(folder, tmp_path / "c", start=2, interpolate=40.0)
+    assert some["frames"] == 7
+    with pytest.raises(InputError, match="interpolate"):
+        film(folder, tmp_path / "d", interpolate=90.0, step=2)
+    with pytest.raises(InputError, match="interpolate"):
+        film(folder, tmp_path / "d", interpolate=90.0, source="run")
+
+
+def test_poses_beyond_the_training_are_said_and_held_back(folder, tmp_path):
+    far = replace(dance(), body_pose=dance().body_pose + np.linspace(0.0, 2.0, len(dance()))[:, None], fps=20.0)
+    far.save(tmp_path / "far.npz")
+    said = {}
+    for outside in ("keep", "clamp"):
+        command = Animate(
+            folder / "me.avatar", tmp_path / "far.npz", tmp_path / outside, height=64, json=True, outside=outside
+        )
+        said[outside] = command.run()["said"]
+    assert "of 6 frames" in said["keep"][0] and "--outside clamp" in said["keep"][0]
+    assert "held back" in said["clamp"][0]
+    kept, held = pictures(tmp_path / "keep"), pictures(tmp_path / "clamp")
+    assert kept[0].shape != held[0].shape or np.abs(kept[-1].astype(int) - held[-1]).max() > 60
+
+
+def test_loose_clothes_of_a_bundle_are_simulated(tmp_path):
+    write_dressed(tmp_path)
+    frames = [swaying(k / 20.0) for k in range(3)]
+    motion = frames[0].concatenate(frames)
+    replace(motion, fps=20.0).save(tmp_path / "motion.npz")
+    simulated, one = film(tmp_path, tmp_path / "a")
+    skinned, other = film(tmp_path, tmp_path / "b", cloth="skin")
+    assert simulated["simulated"] == ["lower"] and skinned["simulated"] == []
+    assert len(one) == len(other) == 3 and np.abs(one[-1].astype(int) - other[-1]).max() > 10
+
+
+def test_a_student_is_no_glb(folder, tmp_path):
+    with pytest.raises(InputError, match=r"\.mp4"):
+        Animate(folder / "me.avatar", folder / "motion.npz", tmp_path / "a.glb").run()
