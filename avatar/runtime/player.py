@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
@@ -35,6 +36,7 @@ class AvatarPlayer:
         bundle: the avatar, or its file.
         threads: of the kernels; None: up to 8, a CPU each.
         cloth: how loose clothes follow motions that are stepped through.
+        clock: gives seconds.
 
     Attributes:
         seconds: that the last pose and picture took, by `PARTS`.
@@ -47,11 +49,17 @@ class AvatarPlayer:
     """
 
     def __init__(
-        self, bundle: AvatarBundle | str | Path, *, threads: int | None = None, cloth: DriverConfig | None = None
+        self,
+        bundle: AvatarBundle | str | Path,
+        *,
+        threads: int | None = None,
+        cloth: DriverConfig | None = None,
+        clock: Callable[[], float] = perf_counter,
     ) -> None:
         self.bundle = bundle if isinstance(bundle, AvatarBundle) else load_bundle(bundle)
         self.threads = thread_count(threads)
         self.seconds: dict[str, float] = {}
+        self._clock = clock
         about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
         self._body = skeleton_body(self.bundle)
         self._parents = np.ascontiguousarray(t["skeleton.parents"], dtype=np.int32)
@@ -144,20 +152,20 @@ class AvatarPlayer:
         Raises:
             InputError: several frames, or parameters of another body.
         """
-        times = [perf_counter()]
+        times = [self._clock()]
         transforms, features, expression = self.joints(params)
         rest = self._shaped(expression, features)
         theta = params.body_pose[0].astype(np.float32)
-        times.append(perf_counter())
+        times.append(self._clock())
         moved = None if self._field is None else self._field.displacements(theta, frame, self.threads)
-        times.append(perf_counter())
+        times.append(self._clock())
         displaced = None if cloth is None else self._over_all(cloth)
         added = self._added(theta, expression, params.jaw_pose[0], frame, displaced)
-        times.append(perf_counter())
+        times.append(self._clock())
         self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         out = self._splats
         self._world(self._posed, added, (out.means, out.quats, out.scales, out.dc, out.rotations), self.threads)
-        times.append(perf_counter())
+        times.append(self._clock())
         self.seconds |= {part: b - a for part, a, b in zip(PARTS, times, times[1:], strict=False)}
         return out
 
@@ -169,11 +177,11 @@ class AvatarPlayer:
         Raises:
             InputError: what `Splatter.draw` refuses.
         """
-        begin = perf_counter()
+        begin = self._clock()
         drawn = self._splatter.draw(
             self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads
         )
-        self.seconds["draw"] = perf_counter() - begin
+        self.seconds["draw"] = self._clock() - begin
         return drawn
 
     @property
