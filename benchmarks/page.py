@@ -416,6 +416,14 @@ PARTS = (
         "`lost`: what the full student has more, mean and worst view; to the full student: the least PSNR of a picture "
         "against torch's. Loose clothes are where the field has them, in new poses too.",
     ),
+    Part(
+        "runtime",
+        "The student without torch",
+        "The student of `woman_casual`, preset `cpu`, and students of its sizes with Gaussians as they are sampled before "
+        "any training (their bundles hold blend shapes of zeros, and are small); pictures of 512x512 from the front, a new "
+        "pose each. Milliseconds of the processor on one thread, the least of eight pictures; torch's colours count as "
+        "`world`, the runtime's as `draw`. On two threads the machine was too busy to be timed.",
+    ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),
