@@ -420,9 +420,10 @@ PARTS = (
         "runtime",
         "The student without torch",
         "The student of `woman_casual`, preset `cpu`, and students of its sizes with Gaussians as they are sampled "
-        "before any training (their bundles hold blend shapes of zeros, and are small); pictures of 512x512 from the "
-        "front, a new pose each. Milliseconds of the processor on one thread, the least of eight pictures; torch's colours count as "
-        "`world`, the runtime's as `draw`. On two threads the machine was too busy to be timed.",
+        "before any training (their bundles hold blend shapes of zeros, and are small); pictures of 512x512 from "
+        "the front, a new pose each. Milliseconds of the processor on one thread, the least of eight pictures; "
+        "torch's colours count as `world`, the runtime's as `draw`. On two threads the machine was too busy to be "
+        "timed.",
     ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
