@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines.web.page import PLAYER
+from smplxpp.core.rotations import matrix_from_rotvec
 
 WEB = Path(__file__).resolve().parents[2] / "web"
 TOOLS = WEB / "node_modules" / ".bin"
@@ -36,9 +39,44 @@ def test_the_built_player_is_that_of_its_sources():
     assert found and found[1] == digest_of_sources(), "build it anew: npm ci && npm run build in web/"
 
 
-@pytest.mark.skipif(
+NEEDS_BUILD = pytest.mark.skipif(
     shutil.which("node") is None or not (TOOLS / "esbuild").exists(), reason="no node with web/'s tools: npm ci in web/"
 )
+
+
+def node(script: str, *, given: object = None) -> object:
+    """Run a script that has the player's modules as `m` and JSON as `given`; return what `result` is."""
+    subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True, capture_output=True, timeout=900)
+    whole = f"""import * as m from {json.dumps((WEB / "build" / "modules.mjs").as_uri())};
+    const given = {json.dumps(given)};
+    {script}
+    process.stdout.write(JSON.stringify(result));"""
+    done = subprocess.run(
+        ["node", "--input-type=module", "-e", whole], check=True, capture_output=True, text=True, timeout=900
+    )
+    return json.loads(done.stdout)
+
+
+@NEEDS_BUILD
+def test_digests_are_those_of_sha_256():
+    lengths = [0, 1, 55, 56, 63, 64, 65, 119, 120, 128, 1000]
+    found = node("const result = given.map(n => m.sha256Here(new Uint8Array(n).map((_, i) => 7 * i)));", given=lengths)
+    assert found == [hashlib.sha256(bytes(7 * i % 256 for i in range(n))).hexdigest() for n in lengths]
+
+
+@NEEDS_BUILD
+def test_joints_between_frames_take_the_short_way_round():
+    """From 170 degrees to -170: through 180, not back through 0."""
+    angles = np.deg2rad([[170.0, 0.0, 0.0], [-170.0, 0.0, 0.0], [-150.0, 0.0, 0.0]])
+    script = """const motion = { framesPerSecond: 10, frames: 3, rotations: Float32Array.from(given.flat()),
+      translation: new Float32Array(9), expression: new Float32Array(0) };
+    const result = [0.05, 0.15, 0.1, 9].map(t => [...m.poseAt(motion, t).rotations]);"""
+    found = matrix_from_rotvec(np.array(node(script, given=angles.tolist())))
+    expected = matrix_from_rotvec(np.deg2rad([[180.0, 0, 0], [-160.0, 0, 0], [-170.0, 0, 0], [-150.0, 0, 0]]))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@NEEDS_BUILD
 def test_a_build_gives_the_same_bytes(tmp_path):
     out = tmp_path / "player.js"
     subprocess.run(["node", str(WEB / "build.mjs"), str(out)], check=True, capture_output=True, timeout=900)
