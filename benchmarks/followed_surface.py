@@ -105,7 +105,7 @@ class Bench:
         self.protocol = scene.capture.protocol or "exact"
         self.gaussians = load_bound(run / GAUSSIANS, faces=scene.template.faces)
         self.reference = load_params_of_run(run).frame(0)
-        self.same = _SamePoints.found(scene, self.reference, part)
+        self.same = SamePoints.found(scene, self.reference, part)
 
     def row(
         self, config: TrackConfig, every: int, *, count: int | None = None, pattern: str | None = None
@@ -176,7 +176,7 @@ class Bench:
 
 
 @dataclass(frozen=True, eq=False)
-class _SamePoints:
+class SamePoints:
     """Vertices of the template and the points of true surfaces that they are."""
 
     own: Int[np.ndarray, " K"]
@@ -184,7 +184,7 @@ class _SamePoints:
     weights: Float[np.ndarray, "K 3"]
 
     @staticmethod
-    def found(scene: TrainScene, reference: BodyParams, part: str) -> _SamePoints:
+    def found(scene: TrainScene, reference: BodyParams, part: str) -> SamePoints:
         """Find the points of the truth that a part's vertices are, in the frame that the template was built from."""
         template = scene.template
         truth = None if scene.built_frame is None else scene.capture.truth_mesh(scene.built_frame)
@@ -196,7 +196,7 @@ class _SamePoints:
         close = squared < SAME**2
         corners = truth.faces[face[close]]
         a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
-        return _SamePoints(own[close], corners, igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c))
+        return SamePoints(own[close], corners, igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c))
 
     def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
         """Return where they are in another frame."""
