@@ -154,20 +154,20 @@ class Bench:
         yield "ridge, pose", lambda train, test: self._ridge(self.features.pose, train, test)
         yield "ridge, history", lambda train, test: self._ridge(self.features.history, train, test)
         for drive in get_args(Drive):
-            yield f"field, {drive}", lambda train, test, drive=drive: self._field(drive, self.followed, train, test)
+            yield f"field, {drive}", lambda train, test, drive=drive: self.field(drive, self.followed, train, test)
         yield "student's field", self._student
         if loose:
             motions = self._simulated(loose)
             yield f"simulated: {' '.join(loose)}", lambda train, test: self._with_cloth(motions, {}, test)
             yield (
                 f"simulated: {' '.join(loose)}; the rest: field, pose",
-                lambda train, test: self._with_cloth(motions, self._field("pose", self.followed, train, test), test),
+                lambda train, test: self._with_cloth(motions, self.field("pose", self.followed, train, test), test),
             )
         if from_truth:
             for drive in get_args(Drive):
                 yield (
                     f"learned from the truth: field, {drive}",
-                    lambda train, test, drive=drive: self._field(drive, self._true(train), train, test),
+                    lambda train, test, drive=drive: self.field(drive, self.true(train), train, test),
                 )
 
     def measured(self, found: Displacements, frames: Sequence[int], *, surface: int = 0) -> dict[str, Any]:
@@ -220,9 +220,10 @@ class Bench:
         found = ridge(x, y, features[[self._row(frame) for frame in test]], best)
         return self._spread(found.unflatten(1, (-1, 3)), test)
 
-    def _field(
+    def field(
         self, drive: Drive, known: Mapping[int, Tensor], train: Sequence[int], test: Sequence[int]
     ) -> Displacements:
+        """What a field with a drive, which learned `known` of the frames `train`, says of the frames `test`."""
         torch.manual_seed(self.config.seed)
         rows = [self._row(frame) for frame in train]
         predictor = Predictor(drive, *self._at_controls, self.features, rows)
@@ -257,7 +258,7 @@ class Bench:
         clothed = {frame: self.rig.with_cloth(plain[frame], motions.shape(frame)) for frame in test}
         return {frame: self.rig.displaced(clothed[frame], rest.get(frame)) for frame in test}
 
-    def _true(self, frames: Sequence[int]) -> Mapping[int, Tensor]:
+    def true(self, frames: Sequence[int]) -> Mapping[int, Tensor]:
         """Displacements that put the control points where they truly are; 0 for those whose place is not known."""
         control = self.track.cage.vertices
         out = {}
