@@ -297,9 +297,9 @@ PARTS = (
     Part(
         "held_out_poses_talking",
         "Forty seconds of talking: what the student's pictures of new poses hang on",
-        TALKING + "PSNR of the person, and of the pixels of each label, in dB, means over the views: one held-out camera, "
-        "which looks from behind as no other does, and one of the training's, every second held-out frame with a true "
-        "surface. Only the surface differs between the student's rows; its Gaussians were trained on its own.",
+        TALKING + "PSNR of the person, and of the pixels of each label, in dB, means over the views: one held-out "
+        "camera, which looks from behind as no other does, and one of the training's, every second held-out frame with a "
+        "true surface. Only the surface differs between the student's rows; its Gaussians were trained on its own.",
     ),
     Part(
         "motion_codes_woman_casual",
