@@ -204,7 +204,8 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
 
     def tracking(config: TrackConfig) -> Callable[[int], Any]:
         gaussians = load_bound(run / "70_bind" / "gaussians.safetensors")
-        task = TrackTask(sequence, TrackedAvatar(rig, gaussians, config.control_points), config)
+        avatar = TrackedAvatar(rig, gaussians, config.control_points, still_body=config.still_body)
+        task = TrackTask(sequence, avatar, config)
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.
         return lambda k: task.step(config.steps * (k // TIMED) + k % TIMED * config.steps // TIMED)
 

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from avatar.export.bundle_numbers import Tensors, blended, halves, rounded, signed, unsigned
 from avatar.models.networks.blend_shapes import BlendShapes
-from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.local_pose import BODY_JOINTS
 from avatar.models.student import Student
 from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, save_bundle
@@ -221,8 +220,7 @@ def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
         neighbours, weights = np.arange(len(kept))[:, None], np.ones((len(kept), 1))
     else:
         kept = np.arange(len(points))
-        control = template_control_points(template, student.config.control_points)
-        neighbours, weights = control.neighbours[cut.vertices], control.weights[cut.vertices]
+        neighbours, weights = (part.cpu().numpy() for part in net.rows.of(torch.as_tensor(cut.vertices)))
     clothes = template.cloth_mask[points]
     sets, member = _seen(net.sets, net.member, kept)
     small = np.uint16 if len(points) <= 1 << 16 else np.uint32

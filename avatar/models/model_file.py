@@ -55,6 +55,7 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
             "frames": list(model.frames),
             "null_code_shown": model.codes is not None and model.codes.null_code_shown,
             "control_points": config.control_points,
+            "still_body": config.still_body,
             "field": None if config.field is None else config_to_dict(config.field),
             "blend_shapes": None if config.blend_shapes is None else config_to_dict(config.blend_shapes),
         }
@@ -149,7 +150,10 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         extra = stored.blended(shapes_config, len(gaussians))
         shapes = BlendShapes(shapes_config, len(gaussians), **extra)
     control_points = as_integer(stored.about.get("control_points"), subject="control_points", least=0)
-    config = StudentConfig(field, shapes_config, control_points)
+    still_body = stored.about.get("still_body", False)  # older files do not say: all of theirs moved
+    if not isinstance(still_body, bool):
+        raise InputError("still_body", expected="true or false", received=shown(still_body), remedy=_REMEDY)
+    config = StudentConfig(field, shapes_config, control_points, still_body)
     known = None if "pose_gate.poses" not in stored.tensors else stored.poses("pose_gate.poses")
     student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known)
     if stored.about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were

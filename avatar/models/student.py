@@ -32,11 +32,14 @@ class StudentConfig:
         field: that of the mesh's motion; None: the mesh follows its joints alone.
         blend_shapes: those of the Gaussians; None: they have none (as before the compensation).
         control_points: vertices that the field is evaluated on, interpolated to the rest; 0: all vertices.
+        still_body: the field moves what is worn and the hair; the body's own surface follows its joints alone. Not
+            applied to a template that is a body alone.
     """
 
     field: FieldConfig | None = dataclasses.field(default_factory=FieldConfig)
     blend_shapes: BlendShapeConfig | None = None
     control_points: int = 0
+    still_body: bool = False
 
     def __post_init__(self) -> None:
         require_at_least("student control_points", self.control_points, 0)
@@ -70,7 +73,7 @@ class Student(nn.Module):
         gaussians.check_topology(rig.faces, "template of the student")
         self.config, self.rig = config, rig
         self.gaussians = LearnedGaussians(gaussians)
-        self.field = None if config.field is None else _make_field(config.field, config.control_points, rig)
+        self.field = None if config.field is None else _make_field(config.field, config, rig)
         self.codes = None if config.field is None else FrameCodes(frames, config.field.code_size)
         if blend_shapes is None and config.blend_shapes is not None:
             blend_shapes = make_blend_shapes(config.blend_shapes, rig, gaussians)
@@ -157,11 +160,12 @@ class Student(nn.Module):
         return other
 
 
-def _make_field(config: FieldConfig, control_points: int, rig: Rig) -> DeformationField:
-    control = template_control_points(rig.template, control_points) if control_points else None
+def _make_field(config: FieldConfig, student: StudentConfig, rig: Rig) -> DeformationField:
+    control = template_control_points(rig.template, student.control_points) if student.control_points else None
     steps = config.local_pose
     seen = torch.tensor(seen_joints(rig.template, steps), device=rig.device) if steps else None
-    return DeformationField(config, rig.vertices, rig.cloth_mask, control=control, seen=seen)
+    still = rig.body_mask if student.still_body and not rig.body_mask.all() else None
+    return DeformationField(config, rig.vertices, rig.cloth_mask, control=control, seen=seen, still=still)
 
 
 def make_blend_shapes(config: BlendShapeConfig, rig: Rig, gaussians: BoundGaussians) -> BlendShapes:

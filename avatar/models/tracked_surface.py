@@ -90,20 +90,25 @@ class TrackedAvatar(nn.Module):
     Args:
         rig: that of the template. gaussians: those on it; they stay as they are.
         count: number of control points.
+        still_body: control points on the body do not move. Not applied to a template that is a body alone.
     """
 
-    def __init__(self, rig: Rig, gaussians: BoundGaussians, count: int) -> None:
+    moves: Tensor
+
+    def __init__(self, rig: Rig, gaussians: BoundGaussians, count: int, *, still_body: bool = False) -> None:
         super().__init__()
         self.rig = rig
         self.gaussians = LearnedGaussians(gaussians)
         self.cage = ControlCage(rig, count)
         self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
         """Displacements (K, 3), metres, in the frame that is being followed."""
+        moves = ~rig.body_mask if still_body and not rig.body_mask.all() else torch.ones_like(rig.body_mask)
+        self.register_buffer("moves", moves[self.cage.vertices, None].float(), persistent=False)
         self.to(rig.device)
 
     def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar, displaced by the control points as they stand."""
-        displacements = self.cage(self.controls)
+        displacements = self.cage(self.moves * self.controls)
         vertices = self.rig.pose(motion, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.gaussians()

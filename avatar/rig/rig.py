@@ -87,6 +87,8 @@ class Rig:
         self.faces = torch.tensor(template.faces, device=device)
         self.vertices = self._tensor(template.vertices)
         self.cloth_mask = torch.tensor(template.cloth_mask, device=device)
+        self.body_mask = torch.tensor(template.vertex_part == 0, device=device)
+        """(V,) of the body's own surface, bare or not."""
         self.semantic_colors = self._tensor(template.semantic_colors / 255.0)
         """(V, 3) in [0, 1]."""
         self._weights = template.weights.dense().astype(np.float32)

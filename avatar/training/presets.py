@@ -35,7 +35,7 @@ class TrainingPreset:
         networks: sizes of the teacher and the field.
         fit: the reference fit, which makes the Gaussians.
         teacher, bake, compensate: the three trainings.
-        blend_shapes: of the student. control_points: see `StudentConfig`.
+        blend_shapes: of the student. control_points, still_body: see `StudentConfig`.
     """
 
     networks: NetworkPreset
@@ -45,10 +45,11 @@ class TrainingPreset:
     compensate: CompensateConfig
     blend_shapes: BlendShapeConfig
     control_points: int = 0
+    still_body: bool = False
 
     def student(self) -> StudentConfig:
         """Return the student of the bake; the compensation adds the blend shapes."""
-        return StudentConfig(self.networks.field, None, self.control_points)
+        return StudentConfig(self.networks.field, None, self.control_points, self.still_body)
 
     def with_seed(self, seed: int) -> TrainingPreset:
         """Return the same with another seed everywhere."""
@@ -151,6 +152,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
                 control_points=size.control_points,
                 body_motion_weight=size.body_motion_weight,
                 tight_reach=size.tight_reach,
+                still_body=True,
             ),
         ),
         bake=BakeConfig(
@@ -180,6 +182,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
         control_points=size.control_points,
+        still_body=True,
     )
 
 

@@ -9,6 +9,7 @@ import torch
 
 from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import HALF_EXTENT, TeacherAvatar, map_frame
@@ -266,6 +267,18 @@ def test_a_field_on_control_points_and_a_template_without_clothes(motion):
     posed = model(rig.motion(dance().frame(3), frame=3), EYES)
     posed.gaussians.means.sum().backward()
     assert torch.isfinite(posed.gaussians.means).all() and posed.displacements.abs().max() > 0
+
+
+def test_a_still_body_follows_its_joints_alone(rig, motion):
+    model = student(rig, still_body=True, control_points=40)
+    disturb(model)
+    moved = model.displacements(motion)
+    assert not moved[rig.body_mask].any() and moved[~rig.body_mask].abs().max() > 0
+    naked = Rig(template().naked())
+    bound = sample_on_mesh(naked.template, SamplingConfig(count=300, sh_degree=1))
+    alone = Student(StudentConfig(field=TINY_FIELD, still_body=True), naked, bound, (0,))
+    disturb(alone)
+    assert alone.displacements(naked.motion(dance().frame(3))).abs().max() > 0
 
 
 def test_gaussians_of_another_mesh_are_refused(rig):

@@ -43,6 +43,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "control points of surface and field": f"{preset.control_points:,}"
         if preset.control_points
         else "all vertices",
+        "surface and field move the body's own surface": "no" if preset.still_body else "yes",
         "teacher: iterations": f"{teacher.iterations:,}",
         "bake: iterations": f"{bake.iterations:,}",
         "compensation: iterations": f"{compensate.iterations:,}",
@@ -70,9 +71,10 @@ def _numbers(pretrainings: Sequence[PretrainConfig | None], name: str) -> str:
 
 def test_the_table_is_that_of_the_presets():
     text = GUIDE.read_text()
-    for preset in TRAINING_PRESETS.values():  # the row on control points speaks of both
+    for preset in TRAINING_PRESETS.values():  # the rows on control points and on the body speak of both
         track = preset.teacher.track
         assert track is None or track.control_points == preset.control_points
+        assert track is None or track.still_body == preset.still_body
     missing = [row for row in rows() if row not in text]
     assert not missing, "docs/training.md lacks:\n" + "\n".join(missing)
     assert "| | " + " | ".join(TRAINING_PRESETS) + " |" in text

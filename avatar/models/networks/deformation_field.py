@@ -96,7 +96,7 @@ class DeformationField(nn.Module):
     """`dv_i = m_i S_c(g_i) + S_b(g_i)`, `g_i = phi(v_i) + theta + z_t` (+ joins vectors), metres in the canonical pose.
 
     S_b moves the whole template; S_c adds the motion of the clothes and is evaluated on them alone (m_i = 1). With
-    control points both are evaluated there and interpolated.
+    control points both are evaluated there and interpolated. Vertices may be kept still: neither is evaluated there.
 
     Args:
         config: sizes.
@@ -104,9 +104,13 @@ class DeformationField(nn.Module):
         cloth_mask: m.
         control: control points of the same vertices, or None to evaluate the field on every vertex.
         seen: the joints of theta, J = pose_size / 3, that each vertex sees, where the configuration asks for it.
+        still: vertices that are not displaced, whole groups of the control points; None: none are.
+
+    Attributes:
+        points: (K,) vertices that the networks are evaluated on.
 
     Raises:
-        InputError: a mask, control points or seen joints of another number of vertices or joints.
+        InputError: a mask, control points or seen joints of another number of vertices or joints; nothing that moves.
     """
 
     points: Tensor
@@ -123,6 +127,7 @@ class DeformationField(nn.Module):
         *,
         control: ControlPoints | None = None,
         seen: Bool[Tensor, "V J"] | None = None,
+        still: Bool[Tensor, " V"] | None = None,
     ) -> None:
         super().__init__()
         if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
@@ -144,18 +149,17 @@ class DeformationField(nn.Module):
                 expected="none without local_pose" if expected is None else f"shape {expected}",
                 received="none" if seen is None else f"shape {tuple(seen.shape)}",
             )
+        if still is not None and (still.shape != cloth_mask.shape or bool(still.all())):
+            raise InputError(
+                "vertices that stay still",
+                expected=f"some of {len(vertices)}, not all",
+                received=f"{int(still.sum())} of {len(still)}",
+            )
         self.config = config
         self.body = FieldNetwork(config)
         self.cloth = FieldNetwork(config)
-        if control is not None:
-            where = torch.as_tensor(control.vertices, device=vertices.device)
-            vertices, cloth_mask = vertices[where], cloth_mask[where]
-            neighbours = torch.as_tensor(control.neighbours, device=vertices.device)
-            weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
-            self.rows: SparseRows | None = SparseRows(neighbours, weights, len(where))
-        else:
-            self.rows = None
-            where = torch.arange(len(vertices), device=vertices.device)
+        where, self.rows = _evaluated(vertices, control, still)
+        vertices, cloth_mask = vertices[where], cloth_mask[where]
         self.register_buffer("points", where, persistent=False)
         self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
         self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
@@ -203,6 +207,28 @@ class DeformationField(nn.Module):
         clothes = self.cloth_index
         member = None if self.member is None else self.member[clothes]
         return moved.index_add(1, clothes, self.cloth(self.encodings[clothes], frames, member))
+
+
+def _evaluated(
+    vertices: Float[Tensor, "V 3"], control: ControlPoints | None, still: Bool[Tensor, " V"] | None
+) -> tuple[Tensor, SparseRows | None]:
+    """The vertices that the field is evaluated on, and how all are interpolated from them; None: they are all."""
+    every = torch.arange(len(vertices), device=vertices.device)
+    if control is None:
+        if still is None:
+            return every, None
+        where, neighbours, weights = every, every[:, None], torch.ones_like(vertices[:, :1])
+    else:
+        where = torch.as_tensor(control.vertices, device=vertices.device)
+        neighbours = torch.as_tensor(control.neighbours, device=vertices.device)
+        weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
+    if still is not None:
+        moves = ~still[where]
+        number = moves.cumsum(0) - 1
+        # A vertex that stays sums a row with weight 0, whichever.
+        neighbours, weights = number[neighbours] * ~still[:, None], weights * ~still[:, None]
+        where = where[moves]
+    return where, SparseRows(neighbours, weights, len(where))
 
 
 class FrameCodes(nn.Module):

@@ -53,9 +53,14 @@ class SparseRows(nn.Module):
             "transposed_offsets": counts.cumsum(0) - counts,
             "transposed_weights": weights[order],
         }
-        self._names = tuple(matrices)
+        self._names, self.per_point = tuple(matrices), per_point
         for name, value in matrices.items():
             self.register_buffer(name, value, persistent=False)
+
+    def of(self, points: Int[Tensor, " N"]) -> tuple[Int[Tensor, "N k"], Float[Tensor, "N k"]]:
+        """Return the rows that some of the sums are made of, and their weights."""
+        rows, weights = (getattr(self, name).reshape(-1, self.per_point) for name in ("rows", "weights"))
+        return rows[points], weights[points]
 
     def forward(self, table: Float[Tensor, "R C"]) -> Float[Tensor, "P C"]:
         """Return the weighted sums of the table's rows."""

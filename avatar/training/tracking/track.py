@@ -57,6 +57,8 @@ class TrackConfig:
         body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
             parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
             clothes.
+        still_body: the body's own surface follows its joints alone: poses say better where it is than photographs of a
+            few hundred pixels do. Not applied to a template that is a body alone.
         tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
             what lies on the body goes where the body goes. 0: no clothes do.
         extrapolation: share of the motion between the two frames before that a frame starts with.
@@ -74,6 +76,7 @@ class TrackConfig:
     smoothness: float = 80.0
     body_motion_weight: float = 0.0
     tight_reach: float = 0.0
+    still_body: bool = False
     extrapolation: float = 1.0
     simulate: bool = True
     weights: ReconstructionWeights = field(
@@ -256,7 +259,8 @@ def follow_surface(
 
     Steps have one frame each: of several processes the first follows it, and the others hear what it found.
     """
-    avatar = TrackedAvatar(sequence.rig, gaussians, min(config.control_points, len(sequence.rig.vertices)))
+    count = min(config.control_points, len(sequence.rig.vertices))
+    avatar = TrackedAvatar(sequence.rig, gaussians, count, still_body=config.still_body)
     task = TrackTask(sequence, avatar, config, replace(session.context, distributed=None))
     progress = session.run_alone(lambda: task, task.config)
     processes = session.distributed or Distributed()

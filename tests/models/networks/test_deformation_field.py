@@ -157,6 +157,23 @@ def test_without_control_points_the_points_are_all_vertices():
     assert torch.equal(field.at_points(*drive()), field(*drive()))
 
 
+@pytest.mark.parametrize("controlled", [False, True])
+def test_what_is_still_does_not_move_and_the_rest_moves_as_without(controlled):
+    torch.manual_seed(0)
+    points, group = torch.rand(30, 3) - 0.5, torch.arange(30) % 3
+    still = group == 1  # clothes are the group 0
+    control = choose_control_points(points.numpy(), group.numpy(), count=12) if controlled else None
+    plain, held = random_field(control=control), random_field(control=control, still=still)
+    held.load_state_dict(plain.state_dict())
+    a, b = plain(*drive()), held(*drive())
+    assert not b[:, still].any() and a[:, still].abs().min() > 0
+    torch.testing.assert_close(b[:, ~still], a[:, ~still], rtol=1e-4, atol=1e-5)
+    assert not still[held.points].any() and len(held.points) < len(plain.points)
+    torch.testing.assert_close(held.at_points(*drive()), b[:, held.points], rtol=1e-4, atol=1e-5)
+    b.square().sum().backward()
+    assert all(p.grad is not None and p.grad.any() for p in held.cloth.parameters())
+
+
 def test_state_does_not_hold_the_template():
     assert all("weight" in name or "bias" in name for name in random_field().state_dict())
 
@@ -194,3 +211,6 @@ def test_refused_input():
             DeformationField(config, torch.rand(5, 3), torch.ones(5, dtype=torch.bool), **options)
     with pytest.raises(InputError, match="local_pose"):
         FieldConfig(local_pose=-1)
+    for still in (torch.ones(5, dtype=torch.bool), torch.zeros(4, dtype=torch.bool)):
+        with pytest.raises(InputError, match="stay still"):
+            DeformationField(CONFIG, torch.rand(5, 3), torch.ones(5, dtype=torch.bool), still=still)

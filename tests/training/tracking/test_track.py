@@ -85,6 +85,22 @@ def test_with_a_prior_the_body_stays_and_the_dress_swings(frames, track, tmp_pat
         assert error(frames, frame, found.displacements(frame)) < 0.5 * error(frames, frame)
 
 
+def test_a_body_that_is_kept_still_does_not_move_and_the_dress_swings(frames, tmp_path):
+    config = replace(CONFIG, still_body=True)
+    found, _ = follow_surface(frames, painted(), config, Session(tmp_path))
+    body = torch.tensor(template().vertex_part == 0)
+    for frame in (1, 3):
+        moved = found.displacements(frame)
+        assert not moved[body].any()
+        assert error(frames, frame, moved) < 0.5 * error(frames, frame)
+
+
+def test_a_naked_body_is_followed_whole(frames):
+    rig = AvatarSequence(frames.capture, template().naked()).rig
+    bound = sample_on_mesh(rig.template, SamplingConfig(count=300, sh_degree=1))
+    assert TrackedAvatar(rig, bound, 8, still_body=True).moves.all()
+
+
 def test_cloth_on_the_skin_counts_as_the_body_and_cloth_off_it_does_not(frames):
     cage = TrackedAvatar(frames.rig, painted(), CONFIG.control_points).cage
     cloth = ~cage.off_clothes
