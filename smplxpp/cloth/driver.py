@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from scipy.sparse import csr_matrix
 
 from smplxpp.body.model import PosedBody
@@ -23,6 +23,8 @@ from smplxpp.template.template import Template
 LONGEST_STEP = 0.26
 # Step of the ramp of a cold start.
 _RAMP_STEP = 1.0 / 30.0
+# Metres of the root from what places are measured from, beyond which that follows it.
+_FAR = 4.0
 # Of a blend of rotations; below, its inverse blows up what the cloth did.
 _LEAST_DETERMINANT = 0.2
 
@@ -97,8 +99,12 @@ class ClothDriver:
         self._fine = np.concatenate([g.vertices for g in garments])
         weights = csr_matrix(template.weights.dense(), dtype=np.float32)
         self._row_weights, self._fine_weights = weights[self._rows], weights[self._fine]
-        self._rest = template.vertices.astype(np.float32)
+        rest = template.vertices.astype(np.float32)
+        self._row_rest, self._fine_rest = rest[self._rows], rest[self._fine]
+        self._skin = self._rows < template.body.vertex_count
         self._threads = [GarmentThread(g, self._rows, self.config) for g in garments]
+        # What places are measured from: near the person, so that float32 knows micrometres wherever that stands.
+        self._origin = np.zeros(3)
         self._time = 0.0
         self._last: BodyParams | None = None
         share = np.concatenate([g.share() for g in garments])
@@ -117,7 +123,7 @@ class ClothDriver:
         """
         names = [garment.part for garment in self.garments]
         require_choice("simulated part", part, names)
-        return self._threads[names.index(part)].particles()
+        return (self._threads[names.index(part)].particles() + self._origin).astype(np.float32)
 
     def place(self, part: str, particles: Float32[np.ndarray, "n 3"]) -> None:
         """Put the particles of a part elsewhere, world, metres; their velocities stay.
@@ -129,7 +135,7 @@ class ClothDriver:
         if particles.shape != expected:
             raise InputError(f"particles of {part}", expected=f"shape {expected}", received=str(particles.shape))
         names = [garment.part for garment in self.garments]
-        self._threads[names.index(part)].place(particles)
+        self._threads[names.index(part)].place((particles - self._origin).astype(np.float32))
 
     def restart(self) -> None:
         """Forget the state: the next step starts cold."""
@@ -173,6 +179,7 @@ class ClothDriver:
         """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
         start = reference_facing_as(self._threads[0].garment.reference, params)
         steps, still = (round(t / _RAMP_STEP) for t in (self.config.ramp, self.config.hold))
+        self._origin = np.array(posed.joints[0, 0])
         places = self._places(self.template.posed_body(start) if steps else posed)
         for thread in self._threads:
             thread.reset(places)
@@ -192,6 +199,11 @@ class ClothDriver:
 
     def _advance(self, posed: PosedBody, seconds: float, *, at_any_speed: bool = False) -> bool:
         """Move all garments on to a pose; False, and nothing moved, where what holds them went too fast."""
+        away = posed.joints[0, 0] - self._origin
+        if np.abs(away).max() > _FAR:
+            self._origin = self._origin + away
+            for thread in self._threads:
+                thread.shift(-away.astype(np.float32))
         places = self._places(posed)
         farthest = max(thread.way_to(places) for thread in self._threads)
         if farthest > self.config.teleport * seconds and not at_any_speed:
@@ -203,27 +215,27 @@ class ClothDriver:
         return True
 
     def _places(self, posed: PosedBody) -> Float32[np.ndarray, "R 3"]:
-        """Return where skinning has the vertices that steps need, metres."""
-        rest, count = self._rest[self._rows], self.template.body.vertex_count
-        skin = self._rows < count
-        rest[skin] = posed.rest_vertices[0][self._rows[skin]]
-        blended = _blended(self._row_weights, posed)
+        """Return where skinning has the vertices that steps need, metres from the origin."""
+        rest = self._row_rest.copy()
+        rest[self._skin] = posed.rest_vertices[0][self._rows[self._skin]]
+        blended = _blended(self._row_weights, posed, self._origin)
         return np.einsum("nij,nj->ni", blended[:, :, :3], rest) + blended[:, :, 3]
 
     def _shaped(self, posed: PosedBody) -> ClothShape:
         """Take the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`."""
-        world = np.concatenate([thread.carried() for thread in self._threads]).astype(np.float32)
-        blended = _blended(self._fine_weights, posed)
-        back, volume = _solved(blended[:, :, :3], world - blended[:, :, 3])
+        carried = np.concatenate([thread.carried() for thread in self._threads]).astype(np.float32)
+        blended = _blended(self._fine_weights, posed, self._origin)
+        back, volume = _solved(blended[:, :, :3], carried - blended[:, :, 3])
         # Joints that turn against each other flatten a blend; such a vertex stays with skinning.
-        displacements = np.where(volume > _LEAST_DETERMINANT, back - self._rest[self._fine], np.float32(0.0))
+        displacements = np.where(volume > _LEAST_DETERMINANT, back - self._fine_rest, np.float32(0.0))
         self._shape = ClothShape(self._fine, displacements, self._shape.share)
         return self._shape
 
 
-def _blended(weights: csr_matrix, posed: PosedBody) -> Float32[np.ndarray, "N 3 4"]:
-    transforms = posed.posed_from_rest[0, :, :3].reshape(-1, 12).astype(np.float32)
-    return (weights @ transforms).reshape(-1, 3, 4)
+def _blended(weights: csr_matrix, posed: PosedBody, origin: Float[np.ndarray, " 3"]) -> Float32[np.ndarray, "N 3 4"]:
+    transforms = np.array(posed.posed_from_rest[0, :, :3])
+    transforms[:, :, 3] -= origin
+    return (weights @ transforms.reshape(-1, 12).astype(np.float32)).reshape(-1, 3, 4)
 
 
 def _solved(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import igl
 import numpy as np
 from jaxtyping import Float, Float32, Int32
+from scipy.sparse import csr_matrix
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
@@ -32,12 +34,24 @@ class Embedding:
 
     def carried_with_normals(self, coarse: TriangleMesh) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
         """Return the fine vertices, metres, and the coarse mesh's smooth unit normals at them."""
-        x, normals = coarse.vertices, _smooth_normals(coarse)
-        place = sum(self.weights[:, k : k + 1] * x[self.corners[:, k]] for k in range(3))
-        normal = _unit(sum(self.weights[:, k : k + 1] * normals[self.corners[:, k]] for k in range(3)))
-        first, second = _tangents(x, self.corners)
-        moved = self.offset[:, :1] * first + self.offset[:, 1:2] * second + self.offset[:, 2:] * normal
-        return place + moved, normal
+        triangles, in_plane, among_corners = self._matrices
+        x, count = coarse.vertices, among_corners.shape[1]
+        place = in_plane @ np.concatenate([x[:count], *_tangents(x, triangles)])
+        normal = _unit(among_corners @ _smooth_normals(coarse)[:count])
+        return place + self.offset[:, 2:] * normal, normal
+
+    @cached_property
+    def _matrices(self) -> tuple[Int32[np.ndarray, "m 3"], csr_matrix, csr_matrix]:
+        """The triangles that carry something; what takes corners and tangents to places; what mixes the corners.
+
+        Both matrices have what they multiply a triangle once in the place of once a vertex.
+        """
+        triangles, which = np.unique(self.corners, axis=0, return_inverse=True)
+        which, count = which.reshape(-1, 1), int(triangles.max(initial=-1)) + 1
+        columns = np.concatenate([self.corners, count + which, count + len(triangles) + which], axis=1)
+        values = np.concatenate([self.weights, self.offset[:, :2]], axis=1)
+        in_plane = _rows(values, columns, count + 2 * len(triangles))
+        return triangles, in_plane, _rows(self.weights, self.corners, count)
 
 
 def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
@@ -61,6 +75,12 @@ def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     offset = np.stack([np.einsum("ni,ni->n", left, first), np.einsum("ni,ni->n", left, second), along], axis=1)
     offset[exact] = np.linalg.solve(frame[exact], missing[exact][:, :, None])[:, :, 0]
     return Embedding(zero.corners, zero.weights, offset.astype(np.float32))
+
+
+def _rows(values: Float[np.ndarray, "N k"], columns: np.ndarray, width: int) -> csr_matrix:
+    """A float64 matrix of k entries a row, summed in their order."""
+    starts = np.arange(0, values.size + 1, values.shape[1])
+    return csr_matrix((values.astype(np.float64).ravel(), columns.ravel(), starts), shape=(len(values), width))
 
 
 def _smooth_normals(mesh: TriangleMesh) -> Float[np.ndarray, "n 3"]:

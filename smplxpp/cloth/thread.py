@@ -36,6 +36,8 @@ class GarmentThread:
         self._particles = np.searchsorted(rows, garment.particles)
         self._skin = np.searchsorted(rows, collider.vertices)
         self._pinned = np.flatnonzero(garment.pinned)
+        self._share = garment.share()
+        self._most_squared = (self._most_stretch * self._model.lengths + 0.01) ** 2
         self._state = ClothState.at_rest(garment.rest.vertices)
         self._places: list[Float32[np.ndarray, "n 3"]] = []
         self._surfaces: list[Float32[np.ndarray, "c 3"]] = []
@@ -76,15 +78,21 @@ class GarmentThread:
         return "the simulation broke down; the cloth is on the body again and goes on from there"
 
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
-        """Put the particles elsewhere, world, metres; their velocities stay."""
+        """Put the particles elsewhere, metres from the driver's origin; their velocities stay."""
         self._state.position[:] = particles
 
+    def shift(self, by: Float32[np.ndarray, " 3"]) -> None:
+        """Move all that is remembered, metres: what places are measured from has moved the other way."""
+        self._state.position[:] += by
+        self._places = [places + by for places in self._places]
+        self._surfaces = [surface + by for surface in self._surfaces]
+
     def particles(self) -> Float32[np.ndarray, "n 3"]:
-        """Return where the particles are, world, metres."""
+        """Return where the particles are, metres from the driver's origin."""
         return self._state.position.copy()
 
     def carried(self) -> Float[np.ndarray, "N 3"]:
-        """Return the vertices that the garment carries, world, metres, `_FINE_MARGIN` outside of what it touches.
+        """Return the vertices that the garment carries, metres, `_FINE_MARGIN` outside of what it touches.
 
         Between particles that keep their margin a limb's curve can come through.
         """
@@ -111,7 +119,7 @@ class GarmentThread:
         if not mine.any():
             return surface
         out = surface.copy()
-        share = self.garment.share()[at[mine], None]
+        share = self._share[at[mine], None]
         out[mine] += share * (self.carried()[at[mine]].astype(np.float32) - out[mine])
         return out
 
@@ -119,9 +127,9 @@ class GarmentThread:
         x = self._state.position
         if not (np.isfinite(x).all() and np.isfinite(self._state.velocity).all()):
             return False
-        edges = self._model.edges
-        lengths = row_lengths(x[edges[:, 0]] - x[edges[:, 1]])
-        return bool((lengths <= self._most_stretch * self._model.lengths + 0.01).all())
+        ends = x[self._model.edges.T]
+        apart = ends[0] - ends[1]
+        return bool((np.einsum("ei,ei->e", apart, apart) <= self._most_squared).all())
 
 
 def _four_moments(

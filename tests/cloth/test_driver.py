@@ -100,6 +100,34 @@ def test_a_person_who_stands_and_looks_elsewhere_has_the_same_cloth():
     assert np.linalg.norm(shapes[1] - shapes[0], axis=1).mean() < 0.0015
 
 
+def test_far_from_the_origin_cloth_does_the_same():
+    shapes, ends = [], []
+    for away in (0.0, 100.0):
+        one = driver()
+        for k in range(40):
+            at = (away + 0.15 * np.sin(k / 6) ** 2, 0.0, 0.4 * away)
+            shape = one.step(standing(at=at, lifted=0.5 * np.sin(k / 10) ** 2), 1 / 30)
+        shapes.append(shape.displacements)
+        ends.append(one.particles(PART) - np.float32([away, 0.0, 0.4 * away]))
+    assert np.abs(shapes[0]).max() > 0.03
+    np.testing.assert_allclose(shapes[1], shapes[0], atol=1e-3)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-3)
+
+
+def test_a_long_way_is_followed_without_a_jerk():
+    """What places are measured from moves along, and the cloth does not notice."""
+    walk, still = driver(), driver()
+    for k in range(50):
+        shapes = [one.step(standing(at=at), 1 / 30) for one, at in ((walk, (0.2 * k, 0.0, 0.0)), (still, (0, 0, 0)))]
+    assert walk.said == []
+    place = walk.particles(PART) - np.float32([0.2 * 49, 0.0, 0.0])
+    pinned = garment().pinned
+    np.testing.assert_allclose(place[pinned], skinned()[pinned], atol=1e-4)
+    # At 6 m/s the skirt lies back against the legs.
+    assert place[garment().depth > 0.3, 0].mean() < still.particles(PART)[garment().depth > 0.3, 0].mean() - 0.05
+    assert np.isfinite(shapes[0].displacements).all()
+
+
 def test_frames_a_second_hardly_matter():
     ends = {fps: followed(fps).particles(PART) for fps in (5.0, 30.0, 120.0)}
     there = skinned() + [0.15 * np.sin(np.pi) ** 2, 0, 0]

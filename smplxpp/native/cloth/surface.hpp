@@ -12,23 +12,24 @@ namespace smplxpp {
 // Points by the cell of a grid that they lie in.
 class Grid {
 public:
-    void fill(const Vec3* points, int64_t count, float cell) {
-        over_ = 1.0f / cell;
+    // Cells are a little wider than twice the reach: all within it of a place lie in the 8 cells that are nearest to that.
+    void fill(const Vec3* points, int64_t count, float reach) {
+        over_ = 1.0f / (2.01f * reach);
         head_.assign(kCells, -1);
         next_.resize(size_t(count));
         for (int32_t i = 0; i < count; ++i) {
-            const uint32_t at = key(of(points[i].x), of(points[i].y), of(points[i].z));
+            const uint32_t at = key(cell(points[i].x), cell(points[i].y), cell(points[i].z));
             next_[size_t(i)] = head_[at];
             head_[at] = i;
         }
     }
-    // Calls visit with the points of the 27 cells about one.
+    // Calls visit with the points within the reach of a place, and with others about it; some of those twice.
     template <class Visit>
     void around(Vec3 p, Visit&& visit) const {
-        const int32_t x = of(p.x), y = of(p.y), z = of(p.z);
-        for (int32_t i = x - 1; i <= x + 1; ++i)
-            for (int32_t j = y - 1; j <= y + 1; ++j)
-                for (int32_t k = z - 1; k <= z + 1; ++k)
+        const int32_t x = first(p.x), y = first(p.y), z = first(p.z);
+        for (int32_t i = x; i <= x + 1; ++i)
+            for (int32_t j = y; j <= y + 1; ++j)
+                for (int32_t k = z; k <= z + 1; ++k)
                     for (int32_t q = head_[key(i, j, k)]; q >= 0; q = next_[size_t(q)]) visit(q);
     }
 
@@ -37,10 +38,12 @@ private:
     static uint32_t key(int32_t i, int32_t j, int32_t k) {
         return (uint32_t(i) * 73856093u ^ uint32_t(j) * 19349663u ^ uint32_t(k) * 83492791u) & (kCells - 1);
     }
-    int32_t of(float x) const {  // far and broken points share a cell: a cast of them has no value
-        const float cell = std::floor(x * over_);
-        return cell > -1e9f && cell < 1e9f ? int32_t(cell) : 0;
+    static int32_t whole(float x) {  // far and broken points share a cell: a cast of them has no value
+        const float down = std::floor(x);
+        return down > -1e9f && down < 1e9f ? int32_t(down) : 0;
     }
+    int32_t cell(float x) const { return whole(x * over_); }
+    int32_t first(float x) const { return whole(x * over_ - 0.5f); }  // of the two cells nearest to a place
     float over_ = 1.0f;
     std::vector<int32_t> head_, next_;
 };
