@@ -239,6 +239,8 @@ def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> 
             {
                 "file": file,
                 "set": view.set,
+                "camera": view.camera,
+                "frame": view.frame,
                 "chosen": view.chosen,
                 "title": f"{'worst of ' if worst else ''}{SETS[view.set]}, {view.camera}, frame {view.frame}",
                 "head": view.head,

@@ -43,6 +43,7 @@ from smplxpp.template.template import Template
 from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 from tools.overview import held_out_view
+from tools.worst_frames import WorstFrames
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 QUICK = ("--every", "4", "--samples", "1000", "--metric", "none", "--speed-pictures", "1", "--speed-size", "24", "32")
@@ -128,6 +129,19 @@ def test_files_of_the_stage(evaluated):
     names = [check["name"] for check in manifest["checks"]]
     assert "student, novel views: PSNR of the person" in names and "template's silhouette on the masks" in names
     assert "P2S of lower against skinning alone, training frames" in names
+
+
+def test_the_worst_views_make_one_picture(evaluated, trained, tmp_path):
+    out = tmp_path / "worst.jpg"
+    WorstFrames(evaluated, out).run()
+    with Image.open(out) as image:
+        whole = image.size
+    WorstFrames(evaluated, out, models=("student",)).run()
+    with Image.open(out) as image:
+        one = image.size
+    assert one[0] < whole[0] and one[1] == whole[1]  # a column less, as many rows
+    with pytest.raises(InputError, match="worst views"):
+        WorstFrames(trained, out).run()
 
 
 def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path, capsys):
