@@ -118,15 +118,19 @@ class ClothMotions:
     def _ways(self, frames: Sequence[int]) -> dict[int, list[BodyParams]]:
         """The poses from each frame's predecessor to it, smoothed within stretches of frames that follow each other.
 
+        Those follow each other whose numbers are as far apart as any two of the motion's nearest are: a capture of
+        every second number is one of half the frames a second.
         Slow frame rates get poses in between: places that go straight from pose to pose cut the corners of limbs.
         """
         out: dict[int, list[BodyParams]] = {}
-        times = max(1, ceil(SLOWEST / self._fps - 1e-6))
-        cuts = np.flatnonzero(np.diff(frames) != 1) + 1
+        apart = int(np.diff(self._frames).min()) if len(self._frames) > 1 else 1
+        fps = self._fps / apart
+        times = max(1, ceil(SLOWEST / fps - 1e-6))
+        cuts = np.flatnonzero(np.diff(frames) != apart) + 1
         for stretch in np.split(np.array(frames), cuts):
             found = [self._params(int(frame)) for frame in stretch]
             poses = BodyParams.concatenate([one for one in found if one is not None])
-            fine = upsampled(smoothed(poses, radius=self.config.smoothing * self._fps), times)
+            fine = upsampled(smoothed(poses, radius=self.config.smoothing * fps), times)
             out[int(stretch[0])] = [fine.frame(0)]
             for k, frame in enumerate(stretch.tolist()[1:]):
                 out[frame] = [fine.frame(k * times + j + 1) for j in range(times)]

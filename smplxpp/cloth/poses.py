@@ -62,6 +62,8 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
             mirrored = np.arange(count) - offset
             inside = (at >= 0) & (at < count) & (mirrored >= 0) & (mirrored < count)
             rows = np.flatnonzero(inside)
+            if not len(rows):  # the motion is shorter than the window
+                continue
             total[rows] += w * _step(value, rows, at[rows], turning)
             weight[rows] += w
         mean = total / weight

@@ -113,6 +113,15 @@ def test_smoothing_takes_the_shaking_of_a_tracker_out_of_the_cloth():
     assert shakes[0.03] < 0.5 * shakes[0.0]
 
 
+def test_every_second_number_is_half_the_frames_a_second():
+    config = ClothMotionConfig(smoothing=0.05, pre_roll=0.2, driver=QUICK)
+    plain = motions(count=30, fps=30.0, params=lambda k: shaken(2 * k), smoothing=0.05)
+    skipping = ClothMotions(person(), [garment()], params=shaken, frames=range(0, 60, 2), fps=60.0, config=config)
+    plain.simulate([20])
+    skipping.simulate([40])
+    np.testing.assert_array_equal(skipping.shape(40).displacements, plain.shape(20).displacements)
+
+
 def test_frames_and_numbers_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="frames to simulate"):
         motions().simulate([59, 60])
