@@ -139,6 +139,7 @@ class TrackTask(PhotometricTask):
         self.avatar, self.track_config = avatar, config
         self.foresight = _foresight(sequence, avatar.cage, config)
         self._shapes: dict[int, Tensor] = {}
+        self._small: tuple[int, dict[tuple[str, int], View]] = (-1, {})
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
@@ -169,11 +170,19 @@ class TrackTask(PhotometricTask):
         raise AssertionError("steps are those of the levels")
 
     def views(self, item: Item) -> list[View]:
-        """Return the photographs at the level's size."""
-        views = super().views(item)
-        for _ in range(self._level(self.iteration)[0].halvings):
-            views = [view.halved() for view in views]
-        return views
+        """Return the photographs at the level's size; halved ones are kept while the frame is followed."""
+        if self._small[0] != item.frame:
+            self._small = (item.frame, {})
+        halvings = self._level(self.iteration)[0].halvings
+        return [self._halved(view, halvings) for view in super().views(item)]
+
+    def _halved(self, view: View, times: int) -> View:
+        kept = self._small[1]
+        if not times:
+            return view
+        if (view.name, times) not in kept:
+            kept[view.name, times] = self._halved(view, times - 1).halved()
+        return kept[view.name, times]
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return `L_rec` with the roughness of what is not foreseen and how far the body moves, and its terms."""

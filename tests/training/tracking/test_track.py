@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from avatar.data.sequence import AvatarSequence
+from avatar.data.views import View
 from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
@@ -143,6 +144,22 @@ def test_a_frame_starts_from_its_neighbours_carried_on(frames):
     assert torch.equal(made._start(0), torch.zeros_like(first))
     torch.testing.assert_close(made._start(1), first)
     torch.testing.assert_close(made._start(2), second + CONFIG.extrapolation * (second - first))
+
+
+def test_photographs_are_halved_once_a_frame(frames, monkeypatch):
+    halved, whole = [], View.halved
+
+    def counted(view):
+        halved.append(view.name)
+        return whole(view)
+
+    monkeypatch.setattr(View, "halved", counted)
+    made = task(frames)
+    for k in range(2 * CONFIG.steps):
+        (item,) = made.micro_batches(k)
+        sizes = {(view.camera.height, len(halved)) for view in made.views(item)}
+        assert len(sizes) == 1
+    assert len(halved) == 2 * len(set(halved))
 
 
 def test_rates_fall_within_every_level(frames):
