@@ -69,6 +69,8 @@ class FollowedSurface:
     """On the part: "photographs", as it is, or among those of `benchmarks.repainted`."""
     count: int | None = None
     """Of the frames that are followed, the first ones; None: all."""
+    levels: int | None = None
+    """Of the preset's sizes of images, the first ones, the coarse; None: all."""
     simulate: tuple[bool, ...] = (True, False)
     """With simulated clothes that foresee where frames begin, and without."""
     name: str = ""
@@ -80,16 +82,29 @@ class FollowedSurface:
         config = training_preset(self.preset).teacher.track
         if config is None:
             raise InputError("preset", expected="one that follows the surface", received=self.preset)
-        figures: dict[str, Any] = {"protocol": bench.protocol, "preset": self.preset, "part": self.part, "rows": {}}
+        config = replace(config, levels=config.levels[: self.levels])
+        figures: dict[str, Any] = {
+            "protocol": bench.protocol,
+            "preset": self.preset,
+            "part": self.part,
+            "halvings": [level.halvings for level in config.levels],
+            "rows": {},
+        }
         for pattern, every, simulate in product(self.patterns, self.every, self.simulate):
             own = replace(config, simulate=simulate)
             row = bench.row(own, every, count=self.count, pattern=None if pattern == PHOTOGRAPHS else pattern)
             name = f"{pattern}, every {every}, {'foreseen' if simulate else 'carried on'}"
             figures["rows"][name] = row
             print(f"{name:44s} {row}", flush=True)
-        command = "python -m benchmarks.followed_surface --run RUN --capture DIR"
-        path = store_results(f"followed_surface_{self.name or bench.capture.name}", command, figures)
+        path = store_results(f"followed_surface_{self.name or bench.capture.name}", self._command(), figures)
         print(f"stored {path.name}")
+
+    def _command(self) -> str:
+        lists = {"every": self.every, "patterns": self.patterns}
+        words = [f"--{name} {' '.join(map(str, values))}" for name, values in lists.items()]
+        words += [f"--{name} {value}" for name, value in (("count", self.count), ("levels", self.levels)) if value]
+        words += ["--simulate " + " ".join(map(str, self.simulate)), f"--preset {self.preset} --part {self.part}"]
+        return " ".join(["python -m benchmarks.followed_surface --run RUN --capture DIR", *words])
 
 
 class Bench:
