@@ -161,13 +161,14 @@ class _Clothes:
         """Open a capture whose held-out frames have their clothes moved so."""
         motions = None
         if self.garments:
-            fps = capture.fps
+            # On skinning nothing swings: how long a frame lasts is not asked for.
+            fps = 1.0 if self.mode == "skin" else capture.fps
             if fps is None:
                 raise InputError(
                     f"capture {capture.name}",
                     expected="its frames a second, to simulate clothes",
                     received="none",
-                    remedy="evaluate with --cloth field",
+                    remedy="evaluate with --cloth field or --cloth skin",
                 )
             motions = ClothMotions(
                 self.template,

@@ -7,19 +7,23 @@ from functools import cache
 import numpy as np
 
 from smplxpp.body import load_body
-from smplxpp.core.labels import LOWER
+from smplxpp.core.labels import LOWER, UPPER
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 from tests.dolls.doll import Part, ball, make_template
 
 PART = LOWER.name
+OVER = UPPER.name
+"""A second skirt over the first one."""
 AROUND, DOWN = 48, 20
 WAIST, HEM = 0.95, 0.45
 """Heights of the skirt's openings, metres."""
 
 
 @cache
-def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False) -> Template:
+def person(
+    *, web: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False, layers: int = 1
+) -> Template:
     """Hips, two legs, a head, and a skirt from the waist to the knees.
 
     Args:
@@ -27,10 +31,17 @@ def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn
         tight: the waistband lies on the hips; else it hangs 9 cm from them.
         outwards: the skirt's faces look out.
         torn: a slit from hem to waist, and a piece that hangs together with nothing.
+        layers: 2: another skirt, 2 cm outside the first.
     """
     hips = ball((0.16, 0.2, 0.12), 0.92, {"pelvis": 1.0}, subdivisions=4)
     legs = [_leg(name, x) for name, x in (("left_hip", 0.08), ("right_hip", -0.08))]
     skirt = _skirt(web=web, tight=tight, outwards=outwards, torn=torn)
+    skirts = {PART: skirt}
+    if layers > 1:
+        away = np.where(np.arange(len(skirt.vertices)) < AROUND, 0.0, 0.02)  # they share the waistband
+        outer = skirt.vertices * [1, 0, 1]
+        outer *= 1 + away[:, None] / np.linalg.norm(outer, axis=1, keepdims=True)
+        skirts[OVER] = Part(outer + skirt.vertices * [0, 1, 0] + [0, 0.002, 0], skirt.faces, skirt.joints, UPPER.id)
     names = load_body().joint_names
     head = ball((0.09, 0.12, 0.1), 1.3, {"head": 1.0}, subdivisions=3)
     parts = [hips, *legs, head]
@@ -40,7 +51,7 @@ def person(*, web: bool = False, tight: bool = True, outwards: bool = True, torn
     for row, name in enumerate(names):
         nearest = np.argsort(np.linalg.norm(vertices - places.get(name, (0.0, 0.92, 0.0)), axis=1))[:6]
         regressor[row, nearest] = 1.0 / 6.0
-    return make_template(parts, {PART: skirt}, bases_changed={"joint_regressor": regressor})
+    return make_template(parts, skirts, bases_changed={"joint_regressor": regressor})
 
 
 def _leg(name: str, x: float) -> Part:
