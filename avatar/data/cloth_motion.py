@@ -28,7 +28,8 @@ class ClothMotionConfig:
     Attributes:
         pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
         smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
-            seconds; trackers shake waistbands. The body that is drawn is not smoothed.
+            seconds; trackers shake waistbands. The body that is drawn is not smoothed; the cloth hangs beside it where
+            the smoothed motion has brought it, so that it does not shake along.
         mode: "simulate", or "skin": the clothes stay where skinning has them.
         driver: how motions are followed.
     """
@@ -95,10 +96,11 @@ class ClothMotions:
         for frame in known:
             seconds = 1.0 if last is None else (frame - last) / self._fps
             for pose in ways[frame]:
-                shape = driver.step(pose, seconds / len(ways[frame]))
+                driver.step(pose, seconds / len(ways[frame]))
             last = frame
-            if frame in wanted:
-                self._shapes[frame] = shape
+            pose_drawn = self._params(frame)
+            if frame in wanted and pose_drawn is not None:
+                self._shapes[frame] = driver.over(pose_drawn)
         for said in driver.said:
             warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
 

@@ -221,6 +221,13 @@ class ClothDriver:
         blended = _blended(self._row_weights, posed, self._origin)
         return np.einsum("nij,nj->ni", blended[:, :, :3], rest) + blended[:, :, 3]
 
+    def over(self, params: BodyParams) -> ClothShape:
+        """Return the cloth where it hangs now, for a body that is drawn in another pose than the last step's.
+
+        Between the pins and what hangs free the way from one pose to the other is blended by `ClothShape.share`.
+        """
+        return self._shaped(self.template.posed_body(params))
+
     def _shaped(self, posed: PosedBody) -> ClothShape:
         """Take the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`."""
         carried = np.concatenate([thread.carried() for thread in self._threads]).astype(np.float32)

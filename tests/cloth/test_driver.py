@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from smplxpp.cloth import ClothDriver, DriverConfig, Garment, GarmentConfig, cut_garment
+from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.play import play
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -59,15 +59,30 @@ def test_a_cold_start_ends_where_cloth_hangs():
     assert shape.displacements[shape.share > 0].any()
 
 
-def test_displacements_put_the_cloth_where_the_particles_are():
-    one = followed(30.0)
-    shape = one.step(swaying(1.0), 1 / 30)
+def in_the_world(shape: ClothShape, params: BodyParams) -> np.ndarray:
+    """The person's vertices in a pose, the cloth displaced."""
     template = person()
-    posed = template.posed_body(swaying(1.0))
+    posed = template.posed_body(params)
     moved = template.vertices.copy()
     moved[shape.vertices] += shape.displacements
     blended = np.einsum("vj,jab->vab", template.weights.dense(), posed.posed_from_rest[0])
-    world = np.einsum("vij,vj->vi", blended[:, :3, :3], moved) + blended[:, :3, 3]
+    return np.einsum("vij,vj->vi", blended[:, :3, :3], moved) + blended[:, :3, 3]
+
+
+def test_cloth_over_another_pose_hangs_where_it_hung():
+    one = followed(30.0)
+    shape = one.step(swaying(1.0), 1 / 30)
+    shaken = standing(at=(0.02, -0.01, 0.01), turned=0.03, lifted=0.55)
+    over = one.over(shaken)
+    there, here = in_the_world(shape, swaying(1.0)), in_the_world(over, shaken)
+    np.testing.assert_allclose(here[over.vertices], there[over.vertices], atol=2e-5)
+    np.testing.assert_array_equal(over.share, shape.share)
+    np.testing.assert_array_equal(one.over(swaying(1.0)).displacements, shape.displacements)
+
+
+def test_displacements_put_the_cloth_where_the_particles_are():
+    one = followed(30.0)
+    world = in_the_world(one.step(swaying(1.0), 1 / 30), swaying(1.0))
     # Those that stand for particles; skin may push them out by a few millimetres.
     np.testing.assert_allclose(world[garment().particles], one.particles(PART), atol=0.015)
     assert np.abs(world[garment().particles] - one.particles(PART)).mean() < 0.002
