@@ -7,7 +7,8 @@ import json
 import pytest
 
 from benchmarks.machine import RESULTS
-from benchmarks.page import PAGE, PARTS, main, page, part_of
+from benchmarks.page import PAGE, main, page
+from benchmarks.page_parts import PARTS, part_of
 from benchmarks.page_tables import shown, tables_of
 
 

@@ -1,0 +1,355 @@
+"""What stands on the page docs/benchmarks.md, in what order, and what each part rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.page_tables import reconstruction_lines, registration_lines, tables_of
+from benchmarks.page_trainings import ablation_lines, build_lines, training_lines
+from smplxpp.capture.protocols import TRACKED
+
+WOMAN = (
+    "Synthetic capture `woman_casual`: 14 cameras of 384x640 and 60 frames; 12 cameras and 48 frames are trained on, "
+    "2 cameras and 12 frames are held out. All inputs are exact: parameters, cameras, labels and normal maps are the "
+    "true ones. The preset `cpu` is a lean one: student and teacher learn from photographs and from a tracked surface."
+)
+EVERY_FRAME = (
+    " Measured on every held-out frame of every held-out camera: 96 images carry the novel views, 24 the novel poses. "
+    "The capture does not say what its inputs are, so that the stored words on them are `not known`. "
+)
+EVERY_FOURTH = (
+    " Measured on every fourth frame: 24 images carry the novel views (12 frames of 2 cameras), 6 the novel poses "
+    "(3 frames of 2 cameras); surfaces are those of 12 training frames and of 3 held-out ones. No spread was stored. "
+)
+TALKING = (
+    "Synthetic capture of `smplxpp synth --motion talking --frames 400`: 8 cameras of 384x640 and 480x480, one of them "
+    "held out, 320 frames at 10 a second for training and the last 80 held out, half-loose shirt over tight trousers; "
+    "exact inputs. Every fourth training frame was trained on and followed, 80 in all. "
+)
+MOTION_CODES = (
+    "Vertexwise distances of the template's parts in mm, P2S where it is written, of the held-out frames; in lists one "
+    "number for each block of training frames that was left out. Predictors learn the followed surface, rows that say "
+    "so the true one. Seconds of CPU, measuring included. One seed; fields learned in 300 steps at 2e-3 on the talking "
+    "person, where half of them died at 5e-3 (nothing but zeros), and in 400 steps at 5e-3 on the woman."
+)
+PERSON = (
+    "The embedded person (`data/fixtures/person`): 8 cameras of 256x320 and 240x240, 16 frames; one camera and 3 "
+    "frames are held out. All inputs are exact, as above. Preset `demo`, 22k Gaussians, lean as `cpu` is. No "
+    "perceptual distance was measured; the surface of a single held-out frame is known."
+)
+TRACKED_INPUTS = (
+    "**Nothing here is exact**: body parameters as a tracker gives them, estimated labels, normals estimated or none, "
+    "as the words below say."
+)
+DISTILLATION = (
+    "The paper's own distillation, in which the student learns from the teacher's images, with L_non to the teacher "
+    "and with L_sem, is behind the figures of `paper-small` alone; the preset `paper` was never trained by us."
+)
+RECIPE = (
+    "No surface is followed and no cloth simulated. The machine was shared: minutes are upper bounds. The perceptual "
+    "distance is ST-LPIPS, which is not LPIPS."
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stored result on the page.
+
+    Attributes:
+        name: of its file in `benchmarks/results`. title: its heading.
+        conditions: what the figures rest on, for whatever the file does not hold.
+        lines: makes the Markdown of its figures.
+    """
+
+    name: str
+    title: str
+    conditions: str
+    lines: Callable[[Any], list[str]] = tables_of
+
+
+_REGISTRATION = (
+    "A synthetic capture as trackers give it (`smplxpp capture degrade`): keypoints with 3 px of noise (an image 640 "
+    "high), 5 % outliers and 10 % missing, parameters 1.5 degrees a joint and 8 mm off, label maps with 5 % of wrong "
+    "pixels, scans of training frames where the capture has them. Errors of the naked body against the exact "
+    "parameters; `one scan, symmetric` attracts all of the scan and the body to each other. "
+)
+_DETECTION = (
+    "Keypoints by MediaPipe 0.10.21 in the photographs of the training cameras (synthetic people on black), within the "
+    "boxes of the true masks; points with a confidence of 0.5. Errors include what MediaPipe and the body call by one "
+    "name and mean differently (hips, ears, toes: one to three centimetres). `registered`: the body fitted to these "
+    "keypoints, with the true masks and without, from nothing else: no scan, no label map, no fit to start from. "
+)
+_MASKS = (
+    "Intersection over union with the true mask. The people are put before made rooms with noise, a shadow on the "
+    "floor and an exposure 4 % below the plates'; three plates a camera, or one. No real photographs. "
+)
+_RECONSTRUCTION = (
+    "Photographs, cameras and masks of frame 0 alone; the truth is looked at in measuring. P2S in mm from the "
+    "reconstruction to the true outer surface, air under the skirt included; completeness in mm from what two of the "
+    "cameras see of the truth. Estimated masks: every other one grown, the rest shrunk by 2 pixels, one of the "
+    "background, one shifted by 12 % of the image. Seconds were taken on a machine with six times as much work as it "
+    "has cores; CPU seconds are the measure. "
+)
+PARTS = (
+    Part(
+        "reconstruction_woman_casual",
+        "Reconstruction of a woman in a wide skirt",
+        _RECONSTRUCTION + "14 cameras of 384x640 and 384x384, 12 of them trained on.",
+        reconstruction_lines,
+    ),
+    Part(
+        "reconstruction_synth24",
+        "Reconstruction of the embedded person from 24 views of 1024 pixels",
+        _RECONSTRUCTION + "`smplxpp synth --cameras 24 --size 1024 --frames 2`; 20 cameras are trained on.",
+        reconstruction_lines,
+    ),
+    Part(
+        "reconstruction_person",
+        "Reconstruction of the embedded person from her fixture",
+        _RECONSTRUCTION + "8 cameras of 256x320 and 240x240, five of them around the body and two of its face trained "
+        "on: with two wrong masks, which are named, three are left around the body, and what they give is no person.",
+        reconstruction_lines,
+    ),
+    Part("registration_woman_casual", "Registration of a woman in a wide skirt", _REGISTRATION, registration_lines),
+    Part("registration_man_casual", "Registration of a man", _REGISTRATION + "One frame.", registration_lines),
+    Part("registration_person", "Registration of the embedded person", _REGISTRATION, registration_lines),
+    Part("detection_woman_casual", "Detected keypoints of a woman in a wide skirt", _DETECTION),
+    Part("detection_person", "Detected keypoints of the embedded person", _DETECTION),
+    Part(
+        "detection_scans",
+        "Landmarks of bare scans",
+        "Scans of three captures, as they are and after what `benchmarks.people.VARIANTS` does to them, and of "
+        "procedural people; drawn from twelve sides, detected by MediaPipe, triangulated. Medians of a person's points "
+        "in mm, against the true body's; how far the facing is off, in degrees. Seconds on a busy machine.",
+    ),
+    Part("detection_masks_woman_casual", "Masks of a woman in a wide skirt", _MASKS),
+    Part("detection_masks_person", "Masks of the embedded person", _MASKS),
+    Part(
+        "ablation_woman_casual_every_frame",
+        "Full against trained skinning on a synthetic woman",
+        WOMAN + EVERY_FRAME + "The perceptual distance is ST-LPIPS, which is not LPIPS.",
+        ablation_lines,
+    ),
+    Part(
+        "ablation_woman_casual",
+        "Ablation on a synthetic woman",
+        WOMAN + EVERY_FOURTH + "No perceptual distance was measured. Templates had the scan's webs still.",
+        ablation_lines,
+    ),
+    Part(
+        "training_woman_casual_cpu",
+        "Training on a synthetic woman",
+        WOMAN + EVERY_FRAME + "The perceptual distance is ST-LPIPS, which is not LPIPS.",
+        training_lines,
+    ),
+    Part(
+        "training_woman_casual_paper-small",
+        "The paper's own recipe on the same woman, in the minutes of `cpu`",
+        WOMAN + EVERY_FRAME + RECIPE,
+        training_lines,
+    ),
+    Part("training_person_demo", "Training of `make demo`", PERSON, training_lines),
+    Part(
+        "cloth_from_pose_woman_casual",
+        "What a pose tells of a skirt",
+        WOMAN + " P2S of the skirt in mm over the held-out frames that are listed; predictors are fitted to the "
+        "training frames and the best of many is *chosen on the held-out ones*, which flatters them.",
+    ),
+    Part(
+        "motion_codes_talking",
+        "What can be learned from motion: forty seconds of talking",
+        TALKING + MOTION_CODES + " The shirt is simulated by the house's own solver, as in the capture's making: that "
+        "row says how far the template's garment carries, not how far real cloth is from ours.",
+    ),
+    Part(
+        "ablation_talking",
+        "Forty seconds of talking: the student against trained skinning",
+        TALKING + "Measured on every trained-on and every held-out frame of the held-out camera. The perceptual "
+        "distance is ST-LPIPS, which is not LPIPS. No surface was measured.",
+        ablation_lines,
+    ),
+    Part(
+        "held_out_poses_talking",
+        "Forty seconds of talking: what the student's pictures of new poses hang on",
+        TALKING + "PSNR of the person, and of the pixels of each label, in dB, means over the views: one held-out "
+        "camera, which looks from behind as no other does, and one of the training's, every second held-out frame with "
+        "a true surface. Only the surface differs between the student's rows; its Gaussians were trained on its own.",
+    ),
+    Part(
+        "motion_codes_woman_casual",
+        "What can be learned from motion: a long skirt, two and a half seconds",
+        "Synthetic capture `woman_casual`, exact inputs: 48 training frames at 20 a second, 12 held-out ones after "
+        "them, in motion that training did not show. " + MOTION_CODES,
+    ),
+    Part(
+        "loose_cloth_woman_casual",
+        "Loose clothes in motion that training did not show, a synthetic woman",
+        "The long skirt of `woman_casual`, mm over all 12 held-out frames; exact "
+        "poses. Vertexwise: frame-0 correspondences. Rows differ by where the simulation starts. Milliseconds of CPU a "
+        "step on a busy machine; the solver alone takes about 3 (least of 15).",
+    ),
+    Part(
+        "loose_cloth_woman_casual_noisy",
+        "The same, driven by a tracker's noisy poses",
+        "Template and garment of the exact run, poses of the capture's tracked protocol, not refined: their errors "
+        "move the whole body, skinning as much as the simulation.",
+    ),
+    Part(
+        "loose_cloth_person",
+        "Loose clothes in motion that training did not show, `make demo`",
+        "The skirt of the embedded person, tracked and refined poses at 10 frames a second, one held-out frame with a "
+        "true surface: one frame is little.",
+    ),
+    Part(
+        "fit_reference",
+        "Reference fit",
+        "One frame (0) of `woman_casual`, 12 cameras trained on and 2 held out, whole views of 384x640, so two images "
+        "carry each row; exact inputs; photographs alone, no surface is learned.",
+    ),
+    Part(
+        "build",
+        "Template builds",
+        "Scans with exact parameters and true labels; distances are to the scan as given. Parts within their face "
+        "budget keep the scan's own faces, hence zeros. The one warning: a web of the man's scan between his thighs, "
+        "which the T-pose does not open, stretches when a thigh is raised.",
+        build_lines,
+    ),
+    Part(
+        "scan_alone_captures",
+        "Bodies found in scans alone",
+        "Scans of three captures, as they are and turned, lying, in centimetres, mirrored in pose, decimated and "
+        "noisy; each is read without parameters, labels, units and axis. Errors of the body's vertices and of its 22 "
+        "joints in mm; labels are the share of faces that the scanner saw. Constants were chosen on procedural people "
+        "and on these three. The labels that follow are of the first fit: a build fits once more with them.",
+    ),
+    Part(
+        "scan_alone_people",
+        "Bodies found in scans of procedural people",
+        "The first 12 of the cast of procedural people, in clothes of other cuts, poses and builds, as they are; "
+        "errors as above. Constants were chosen on five of them and three others, among these the second cape below.",
+    ),
+    Part(
+        "scan_alone_capes",
+        "Bodies found in scans of procedural people in capes",
+        "The worst that were seen: a cape hides an arm and the trunk of one, cape and hood arms, trunk and head of the "
+        "other. Confidences of 0.5 and less say so.",
+    ),
+    Part(
+        "registration_icp",
+        "The baseline of a body found in a scan: iterated closest points",
+        "open3d's ICP of the mean body in an A-pose to three scans, from the true facing, a quarter and half a turn "
+        "off; mean distance of the body's vertices in mm. The bodies above are found in the same scans.",
+    ),
+    Part(
+        "placed_landmarks",
+        "Bodies of a few landmarks placed by hand",
+        "Scans of three captures and of six procedural people, without parameters, labels or photographs. A hand is "
+        "simulated: true points with errors of 8 mm a coordinate on the skin, 15 mm within limbs. Errors of the body's "
+        "vertices, of its 22 joints and of the worst joint in mm: of the landmarks alone, registered with the scan, "
+        "and (`searched`) of the search for the body in a bare scan, told the landmarks. Eight leave elbows, knees and "
+        "how a limb turns open, which registration alone does not find from there; the search does.",
+    ),
+    Part(
+        "driving_alone",
+        "Templates of scans alone, driven",
+        "Visible vertices of templates built from a scan with nothing beside it, with exact parameters, and with "
+        "everything true; driven in four hard poses, against the true surface driven by its authored weights. Mean, "
+        "95th and 99th percentile in mm by true part. Vertices farther than 20 mm from the true surface are counted, "
+        "not measured. The rows of what was found alone are of later builds than the two beside them.",
+    ),
+    Part(
+        "photographs_alone_woman_casual",
+        "From photographs alone to a student",
+        "Photographs, cameras and masks of 12 training cameras, and which frames and cameras are held out; no scan, "
+        "parameters, keypoints or labels. The truth is looked at in measuring alone. Bodies and labels against the "
+        "true ones; images as in the trainings below, whose students' figures on exact and on tracked inputs stand "
+        "beside. Seconds of the build are of a machine that did much else.",
+    ),
+    Part(
+        "nasty_scans",
+        "Builds of scans that are not what they should be",
+        "Variants of the fixture's scan, with exact parameters and the true labels but where the name says otherwise; "
+        "what a build warns of and fails, and what it costs. `nothing` is right for whole scans and for holes that "
+        "scanners leave; it is wrong for shoes that are labelled skin, and for a mirrored scan in a symmetric pose it "
+        "says that geometry cannot tell. Bounds of the checks were chosen on these scans and on whole ones of three "
+        "persons.",
+    ),
+    Part(
+        "damaged_files",
+        "Damaged files",
+        "Mutations of valid files (bytes, tokens, values, the file itself) through the doors that read them: each is "
+        "to be read, as what it then says, or refused with an error that says what is wrong. Checkpoints, logs and "
+        "records of stages are left aside where they are damaged, with a word in the log, and count as read.",
+    ),
+    Part(
+        "driving",
+        "Driven garments, two captures with known weights",
+        "Distance in mm of each driven part from the same part driven by its authored weights; `exact` and `noisy` "
+        "parameters apart. Settings of `ours` were chosen on these two captures.",
+    ),
+    Part(
+        "driving_fixture",
+        "Driven garments, the embedded person",
+        "As above; no setting was chosen on her, and her cloth has settled under its weight.",
+    ),
+    Part(
+        "transfer_garments",
+        "Skin-weight transfer on garments that were not seen",
+        "26 garments made by procedure on three open bodies; authored weights by stated rules (last table): the "
+        "figures of loose garments say how well a method agrees with such a rule, those of close ones how well it "
+        "finds the skin below. Distance in mm of the driven garment from the same garment driven by its authored "
+        "weights, over four hard poses. `published` is our implementation of the published method; `ours, 0.1` the "
+        "default before, in which joints of a label overruled matches. Our settings were chosen on the first person's "
+        "garments and on the two captures above.",
+    ),
+    Part("transfer_speed", "Skin-weight transfer, speed", "Both captures' garments; exact parameters."),
+    Part(
+        "labels_by_body",
+        "Labels of scans that nobody labelled",
+        "Procedural people, the embedded person and both captures, labelled by their surface, colours and body alone; "
+        "true labels to compare with, faces that a scanner saw. `a fit`: the body 13 to 45 mm off. Rules and constants "
+        "were chosen with most of these people in view. Bins of confidence end at 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.",
+    ),
+    Part("segmentation", "Labels of scans", "True labels to compare with; label maps as a parser would give them."),
+    Part("rasterizer", "Rasteriser", "Synthetic clouds of Gaussians; milliseconds of forward and of both passes."),
+    Part(
+        "bundle_woman_casual",
+        "The student as a bundle",
+        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in held-out views by torch "
+        "from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of the person, dB; "
+        "`lost`: what the full student has more, mean and worst view; to the full student: the least PSNR of a picture "
+        "against torch's. Loose clothes are where the field has them, in new poses too.",
+    ),
+    Part(
+        "runtime",
+        "The student without torch",
+        "The student of `woman_casual`, preset `cpu`, and students of its sizes with Gaussians as they are sampled "
+        "before any training (their bundles hold blend shapes of zeros, and are small); pictures of 512x512 from "
+        "the front, a new pose each. Milliseconds of the processor on one thread, the least of eight pictures; "
+        "torch's colours count as `world`, the runtime's as `draw`. On two threads the machine was too busy to be "
+        "timed.",
+    ),
+    Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
+    Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
+    Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),
+    Part("capture_loader", "Reading captures", "Written for the measurement; no data set of others was read."),
+    Part("metrics_peers", "Metrics against other libraries", "Template and scan of `woman_casual`."),
+    Part(
+        "viewer_check",
+        "Exported splats in a web viewer",
+        "The embedded person's Gaussians; PSNR between the viewer's picture and our rasteriser's.",
+    ),
+)
+
+
+def part_of(name: str) -> Part:
+    """Return what is said of a stored result; one whose inputs are tracked is described by the exact one's words."""
+    known = {part.name: part for part in PARTS}
+    if name in known:
+        return known[name]
+    base = known.get(name.removesuffix(f"_{TRACKED}"))
+    if base is None:
+        return Part(name, name, "Not described.")
+    return Part(name, f"{base.title}: tracked inputs", f"{TRACKED_INPUTS} Else as below: {base.conditions}", base.lines)
