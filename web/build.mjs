@@ -6,7 +6,7 @@ import { build } from "esbuild";
 
 const here = (path) => fileURLToPath(new URL(path, import.meta.url));
 const shared = { bundle: true, minify: true, target: "es2022", legalComments: "none", charset: "ascii" };
-const asText = { loader: { ".css": "text" } };
+const files = { loader: { ".css": "text", ".wasm": "binary" } };
 
 /** Names and bytes of what the build reads, in one number: a test tells by it whether the built file is old. */
 function digestOfSources() {
@@ -20,16 +20,16 @@ function digestOfSources() {
 if (process.argv.includes("--tests")) {
   await build({
     entryPoints: [here("test/modules.ts")], outfile: here("build/modules.mjs"), bundle: true, format: "esm",
-    target: "es2022", platform: "neutral",
+    target: "es2022", platform: "neutral", ...files,
   });
 } else {
   const outfile = process.argv[2] ?? here("../pipelines/web/assets/player.js");
   const worker = await build({
-    ...shared, entryPoints: [here("src/worker/worker.ts")], format: "iife", write: false,
+    ...shared, ...files, entryPoints: [here("src/worker/worker.ts")], format: "iife", write: false,
   });
   const licence = `/* smplxpp player, Apache-2.0; web/ of the project has its sources ${digestOfSources()} */`;
   await build({
-    ...shared, ...asText, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
+    ...shared, ...files, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
     define: { WORKER_SOURCE: JSON.stringify(worker.outputFiles[0].text) },
   });
   console.log(`${outfile}: ${readFileSync(outfile).length} bytes`);

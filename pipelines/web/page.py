@@ -12,9 +12,11 @@ from smplxpp.core.files.paths import read_text
 PLAYER = Path(__file__).parent / "assets" / "player.js"
 """Built of `web/` by `npm run build`; a test holds it against its sources."""
 INDEX, SCRIPT, AVATAR = "index.html", "player.js", "me.avatar"
-# The page needs its script, a worker made of it, styles made by it, and avatars; it loads nothing else from anywhere.
+# The page needs its script, a worker made of it and the WebAssembly in that, styles made by it, and avatars; it loads
+# nothing else from anywhere.
 _POLICY = (
-    "default-src 'none'; script-src {script}; worker-src blob:; style-src 'unsafe-inline'; img-src data:; {connect}"
+    "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; worker-src blob:; style-src 'unsafe-inline'; "
+    "img-src data:; {connect}"
 )
 _PAGE = """<!doctype html>
 <html lang="en">

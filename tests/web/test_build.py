@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import os
 import re
 import shutil
 import subprocess
-from pathlib import Path
+import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from pipelines.web.page import PLAYER
 from smplxpp.core.rotations import matrix_from_rotvec
+from tests.web.modules import NEEDS_BUILD, TOOLS, WEB, node
 
-WEB = Path(__file__).resolve().parents[2] / "web"
-TOOLS = WEB / "node_modules" / ".bin"
+NATIVE = WEB.parent / "smplxpp" / "native"
+KERNELS = WEB / "src" / "native" / "kernels.wasm"
 
 
 def digest_of_sources() -> str:
@@ -39,22 +41,26 @@ def test_the_built_player_is_that_of_its_sources():
     assert found and found[1] == digest_of_sources(), "build it anew: npm ci && npm run build in web/"
 
 
-NEEDS_BUILD = pytest.mark.skipif(
-    shutil.which("node") is None or not (TOOLS / "esbuild").exists(), reason="no node with web/'s tools: npm ci in web/"
-)
+def test_the_built_kernels_are_those_of_their_sources():
+    """Every file that is compiled is in the list that the build left, as it was then."""
+    listed = dict(line.split(" ") for line in KERNELS.read_bytes().split(b"sources")[-1].decode().splitlines())
+    assert {"runtime/field.cpp", "cloth/xpbd.cpp", "common/simd.hpp", "kernels.mjs"} < listed.keys()
+    for name, digest in listed.items():
+        path = WEB / name if name == "kernels.mjs" else NATIVE / name
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        assert found == digest, f"{name} changed: npm run kernels && npm run build in web/"
+        included = re.findall(r'^#include "(.+)"', path.read_text(), re.MULTILINE)
+        assert name == "kernels.mjs" or set(included) <= listed.keys()
 
 
-def node(script: str, *, given: object = None) -> object:
-    """Run a script that has the player's modules as `m` and JSON as `given`; return what `result` is."""
-    subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True, capture_output=True, timeout=900)
-    whole = f"""import * as m from {json.dumps((WEB / "build" / "modules.mjs").as_uri())};
-    const given = {json.dumps(given)};
-    {script}
-    process.stdout.write(JSON.stringify(result));"""
-    done = subprocess.run(
-        ["node", "--input-type=module", "-e", whole], check=True, capture_output=True, text=True, timeout=900
-    )
-    return json.loads(done.stdout)
+@pytest.mark.slow
+@NEEDS_BUILD
+@pytest.mark.skipif(find_spec("ziglang") is None, reason="no compiler for the kernels: pip install ziglang==0.17.1")
+def test_a_build_of_the_kernels_gives_the_same_bytes(tmp_path):
+    out = tmp_path / "kernels.wasm"
+    command = ["node", str(WEB / "kernels.mjs"), str(out)]
+    subprocess.run(command, check=True, capture_output=True, timeout=3600, env={**os.environ, "PYTHON": sys.executable})
+    assert out.read_bytes() == KERNELS.read_bytes()
 
 
 @NEEDS_BUILD

@@ -1,8 +1,8 @@
 /** What the tests take from the player. */
 export { Deformer, RECORD } from "../src/avatar/deform.ts";
 export { poseAt, restPose, turned } from "../src/avatar/motion.ts";
-export { DepthSorter } from "../src/avatar/sort.ts";
 export { BundleError } from "../src/bundle/errors.ts";
 export { readBundle } from "../src/bundle/read.ts";
 export { sha256Here } from "../src/bundle/sha256.ts";
 export { orbitCamera } from "../src/render/camera.ts";
+export { Native } from "../src/native/memory.ts";

@@ -276,7 +276,7 @@ void check(const Model& m) {
     check_indices(m.hinge, 4 * m.hinges, m.particles);
     check_indices(m.collider_face, 3 * m.collider_faces, m.collider_vertices);
     for (int64_t i = 0; i < m.particles; ++i)
-        if (m.anchor[i] < -1 || m.anchor[i] >= m.particles) throw std::out_of_range("anchor");
+        if (m.anchor[i] < -1 || m.anchor[i] >= m.particles) smplxpp::throw_out_of_range("anchor");
 }
 
 }  // namespace
@@ -286,7 +286,7 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_advance(const Model* model, const Forces* f
                                              int32_t substeps, int32_t contacts_every, float* position, float* velocity) {
     return smplxpp::guarded([&] {
         check(*model);
-        if (substeps < 1 || contacts_every < 1) throw std::out_of_range("substeps");
+        if (substeps < 1 || contacts_every < 1) smplxpp::throw_out_of_range("substeps");
         Solver(*model, *forces, (Vec3*)position, (Vec3*)velocity).advance(*moments, seconds, substeps, contacts_every);
     });
 }

@@ -1,5 +1,17 @@
-// Running a function on several threads.
+// Running a function on several threads; in WebAssembly, which is built without any, on the caller's.
 #pragma once
+#if defined(__wasm__)
+
+namespace smplxpp {
+
+template <class Work>
+void run_threads(int threads, Work&& work) {
+    for (int t = 0; t < threads; ++t) work(t);
+}
+
+}  // namespace smplxpp
+
+#else
 #include <atomic>
 #include <cstddef>
 #include <mutex>
@@ -70,3 +82,5 @@ void run_threads(int threads, Work&& work) {
 }
 
 }  // namespace smplxpp
+
+#endif

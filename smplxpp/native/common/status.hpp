@@ -1,5 +1,6 @@
 // How every exported function of the library ends: with a number, whatever was thrown, since an exception that crossed the
 // C interface would end the process. smplxpp/native/__init__.py says them again, and turns them into Python's exceptions.
+// WebAssembly is built without exceptions: there the module traps, which the page's JavaScript catches.
 #pragma once
 #include <cstdint>
 #include <new>
@@ -13,6 +14,10 @@ constexpr int32_t DONE = 0, OUT_OF_MEMORY = 1, OUT_OF_RANGE = 2, OVER_LIMIT = 3,
 
 // More work than the caller allows.
 struct OverLimit {};
+
+#if defined(__cpp_exceptions)
+[[noreturn]] inline void throw_out_of_range(const char* what) { throw std::out_of_range(what); }
+[[noreturn]] inline void throw_over_limit() { throw OverLimit(); }
 
 template <class Work>
 int32_t guarded(Work&& work) noexcept {
@@ -31,13 +36,23 @@ int32_t guarded(Work&& work) noexcept {
         return FAILED;
     }
 }
+#else
+[[noreturn]] inline void throw_out_of_range(const char*) { __builtin_trap(); }
+[[noreturn]] inline void throw_over_limit() { __builtin_trap(); }
 
-// Every index in [0, bound), or std::out_of_range.
+template <class Work>
+int32_t guarded(Work&& work) noexcept {
+    work();
+    return DONE;
+}
+#endif
+
+// Every index in [0, bound), or it is refused.
 template <class Index>
 void check_indices(const Index* indices, int64_t count, int64_t bound) {
     bool outside = false;
     for (int64_t i = 0; i < count; ++i) outside |= (uint64_t)(int64_t)indices[i] >= (uint64_t)bound;
-    if (outside) throw std::out_of_range("index");
+    if (outside) throw_out_of_range("index");
 }
 
 }  // namespace smplxpp

@@ -12,7 +12,7 @@ namespace {
 using namespace smplxpp;
 
 constexpr int MOST_WIDTH = 512;
-constexpr int OUTPUTS = NATIVE == 16 ? 8 : 4;  // sums that registers hold
+constexpr int OUTPUTS = NATIVE == 16 ? 8 : NATIVE == 8 ? 4 : 2;  // sums that registers hold
 
 // Mirrored by avatar/runtime/kernels.py.
 struct Network {
@@ -48,10 +48,10 @@ SMPLXPP_EXPORT int32_t smplxpp_runtime_field(const Network* net, int64_t S, cons
                                              const int32_t* at, int64_t rows, float* out, int32_t threads) {
     return guarded([&] {
         const int64_t width = net->width, blocks = (net->points + LANES - 1) / LANES;
-        if (width > MOST_WIDTH) throw OverLimit();
+        if (width > MOST_WIDTH) throw_over_limit();
         check_indices(member, net->points, S);
         if (at) check_indices(at, net->points, rows);
-        else if (rows < net->points) throw std::out_of_range("rows");
+        else if (rows < net->points) throw_out_of_range("rows");
         std::vector<float> of_frame(S * width);
         for (int64_t s = 0; s < S; ++s)
             for (int64_t o = 0; o < width; ++o) {

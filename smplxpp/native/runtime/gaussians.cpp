@@ -75,7 +75,7 @@ struct Bound {
 SMPLXPP_EXPORT int32_t smplxpp_runtime_blend(const Shapes* in, const float* z, const float* keep, float* added, int32_t threads) {
     return guarded([&] {
         if (in->row) check_indices(in->row, in->rows, in->count);
-        else if (in->rows > in->count) throw std::out_of_range("rows");
+        else if (in->rows > in->count) throw_out_of_range("rows");
         if (in->part) check_indices(in->part, in->rows, in->parts);
         const int64_t blocks = (in->rows + LANES - 1) / LANES;
         run_threads(threads, [&](int t) {
@@ -93,7 +93,7 @@ SMPLXPP_EXPORT int32_t smplxpp_runtime_world(const Bound* in, const float* posed
                                              float* scales, float* dc, float* rotations, int32_t threads) {
     return guarded([&] {
         check_indices(in->face, 3 * in->faces, in->vertices);
-        if (in->first[0] != 0 || in->first[in->faces] != in->count) throw std::out_of_range("first");
+        if (in->first[0] != 0 || in->first[in->faces] != in->count) throw_out_of_range("first");
         run_threads(threads, [&](int t) {
             for (int64_t f = in->faces * t / threads, end = in->faces * (t + 1) / threads; f < end; ++f) {
                 const int32_t* face = in->face + 3 * f;

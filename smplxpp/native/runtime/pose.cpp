@@ -31,7 +31,7 @@ SMPLXPP_EXPORT int32_t smplxpp_runtime_pose(int64_t J, const int32_t* parents, c
             if (features && j > 0)
                 for (int k = 0; k < 9; ++k) features[9 * (j - 1) + k] = (float)(R[k] - (k % 4 == 0 ? 1.0 : 0.0));
             const int32_t parent = parents[j];
-            if (parent >= j) throw std::out_of_range("parent");
+            if (parent >= j) smplxpp::throw_out_of_range("parent");
             if (parent < 0) {
                 for (int k = 0; k < 9; ++k) out[k] = R[k];
                 for (int k = 0; k < 3; ++k) out[9 + k] = rest[3 * j + k] + transl[k];

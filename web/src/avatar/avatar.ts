@@ -104,13 +104,18 @@ export interface KnownPoses {
 /** Gaussians on the triangles of the mesh. */
 export interface Gaussians {
   count: number;
+  /** They come in the order of their triangles: (N,) the triangle of each, (F + 1,) where those of a triangle begin. */
   face: Int32Array;
+  first: Int32Array;
   /** (N, 2) weights of the first two corners. */
   barycentric: Float32Array;
   /** (N, 3) metres in the triangle's frame, the offset along the normal included. */
   offset: Float32Array;
-  /** (N, 6) covariance in the triangle's frame, in squared mean edge lengths: xx xy xz yy yz zz. */
-  covariance: Float32Array;
+  /** (N, 4) wxyz in the triangle's frame, and (N, 2) standard deviations in its plane, in its mean edge lengths. */
+  quats: Float32Array;
+  scales: Float32Array;
+  /** Along the normal, the same for all. */
+  thickness: number;
   opacity: Float32Array;
   /** (N, 3) sRGB, and (N, K, 3) harmonics of degree 1 and up. */
   color: Float32Array;

@@ -1,173 +1,173 @@
-/** An avatar in a pose: from joints to Gaussians in the world, as `avatar.models.student` does it. */
+/** An avatar in a pose: from joints to Gaussians in the world, by the runtime's kernels (`avatar/runtime/player.py`). */
 
-import type { Avatar, Pose } from "./avatar.ts";
-import { triangleFrames } from "./frames.ts";
-import { harmonics } from "./harmonics.ts";
-import { FieldEvaluator } from "./networks.ts";
-import { Residuals } from "./residuals.ts";
-import { JointTransforms } from "./skeleton.ts";
+import { Native, type Block } from "../native/memory.ts";
+import type { Avatar, Pose, RestShapes } from "./avatar.ts";
+import { BlendAdder } from "./blend.ts";
+import { FieldEvaluator } from "./field.ts";
 
-/** Numbers of a Gaussian in the world: centre 3, opacity, covariance 6 (xx xy xz yy yz zz), colour 3, unused. */
+/** Numbers of a Gaussian for the renderers: centre 3, opacity, covariance 6 (xx xy xz yy yz zz), colour 3, unused. */
 export const RECORD = 14;
 const BODY_JOINTS = 21;
+/** What a pose takes time for, as `avatar.runtime.player` counts it. */
+export const PARTS = ["pose", "field", "blend", "world"] as const;
 
-/** Poses an avatar; holds the working memory. WebAssembly that does the same takes its place here. */
+/** Displacements (V, 3) of simulated clothes, metres, and how much of each vertex's displacement they are, (V,). */
+export interface Displaced {
+  displacements: Block<Float32Array>;
+  share: Block<Float32Array>;
+  /** (N,) what part of the body's blend shapes each Gaussian takes. */
+  keep: Block<Float32Array>;
+}
+
+interface Basis {
+  rows: Block<Int32Array>;
+  basis: Block<Float32Array>;
+  size: number;
+}
+
+/** Poses an avatar; holds the working memory. */
 export class Deformer {
-  /** (V, 3) of the last pose, metres. */
-  readonly vertices: Float32Array;
-  /** (N, 3) of the last pose, metres. */
-  readonly centers: Float32Array;
-  private readonly joints: JointTransforms;
+  readonly native = new Native();
+  /** Milliseconds of the last pose by part. */
+  readonly milliseconds: Record<(typeof PARTS)[number], number> = { pose: 0, field: 0, blend: 0, world: 0 };
+  /** (J, 3, 4) of the last pose: the posed body from the T-pose. */
+  readonly transforms: Block<Float32Array>;
+  /** (V, 3) of the last pose, in the T-pose: with expression and correctives, without the field. */
+  readonly rest: Block<Float32Array>;
+  private readonly posed: Block<Float32Array>;
+  private readonly skeleton: { parents: Block<Int32Array>; turns: Block<Float64Array>; rest: Block<Float64Array>; place: Block<Float64Array> };
+  private readonly features: Block<Float32Array> | null;
+  private readonly shapes: { expressions: Basis; correctives: Basis | null; expression: Block<Float32Array> };
   private readonly field: FieldEvaluator | null;
-  private readonly residuals: Residuals;
-  private readonly rest: Float32Array;
-  private readonly moved: Float32Array;
-  private readonly rotations: Float32Array;
-  private readonly lengths: Float32Array;
+  private readonly blend: BlendAdder | null;
+  private readonly surface: Block<Uint8Array>;
+  private readonly bound: Block<Uint8Array>;
+  private readonly world: Record<"means" | "quats" | "scales" | "colors" | "rotations", Block<Float32Array>>;
+  private readonly splats: Block<Uint8Array>;
+  private readonly sorting: {
+    row: Block<Float32Array>; part: Block<Uint8Array>; hidden: Block<Uint8Array>; order: Block<Uint32Array>;
+    range: Block<Float32Array>; count: Block<Int32Array>;
+  };
+  private readonly eye: Block<Float32Array>;
+  private readonly records: Block<Float32Array>;
 
   constructor(readonly avatar: Avatar) {
-    const { mesh, skeleton } = avatar;
-    this.vertices = new Float32Array(mesh.vertices.length);
-    this.rest = new Float32Array(mesh.vertices.length);
-    this.moved = new Float32Array(mesh.vertices.length);
-    this.rotations = new Float32Array(3 * mesh.faces.length);
-    this.lengths = new Float32Array(mesh.faces.length / 3);
-    this.centers = new Float32Array(3 * avatar.gaussians.count);
-    this.joints = new JointTransforms(skeleton);
-    this.field = avatar.field && new FieldEvaluator(avatar.field);
-    this.residuals = new Residuals(avatar);
+    const { native } = this, { mesh, skeleton, gaussians: g, field } = avatar;
+    const J = skeleton.parents.length, V = mesh.vertices.length / 3, F = mesh.faces.length / 3, N = g.count;
+    this.skeleton = {
+      parents: native.keep(skeleton.parents), turns: native.room(Float64Array, 3 * J), rest: native.room(Float64Array, 3 * J),
+      place: native.room(Float64Array, 3),
+    };
+    this.transforms = native.floats(12 * J);
+    this.features = mesh.correctives && native.floats(mesh.correctives.size);
+    const basis = ({ rows, basis, size }: RestShapes) => ({ rows: native.keep(rows), basis: native.keep(basis), size });
+    this.shapes = {
+      expressions: basis(mesh.expressions), correctives: mesh.correctives && basis(mesh.correctives),
+      expression: native.floats(mesh.expressions.size),
+    };
+    this.field = field && new FieldEvaluator(native, field);
+    this.blend = avatar.blendShapes && new BlendAdder(native, avatar.blendShapes, avatar.known, N);
+    this.rest = native.keep(mesh.vertices);
+    this.posed = native.floats(3 * V);
+    this.surface = native.struct([V, J, mesh.influences, field ? field.setOf.length : 0, field ? field.neighbourCount : 0], [
+      native.keep(mesh.joints), native.keep(mesh.weights), field && native.keep(field.neighbours), field && native.keep(field.weights),
+    ]);
+    const faces = native.keep(mesh.faces), dc = native.keep(g.color);
+    this.bound = native.struct([F, N, V], [
+      faces, native.keep(g.first), native.keep(g.barycentric), native.keep(g.offset), native.keep(g.scales), native.keep(g.quats), dc,
+      [g.thickness],
+    ]);
+    this.world = {
+      means: native.floats(3 * N), quats: native.floats(4 * N), scales: native.floats(3 * N), colors: native.floats(3 * N),
+      rotations: native.floats(9 * F),
+    };
+    const { means, quats, scales, colors, rotations } = this.world;
+    this.splats = native.struct([N, g.harmonicCount], [
+      means, quats, scales, native.keep(g.opacity), colors, native.keep(g.harmonics), native.keep(g.face), rotations,
+    ]);
+    this.sorting = {
+      row: native.floats(4), part: native.keep(g.part), hidden: native.room(Uint8Array, 256), order: native.room(Uint32Array, N),
+      range: native.floats(2), count: native.room(Int32Array, 1),
+    };
+    this.eye = native.floats(3);
+    this.records = native.floats(RECORD * N);
   }
 
-  /** Moves the mesh, its triangles' frames and the Gaussians' residuals to a pose. */
-  pose(pose: Pose): void {
-    const { mesh } = this.avatar;
+  /** (N, 3) of the last pose, metres; good until the next one. */
+  get centers(): Float32Array {
+    return this.world.means.view;
+  }
+
+  /** (V, 3) of the last pose, metres; good until the next one. */
+  get vertices(): Float32Array {
+    return this.posed.view;
+  }
+
+  /** Brings skeleton and surface at rest to a pose: `transforms` and `rest`. */
+  joints(pose: Pose): void {
+    const { native, features, transforms, rest, shapes } = this, { mesh, skeleton } = this.avatar;
+    const { parents, turns, rest: joints, place } = this.skeleton, at = joints.view, size = mesh.expressions.size;
+    for (let i = 0; i < at.length; ++i) {
+      let value = skeleton.rest[i];
+      for (let e = 0; e < size; ++e) value += skeleton.byExpression[i * size + e] * pose.expression[e];
+      at[i] = value;
+    }
+    turns.view.set(pose.rotations);
+    place.view.set(pose.translation);
+    native.run("runtime_pose", BigInt(parents.count), parents, turns, joints, place, transforms, features);
+    rest.view.set(mesh.vertices);
+    shapes.expression.view.set(pose.expression);
+    if (pose.expression.some((value) => value !== 0)) this.shape(shapes.expressions, shapes.expression);
+    if (shapes.correctives && features) this.shape(shapes.correctives, features);
+  }
+
+  /** Moves everything to a pose; clothes that are simulated are where they are said to be. */
+  pose(pose: Pose, cloth: Displaced | null = null): void {
+    const { native, field, blend, transforms, rest, posed, world } = this;
     const theta = Float32Array.from(pose.rotations.subarray(3, 3 + 3 * BODY_JOINTS));
-    this.joints.pose(pose);
-    this.field?.displacements(theta, this.moved);
-    this.shape(pose);
-    skin(this.rest, mesh.joints, mesh.weights, this.joints.posedFromRest, this.vertices);
-    triangleFrames(this.vertices, mesh.faces, this.rotations, this.lengths);
-    this.residuals.pose(pose, theta);
-    this.place();
-  }
-
-  /** `u v1 + v v2 + (1 - u - v) v3 + R (offset + residual)`. */
-  private place(): void {
-    const { gaussians: g, mesh: { faces } } = this.avatar;
-    const { rotations: R, vertices: x, centers } = this;
-    const extra = this.residuals.values, N = g.count, moving = extra.length > 0;
-    for (let i = 0; i < N; ++i) {
-      const face = g.face[i], f = 9 * face;
-      const a = 3 * faces[3 * face], b = 3 * faces[3 * face + 1], c = 3 * faces[3 * face + 2];
-      const u = g.barycentric[2 * i], v = g.barycentric[2 * i + 1], w = 1 - u - v;
-      let n = g.offset[3 * i], q = g.offset[3 * i + 1], s = g.offset[3 * i + 2];
-      if (moving) n += extra[i], q += extra[N + i], s += extra[2 * N + i];
-      for (let k = 0; k < 3; ++k) {
-        const turned = R[f + 3 * k] * n + R[f + 3 * k + 1] * q + R[f + 3 * k + 2] * s;
-        centers[3 * i + k] = u * x[a + k] + v * x[b + k] + w * x[c + k] + turned;
-      }
-    }
-  }
-
-  /** The T-pose with expression, pose correctives and the field's displacements. */
-  private shape(pose: Pose): void {
-    const { vertices, expressions, correctives } = this.avatar.mesh;
-    for (let i = 0; i < vertices.length; ++i) this.rest[i] = vertices[i] + this.moved[i];
-    addShapes(this.rest, expressions.rows, expressions.basis, Float32Array.from(pose.expression));
-    if (correctives) {
-      const feature = new Float32Array(correctives.size);
-      for (let i = 0; i < feature.length; ++i) feature[i] = this.joints.local[9 + i] - (i % 9 % 4 === 0 ? 1 : 0);
-      addShapes(this.rest, correctives.rows, correctives.basis, feature);
-    }
+    const times = [performance.now()];
+    const lap = () => times.push(performance.now());
+    this.joints(pose);
+    lap();
+    field?.evaluate(theta);
+    lap();
+    blend?.pose(pose, theta, cloth && cloth.keep);
+    lap();
+    native.run("runtime_surface", this.surface, rest, field && field.moved, cloth && cloth.displacements, cloth && cloth.share,
+      transforms, posed, 1);
+    native.run("runtime_world", this.bound, posed, blend && blend.added, world.means, world.quats, world.scales, world.colors,
+      world.rotations, 1);
+    lap();
+    PARTS.forEach((part, k) => (this.milliseconds[part] = times[k + 1] - times[k]));
   }
 
   /**
-   * Writes the Gaussians of the last pose, in the given order, as a camera at `eye` (metres) sees them.
+   * Chooses the Gaussians of the last pose that are before a camera's near plane and whose part is shown.
    *
-   * @param order which Gaussians; null: all.
+   * @param row the third row of the camera's rotation, and the z of its translation. @param hidden parts.
+   * @param sorted nearest first, by depth in 16 bits; else as they come.
+   * @returns how many there are, and the least and largest depth, metres.
    */
-  records(eye: ArrayLike<number>, order: Uint32Array | null, out: Float32Array): void {
-    const g = this.avatar.gaussians;
-    const { rotations: R, lengths, centers } = this;
-    const extra = this.residuals.values, N = g.count, K = g.harmonicCount, moving = extra.length > 0;
-    const basis = new Float64Array(Math.max(K, 3));
-    const count = order ? order.length : N;
-    for (let row = 0, to = 0; row < count; ++row, to += RECORD) {
-      const i = order ? order[row] : row;
-      const face = g.face[i], f = 9 * face;
-      const mx = centers[3 * i], my = centers[3 * i + 1], mz = centers[3 * i + 2];
-      out[to] = mx, out[to + 1] = my, out[to + 2] = mz;
-      out[to + 3] = g.opacity[i];
-
-      // R C R^T, C in squared edge lengths.
-      const c = 6 * i, square = lengths[face] * lengths[face];
-      const xx = square * g.covariance[c], xy = square * g.covariance[c + 1], xz = square * g.covariance[c + 2];
-      const yy = square * g.covariance[c + 3], yz = square * g.covariance[c + 4], zz = square * g.covariance[c + 5];
-      const ax = R[f] * xx + R[f + 1] * xy + R[f + 2] * xz, ay = R[f] * xy + R[f + 1] * yy + R[f + 2] * yz;
-      const az = R[f] * xz + R[f + 1] * yz + R[f + 2] * zz;
-      const bx = R[f + 3] * xx + R[f + 4] * xy + R[f + 5] * xz, by = R[f + 3] * xy + R[f + 4] * yy + R[f + 5] * yz;
-      const bz = R[f + 3] * xz + R[f + 4] * yz + R[f + 5] * zz;
-      const cx = R[f + 6] * xx + R[f + 7] * xy + R[f + 8] * xz, cy = R[f + 6] * xy + R[f + 7] * yy + R[f + 8] * yz;
-      const cz = R[f + 6] * xz + R[f + 7] * yz + R[f + 8] * zz;
-      out[to + 4] = ax * R[f] + ay * R[f + 1] + az * R[f + 2];
-      out[to + 5] = ax * R[f + 3] + ay * R[f + 4] + az * R[f + 5];
-      out[to + 6] = ax * R[f + 6] + ay * R[f + 7] + az * R[f + 8];
-      out[to + 7] = bx * R[f + 3] + by * R[f + 4] + bz * R[f + 5];
-      out[to + 8] = bx * R[f + 6] + by * R[f + 7] + bz * R[f + 8];
-      out[to + 9] = cx * R[f + 6] + cy * R[f + 7] + cz * R[f + 8];
-
-      let red = g.color[3 * i], green = g.color[3 * i + 1], blue = g.color[3 * i + 2];
-      if (moving) red += extra[3 * N + i], green += extra[4 * N + i], blue += extra[5 * N + i];
-      if (K) {
-        let dx = mx - eye[0], dy = my - eye[1], dz = mz - eye[2];
-        const inverse = 1 / Math.sqrt(dx * dx + dy * dy + dz * dz);
-        dx *= inverse, dy *= inverse, dz *= inverse;
-        const lx = R[f] * dx + R[f + 3] * dy + R[f + 6] * dz;
-        const ly = R[f + 1] * dx + R[f + 4] * dy + R[f + 7] * dz;
-        const lz = R[f + 2] * dx + R[f + 5] * dy + R[f + 8] * dz;
-        harmonics(lx, ly, lz, K, basis);
-        for (let k = 0, at = 3 * K * i; k < K; ++k, at += 3) {
-          red += basis[k] * g.harmonics[at];
-          green += basis[k] * g.harmonics[at + 1];
-          blue += basis[k] * g.harmonics[at + 2];
-        }
-      }
-      out[to + 10] = Math.max(0, red), out[to + 11] = Math.max(0, green), out[to + 12] = Math.max(0, blue);
-    }
+  order(row: number[], near: number, hidden: Iterable<number>, sorted: boolean): { count: number; depths: [number, number] } {
+    const own = this.sorting;
+    own.row.view.set(row);
+    own.hidden.view.fill(0);
+    for (const part of hidden) own.hidden.view[part] = 1;
+    this.native.run("web_order", BigInt(this.avatar.gaussians.count), this.world.means, own.row, near, own.part, own.hidden,
+      sorted ? 1 : 0, own.order, own.range, own.count);
+    const [least, most] = own.range.view;
+    return { count: own.count.view[0], depths: [least, most] };
   }
-}
 
-/** `rest += basis coefficients` at some vertices. */
-function addShapes(rest: Float32Array, rows: Int32Array, basis: Float32Array, coefficients: Float32Array): void {
-  const size = coefficients.length;
-  // Most coefficients of most poses are zero.
-  const used = [...coefficients.keys()].filter((k) => coefficients[k] !== 0);
-  for (let r = 0; r < rows.length; ++r) {
-    for (let c = 0; c < 3; ++c) {
-      let sum = 0;
-      for (const k of used) sum += basis[(3 * r + c) * size + k] * coefficients[k];
-      rest[3 * rows[r] + c] += sum;
-    }
+  /** Returns `RECORD` numbers of each of the first `count` of the last order as an eye (metres) sees them; good until the next pose. */
+  recordsFor(eye: ArrayLike<number>, count: number): Float32Array {
+    this.eye.view.set(eye);
+    this.native.run("web_records", this.splats, this.eye, this.sorting.order, BigInt(count), this.records);
+    return this.records.view.subarray(0, RECORD * count);
   }
-}
 
-/** `x = sum_j w_j G_j rest`. */
-function skin(
-  rest: Float32Array, joints: Int32Array, weights: Float32Array, transforms: Float64Array, out: Float32Array,
-): void {
-  const count = rest.length / 3, influences = weights.length / count;
-  const m = new Float64Array(12);
-  for (let v = 0; v < count; ++v) {
-    m.fill(0);
-    for (let k = v * influences; k < (v + 1) * influences; ++k) {
-      const weight = weights[k];
-      if (weight === 0) continue;
-      const at = 12 * joints[k];
-      for (let i = 0; i < 12; ++i) m[i] += weight * transforms[at + i];
-    }
-    const x = rest[3 * v], y = rest[3 * v + 1], z = rest[3 * v + 2];
-    out[3 * v] = m[0] * x + m[1] * y + m[2] * z + m[3];
-    out[3 * v + 1] = m[4] * x + m[5] * y + m[6] * z + m[7];
-    out[3 * v + 2] = m[8] * x + m[9] * y + m[10] * z + m[11];
+  private shape({ rows, basis, size }: Basis, coefficients: Block<Float32Array>): void {
+    const { native, rest } = this;
+    native.run("runtime_basis", BigInt(rows.count), BigInt(size), BigInt(rest.count / 3), rows, basis, coefficients, rest);
   }
 }

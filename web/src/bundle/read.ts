@@ -185,20 +185,24 @@ function blendShapes(t: Tensors, jaw: boolean): BlendShapes {
 function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians {
   const { N, K, F } = t.sizes;
   const perFace = t.ints("gaussians.per_face"), face = new Int32Array(N), part = new Uint8Array(N);
+  const first = new Int32Array(F + 1);
   let filled = 0;
   for (let f = 0; f < F; ++f) {
     face.fill(f, filled, filled + perFace[f]);
     part.fill(parts[faces[3 * f]], filled, filled + perFace[f]);
     filled += perFace[f];
+    first[f + 1] = filled;
   }
   if (filled !== N || perFace.some((count) => count < 0)) {
     throw new BundleError("gaussians.per_face", `counts of ${N}`, `${filled}`, EXPORT_AGAIN);
   }
   return {
-    count: N, face, part,
+    count: N, face, first, part,
     barycentric: t.floats("gaussians.barycentric"),
     offset: t.floats("gaussians.offset"),
-    covariance: covariances(t.floats("gaussians.quats"), t.floats("gaussians.log_scales")),
+    quats: t.floats("gaussians.quats"),
+    scales: t.floats("gaussians.log_scales").map(Math.exp),
+    thickness: THICKNESS,
     opacity: t.floats("gaussians.opacities"),
     color: t.floats("gaussians.dc"),
     harmonics: t.floats("gaussians.sh"),
@@ -213,28 +217,6 @@ function normalised(rows: Float32Array, width: number): Float32Array {
     let sum = 0;
     for (let k = 0; k < width; ++k) sum += rows[at + k];
     for (let k = 0; k < width; ++k) out[at + k] = rows[at + k] / Math.max(sum, 1e-12);
-  }
-  return out;
-}
-
-/** (N, 6) of `R diag(s^2) R^T` with `s = [THICKNESS, exp, exp]`, in squared edge lengths. */
-function covariances(quats: Float32Array, logScales: Float32Array): Float32Array {
-  const count = quats.length / 4, out = new Float32Array(6 * count);
-  for (let i = 0; i < count; ++i) {
-    const length = Math.hypot(...quats.subarray(4 * i, 4 * i + 4));
-    const [w, x, y, z] = quats.subarray(4 * i, 4 * i + 4).map((value) => value / length);
-    const rows = [
-      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ];
-    const squares = [THICKNESS ** 2, Math.exp(2 * logScales[2 * i]), Math.exp(2 * logScales[2 * i + 1])];
-    let to = 6 * i;
-    for (let r = 0; r < 3; ++r) {
-      for (let c = r; c < 3; ++c) {
-        out[to++] = squares.reduce((sum, square, k) => sum + square * rows[r][k] * rows[c][k], 0);
-      }
-    }
   }
   return out;
 }

@@ -1,23 +1,4 @@
-/** Rotations: axis-angle vectors in radians, row-major 3x3 matrices, unit quaternions wxyz. */
-
-/** Writes the matrix of the axis-angle vector at `vector[at..at+2]` to `out[to..to+8]` (Rodrigues). */
-export function matrixFromRotvec(vector: ArrayLike<number>, at: number, out: Float64Array, to: number): void {
-  const x = vector[at], y = vector[at + 1], z = vector[at + 2];
-  const square = x * x + y * y + z * z;
-  const angle = Math.sqrt(square);
-  // Series where the quotients lose their digits.
-  const s = angle > 1e-4 ? Math.sin(angle) / angle : 1 - square / 6;
-  const c = angle > 1e-4 ? (1 - Math.cos(angle)) / square : 0.5 - square / 24;
-  out[to] = 1 - c * (y * y + z * z);
-  out[to + 1] = c * x * y - s * z;
-  out[to + 2] = c * x * z + s * y;
-  out[to + 3] = c * x * y + s * z;
-  out[to + 4] = 1 - c * (x * x + z * z);
-  out[to + 5] = c * y * z - s * x;
-  out[to + 6] = c * x * z - s * y;
-  out[to + 7] = c * y * z + s * x;
-  out[to + 8] = 1 - c * (x * x + y * y);
-}
+/** Rotations: axis-angle vectors in radians, unit quaternions wxyz. */
 
 export type Quaternion = [number, number, number, number];
 

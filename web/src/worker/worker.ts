@@ -3,7 +3,6 @@
 import type { Avatar } from "../avatar/avatar.ts";
 import { Deformer, RECORD } from "../avatar/deform.ts";
 import { poseAt, restPose } from "../avatar/motion.ts";
-import { DepthSorter } from "../avatar/sort.ts";
 import { BundleError } from "../bundle/errors.ts";
 import { readBundle } from "../bundle/read.ts";
 import { eye, NEAR } from "../render/camera.ts";
@@ -16,7 +15,6 @@ const thread = self as unknown as {
 };
 
 let deformer: Deformer | null = null;
-let sorter: DepthSorter | null = null;
 
 thread.onmessage = async (event) => {
   try {
@@ -31,7 +29,6 @@ thread.onmessage = async (event) => {
 async function open(data: ArrayBuffer): Promise<[Reply, Transferable[]]> {
   const avatar = await readBundle(new Uint8Array(data));
   deformer = new Deformer(avatar);
-  sorter = new DepthSorter(avatar.gaussians.count);
   return [{ kind: "opened", summary: summary(avatar, deformer) }, []];
 }
 
@@ -59,19 +56,18 @@ function summary(avatar: Avatar, first: Deformer): Summary {
 }
 
 function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferable[]] {
-  if (!deformer || !sorter) throw new Error("no avatar is open");
-  const { camera } = request, { gaussians } = deformer.avatar;
+  if (!deformer) throw new Error("no avatar is open");
+  const { camera } = request;
   const started = performance.now();
   deformer.pose(request.pose);
   const posed = performance.now();
-  const row = camera.view.slice(8, 12);
   // Where the page sorts, this only leaves out what is hidden or behind the camera.
-  const order = sorter.sort(deformer.centers, row, NEAR, gaussians.part, new Set(request.hidden), request.sorted);
+  const { count, depths } = deformer.order(camera.view.slice(8, 12), NEAR, request.hidden, request.sorted);
   const sorted = performance.now();
-  const size = 4 * RECORD * gaussians.count;
+  const size = 4 * RECORD * deformer.avatar.gaussians.count;
   const records = request.records?.byteLength === size ? request.records : new ArrayBuffer(size);
-  deformer.records(eye(camera), order, new Float32Array(records));
+  new Float32Array(records).set(deformer.recordsFor(eye(camera), count));
   const packed = performance.now();
   const deform = posed - started + (packed - sorted), sort = sorted - posed;
-  return [{ kind: "frame", records, count: order.length, camera, depths: sorter.range, deform, sort }, [records]];
+  return [{ kind: "frame", records, count, camera, depths, deform, sort }, [records]];
 }

@@ -1,0 +1,107 @@
+// What the page's renderers take: Gaussians of the world by depth, and a record of each. Built for WebAssembly alone
+// (web/kernels.mjs); the rasteriser of smplxpp/native/gaussians does the same in its own way.
+#include <algorithm>
+#include <cfloat>
+#include <cstring>
+#include <vector>
+
+#include "common/status.hpp"
+#include "gaussians/harmonics.hpp"
+
+namespace {
+
+using namespace smplxpp::binding;
+
+constexpr int RECORD = 14, BINS = 1 << 16;
+
+// Mirrored by web/src/native/kernels.ts: N Gaussians as smplxpp_runtime_world writes them.
+struct Splats {
+    int64_t count, harmonics;
+    const float *means, *quats, *scales, *opacities, *dc;  // (N, 3) (N, 4) (N, 3) (N) (N, 3)
+    const float* sh;                                       // (N, harmonics, 3)
+    const int32_t* face;                                   // (N)
+    const float* rotations;                                // (F, 3, 3)
+};
+
+// xx xy xz yy yz zz of R diag(s)^2 R^T.
+void covariance(const float* q, const float* s, float* out) {
+    const float w = q[0], x = q[1], y = q[2], z = q[3], two = 2.0f / (w * w + x * x + y * y + z * z);
+    const float R[9] = {1 - two * (y * y + z * z), two * (x * y - w * z),     two * (x * z + w * y),
+                        two * (x * y + w * z),     1 - two * (x * x + z * z), two * (y * z - w * x),
+                        two * (x * z - w * y),     two * (y * z + w * x),     1 - two * (x * x + y * y)};
+    Vec row[3];
+    for (int r = 0; r < 3; ++r) row[r] = {R[3 * r] * s[0], R[3 * r + 1] * s[1], R[3 * r + 2] * s[2]};
+    out[0] = dot(row[0], row[0]), out[1] = dot(row[0], row[1]), out[2] = dot(row[0], row[2]);
+    out[3] = dot(row[1], row[1]), out[4] = dot(row[1], row[2]), out[5] = dot(row[2], row[2]);
+}
+
+template <int K>
+void write(const Splats& in, Vec eye, float* out) {
+    [[maybe_unused]] float basis[15];
+    for (int64_t i = 0; i < in.count; ++i, out += RECORD) {
+        const Vec mean = load(in.means + 3 * i);
+        Vec color = load(in.dc + 3 * i);
+        if constexpr (K > 0) {
+            const Vec away = mean - eye;
+            const Vec along = (1.0f / length(away)) * away;
+            color = color_before_clamp<K>(turn_back(in.rotations + 9 * (int64_t)in.face[i], along), color, in.sh + 3 * K * i, basis);
+        }
+        store(out, mean);
+        out[3] = in.opacities[i];
+        covariance(in.quats + 4 * i, in.scales + 3 * i, out + 4);
+        store(out + 10, {std::max(color.x, 0.0f), std::max(color.y, 0.0f), std::max(color.z, 0.0f)});
+        out[13] = 0.0f;
+    }
+}
+
+}  // namespace
+
+// Centre, opacity, covariance and colour of `rows` Gaussians in an order, as an eye (3, metres) sees them: records
+// (rows, 14).
+SMPLXPP_EXPORT int32_t smplxpp_web_records(const Splats* in, const float* eye, const uint32_t* order, int64_t rows, float* records) {
+    return smplxpp::guarded([&] {
+        smplxpp::check_indices(order, rows, in->count);
+        // All of them as they lie in memory, then into the order: one jump in memory for each instead of eight.
+        std::vector<float> all(RECORD * in->count);
+        const Vec from = load(eye);
+        switch (in->harmonics) {
+            case 0: write<0>(*in, from, all.data()); break;
+            case 3: write<3>(*in, from, all.data()); break;
+            case 8: write<8>(*in, from, all.data()); break;
+            case 15: write<15>(*in, from, all.data()); break;
+            default: smplxpp::throw_out_of_range("harmonics");
+        }
+        for (int64_t r = 0; r < rows; ++r) std::memcpy(records + RECORD * r, all.data() + RECORD * order[r], RECORD * sizeof(float));
+    });
+}
+
+// Those of N Gaussians that lie before a camera's near plane and whose part is shown, where `sorted` by depth in 16 bits,
+// nearest first. row (4): what of the view gives a depth; part (N), hidden (by part). Writes order (as many as it says in
+// `count`) and the least and largest depth (2), metres.
+SMPLXPP_EXPORT int32_t smplxpp_web_order(int64_t N, const float* means, const float* row, float near, const uint8_t* part,
+                                         const uint8_t* hidden, int32_t sorted, uint32_t* order, float* range, int32_t* count) {
+    return smplxpp::guarded([&] {
+        std::vector<float> depths(N);
+        std::vector<uint32_t> shown(N), first(BINS + 1, 0);
+        int64_t n = 0;
+        float least = FLT_MAX, most = -FLT_MAX;
+        for (int64_t i = 0; i < N; ++i) {
+            const float* p = means + 3 * i;
+            const float z = row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3];
+            if (!(z >= near) || hidden[part[i]]) continue;
+            depths[n] = z, shown[n++] = (uint32_t)i;
+            least = std::min(least, z), most = std::max(most, z);
+        }
+        *count = (int32_t)n;
+        range[0] = n ? least : 0.0f, range[1] = n ? most : 1.0f;
+        if (!sorted) {
+            std::copy(shown.begin(), shown.begin() + n, order);
+            return;
+        }
+        const float scale = most > least ? (BINS - 1) / (most - least) : 0.0f;
+        const auto key = [&](int64_t k) { return (uint32_t)((depths[k] - least) * scale) & (BINS - 1); };
+        for (int64_t k = 0; k < n; ++k) ++first[key(k) + 1];
+        for (int bin = 0; bin < BINS; ++bin) first[bin + 1] += first[bin];
+        for (int64_t k = 0; k < n; ++k) order[first[key(k)]++] = shown[k];
+    });
+}
