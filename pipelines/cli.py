@@ -43,6 +43,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Label",
         "labels and landmarks of a run's scan, corrected by hand in the browser and kept",
     ),
+    "view": (
+        "pipelines.commands.view",
+        "View",
+        "a run in the browser: layers, weights, Gaussians, photographs, frames, and a training while it goes on",
+    ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit-reference": (
         "pipelines.commands.fit_reference",

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from contextlib import redirect_stdout
-from functools import wraps
-from io import StringIO
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -20,9 +16,9 @@ from pipelines.viewer.landmark_choice import CHOICE, lies_within
 from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
 from pipelines.viewer.run_scan import label_again
 from pipelines.viewer.scene import MODES, ScanScene
+from pipelines.viewer.server import address_of, one_at_a_time, start_server, stop_server
 from pipelines.viewer.session import LabelSession
 from pipelines.viewer.shapes import legend
-from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, UPPER
 from smplxpp.segment.corrected_faces import stroked_faces
 
@@ -44,31 +40,8 @@ def open_window(session: LabelSession, run: Path, *, host: str = "127.0.0.1", po
     Raises:
         MissingExtraError: viser is not installed.
     """
-    try:
-        import viser
-    except ImportError:
-        raise MissingExtraError("viser", extra="viewer", purpose="the viewer") from None
-    logging.getLogger("websockets").setLevel(logging.WARNING)  # it tells of every connection
-    with redirect_stdout(StringIO()):  # and viser of its address, whatever it is asked for
-        server = viser.ViserServer(host=host, port=port, label="smplxpp label", verbose=False)
+    server = start_server("smplxpp label", host=host, port=port)
     return LabelWindow(server, session, run)
-
-
-def _one_at_a_time(method: Callable[..., None]) -> Callable[..., None]:
-    """Let callbacks, which come from several threads, wait for each other, and show what they refuse."""
-
-    @wraps(method)
-    def held(self: LabelWindow, *args: Any) -> None:
-        with self.lock:
-            try:
-                method(self, *args)
-            except (InputError, OSError) as error:
-                self.say(f"**error:** {error}")
-            except Exception:  # a callback's error would end in the server's log alone
-                log.exception("the viewer could not do that")
-                self.say("**error:** that went wrong; the terminal says how")
-
-    return held
 
 
 class LabelWindow:
@@ -92,13 +65,11 @@ class LabelWindow:
     @property
     def address(self) -> str:
         """Where a browser finds it."""
-        host = self.server.get_host()
-        return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{self.server.get_port()}"
+        return address_of(self.server)
 
     def close(self) -> None:
         """End the server."""
-        with redirect_stdout(StringIO()):
-            self.server.stop()
+        stop_server(self.server)
 
     def say(self, words: str) -> None:
         """Show a line below the controls."""
@@ -151,7 +122,7 @@ class LabelWindow:
         steps.on_click(lambda event: self._step(1 if event.target.value == "next" else -1))
         self._choose_tool()
 
-    @_one_at_a_time
+    @one_at_a_time
     def _choose_tool(self) -> None:
         tool = self._tool.value
         self._help.content = _HELP[tool]
@@ -168,7 +139,7 @@ class LabelWindow:
 
     # -- the pointer
 
-    @_one_at_a_time
+    @one_at_a_time
     def click(self, origin: Float[np.ndarray, " 3"], direction: Float[np.ndarray, " 3"]) -> None:
         """Do what the tool does where a ray meets the scan."""
         surface, hit = self.session.surface, first_hit(self.session.surface, origin, direction)
@@ -188,7 +159,7 @@ class LabelWindow:
                 self.session.place(name, hit.point if within is None else within)
                 self._changed(f"{name} placed" + (", within the limb" if within is not None else ", on the surface"))
 
-    @_one_at_a_time
+    @one_at_a_time
     def drag(self, phase: str, origin: Float[np.ndarray, " 3"], place: Float[np.ndarray, " 3"]) -> None:
         """Paint along the places that a pointer goes through; what is under it shows at once, and counts at the end."""
         if self._tool.value != BRUSH:
@@ -234,21 +205,21 @@ class LabelWindow:
             self._box[0].remove()
         self._box = self.scene.draw_box(center, np.array(self._size.value), LABELS[self._label_id].display_rgb)
 
-    @_one_at_a_time
+    @one_at_a_time
     def _resize_box(self) -> None:
         if self._box is not None:
             gizmo, shape = self._box
             shape.dimensions, shape.color = tuple(self._size.value), LABELS[self._label_id].display_rgb
             self._box = gizmo, shape
 
-    @_one_at_a_time
+    @one_at_a_time
     def _fill_box(self) -> None:
         if self._box is not None:
             gizmo = self._box[0]
             turn = Rotation.from_quat(np.roll(gizmo.wxyz, -1)).as_matrix()  # its w comes last
             self._count(self.session.box(self._label_id, np.array(gizmo.position), np.array(self._size.value), turn))
 
-    @_one_at_a_time
+    @one_at_a_time
     def _remark(self) -> None:
         chosen = self._mark.value if self._tool.value == LANDMARK else None
         gizmo = self.scene.draw_landmarks(self.session, chosen)
@@ -259,24 +230,24 @@ class LabelWindow:
             async def _(event: Any) -> None:
                 self.move_landmark(name, np.array(event.target.position))
 
-    @_one_at_a_time
+    @one_at_a_time
     def move_landmark(self, name: str, point: Float[np.ndarray, " 3"]) -> None:
         """Move a landmark that is placed."""
         self.session.place(name, point)
         self._changed(f"{name} moved")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _remove_landmark(self) -> None:
         if self._mark.value in self.session.landmarks:
             self.session.take_away(self._mark.value)
             self._changed(f"{self._mark.value} removed")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _undo(self) -> None:
         said = self.session.undo()
         self._changed(f"undone: {said}" if said else "nothing to undo")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _remove(self) -> None:
         if self._list.value != _NONE:
             number = int(self._list.value.split(":")[0]) - 1
@@ -284,12 +255,12 @@ class LabelWindow:
             self._redraw()
             self._changed(f"correction {number + 1} removed")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _save(self) -> None:
         written = self.session.save(self.run)
         self._changed(f"saved: {', '.join(written)}" if written else "nothing to save")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _label_again(self) -> None:
         self.session.save(self.run)
         self.say("labelling again ...")
@@ -297,11 +268,11 @@ class LabelWindow:
         self._redraw()
         self._changed("labelled again; `smplxpp build` takes it on from there")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _view(self, side: str) -> None:
         self.scene.look_at_whole({"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}[side])
 
-    @_one_at_a_time
+    @one_at_a_time
     def _step(self, by: int) -> None:
         if self._regions:
             self._at = (self._at + by) % len(self._regions) if self._at >= 0 else 0
@@ -310,12 +281,12 @@ class LabelWindow:
 
     # -- what is shown
 
-    @_one_at_a_time
+    @one_at_a_time
     def _redraw(self) -> None:
         self._listen(self.scene.draw_scan(self.session, self._mode.value))
         self._changed("")
 
-    @_one_at_a_time
+    @one_at_a_time
     def _repaint(self) -> None:
         self.scene.draw_painted(self.session, shown=self._painted.value and self._mode.value == "labels")
 

@@ -1,0 +1,61 @@
+"""`smplxpp view`: the live viewer of a run: template, Gaussians, photographs, and a training while it goes on."""
+
+from __future__ import annotations
+
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from pipelines.commands.label import wait
+from pipelines.commands.options import OptionalPath, require_avatar
+from pipelines.commands.templates import load_run_template
+from smplxpp.core.validation import require_between
+
+_LARGEST_PORT = 65535
+
+
+@dataclass(frozen=True)
+class View:
+    """Options of `smplxpp view`."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `smplxpp build` wrote; a training in it may be under way."""
+    capture: OptionalPath = None
+    """Capture whose photographs and frames are shown; by default the one that the run was made from."""
+    params: OptionalPath = None
+    """Motion to go through, any layout that `smplxpp params convert` reads; by default the capture's frames."""
+    port: int = 8080
+    """Port to listen at, on this machine alone; the next free one where it is taken."""
+    no_browser: bool = False
+    """Open no browser, print the address alone."""
+    json: bool = False
+    """Print what was shown at the end as JSON; the address goes to the log."""
+
+    def run(self) -> dict:
+        """Serve the window until Ctrl-C."""
+        from pipelines.viewer.run_session import open_run
+        from pipelines.viewer.run_window import open_run_window
+
+        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_avatar("the viewer of a run")
+        template = load_run_template(self.run_folder)
+        session = open_run(self.run_folder, template, capture=self.capture, params=self.params)
+        window = open_run_window(session, port=self.port)
+        Console(stderr=self.json).print(f"{window.address}  (Ctrl-C ends it)", highlight=False)
+        try:
+            if not self.no_browser:
+                webbrowser.open_new_tab(window.address)
+            wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            window.close()
+        return {
+            "run": str(self.run_folder),
+            "frames": len(session.motion.numbers),
+            "gaussians": None if session.source is None else session.source.words,
+        }

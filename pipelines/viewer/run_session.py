@@ -1,0 +1,192 @@
+"""A run as it is looked at, without any window: which frame, how it is changed by hand, what there is to draw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64, UInt8
+from scipy.spatial.transform import Rotation
+
+from pipelines.figures import blend_joint_colors, heat_colors
+from pipelines.viewer.run_models import SplatSource, Surface, covariances, newest_splats, open_player, tracked_surface
+from pipelines.viewer.run_motion import ShownMotion, capture_of_run, motion_of_run
+from pipelines.viewer.training_now import TrainingNow, training_now
+from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.capture import Capture
+from smplxpp.core.labels import display_colors
+from smplxpp.core.params import POSE_BLOCKS, BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.validation import require_choice
+from smplxpp.template.template import Template
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarPlayer
+
+Coloring = Literal["photograph", "labels", "weights", "one joint"]
+COLORINGS: tuple[Coloring, ...] = ("photograph", "labels", "weights", "one joint")
+TURNED = SMPLX_JOINTS[:23]
+"""Joints that can be turned by hand: the body's and the jaw."""
+_PLACES = {
+    name: (block, 3 * k)
+    for (block, count), first in zip(POSE_BLOCKS[:3], (0, 1, 22), strict=True)
+    for k, name in enumerate(SMPLX_JOINTS[first : first + count])
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A part of the template: its vertices among all, and its faces over these."""
+
+    name: str
+    vertices: Int64[np.ndarray, " v"]
+    faces: Int64[np.ndarray, "f 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSplats:
+    """Gaussians in the world: metres, square metres, sRGB and opacity in [0, 1]."""
+
+    means: Float[np.ndarray, "N 3"]
+    covariances: Float[np.ndarray, "N 3 3"]
+    colors: Float[np.ndarray, "N 3"]
+    opacities: Float[np.ndarray, "N 1"]
+
+
+@dataclass(eq=False)
+class RunSession:
+    """What is shown of a run.
+
+    Attributes:
+        run: its folder. template, motion: posed, and through which frames. capture: the photographs; None: none.
+        player: draws the Gaussians of `source`; None: the run has none yet. tracked: the surface that was followed.
+        now: the training that is under way.
+        at: row of the motion. turned: degrees about x, y and z by which joints are turned beyond the frame's pose.
+        expression: added to the frame's coefficients.
+    """
+
+    run: Path
+    template: Template
+    motion: ShownMotion
+    capture: Capture | None = None
+    player: AvatarPlayer | None = None
+    source: SplatSource | None = None
+    tracked: Surface | None = None
+    now: TrainingNow | None = None
+    at: int = 0
+    turned: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    expression: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def frame(self) -> int:
+        """The number of the frame that is shown."""
+        return self.motion.numbers[self.at]
+
+    @property
+    def layers(self) -> list[Layer]:
+        """The parts of the template, the body first."""
+        out = []
+        for name in self.template.part_names:
+            faces = self.template.faces[self.template.part_faces(name)]
+            vertices, local = np.unique(faces, return_inverse=True)
+            out.append(Layer(name, vertices, local.reshape(-1, 3).astype(np.int64)))
+        return out
+
+    @property
+    def expressions(self) -> tuple[str, ...]:
+        """Names of the expressions that can be added."""
+        body = self.template.body
+        names = body.expression_names
+        return tuple(names) if names else tuple(f"expression {k}" for k in range(body.num_expressions))
+
+    def go_to(self, row: int) -> None:
+        """Show another frame, the first after the last."""
+        self.at = row % len(self.motion.numbers)
+
+    def turn(self, joint: str, degrees: tuple[float, float, float]) -> None:
+        """Turn a joint beyond what the frame has."""
+        require_choice("joint", joint, TURNED)
+        self.turned[joint] = degrees
+
+    def reset(self) -> None:
+        """Take back what was turned and added by hand."""
+        self.turned.clear()
+        self.expression.clear()
+
+    @property
+    def params(self) -> BodyParams:
+        """The frame's parameters, with what was changed by hand."""
+        params = self.motion.params.frame(self.at)
+        blocks: dict[str, Any] = {name: np.array(getattr(params, name)) for name, _ in POSE_BLOCKS[:3]}
+        for joint, degrees in self.turned.items():
+            block, first = _PLACES[joint]
+            own = blocks[block][0, first : first + 3]
+            added = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+            blocks[block][0, first : first + 3] = rotvec_from_matrix(matrix_from_rotvec(own) @ added)
+        expression = np.zeros((1, max(params.expression.shape[1], len(self.expressions) if self.expression else 0)))
+        expression[:, : params.expression.shape[1]] = params.expression
+        for name, value in self.expression.items():
+            expression[0, self.expressions.index(name)] += value
+        return replace(params, **blocks, expression=expression)
+
+    def vertices(self) -> Float64[np.ndarray, "V 3"]:
+        """The template as its joints have it, metres."""
+        return self.template.pose(self.params)[0]
+
+    def tracked_vertices(self) -> Float[np.ndarray, "V 3"] | None:
+        """The followed surface of the frame; None where it was not followed."""
+        return None if self.tracked is None else self.tracked(self.frame, self.motion.params.frame(self.at))
+
+    def colors(self, coloring: Coloring, joint: str | None = None) -> UInt8[np.ndarray, "V 3"]:
+        """Colours of the template's vertices; `joint` is the one whose weights are shown as heat."""
+        require_choice("colours", coloring, COLORINGS)
+        if coloring == "photograph":
+            return self.template.vertex_colors
+        if coloring == "labels":
+            return display_colors(self.template.vertex_labels)
+        if coloring == "weights":
+            return blend_joint_colors(self.template.weights)
+        names = self.template.body.joint_names
+        require_choice("joint", joint or names[0], names)
+        weights = self.template.weights.dense()[:, names.index(joint or names[0])]
+        return heat_colors(weights, cmap="weight", limits=(0.0, 1.0))
+
+    def splats(self, eye: Float[np.ndarray, " 3"]) -> DrawnSplats | None:
+        """The Gaussians as they look from a point, metres; None where the run has none."""
+        if self.player is None:
+            return None
+        frame = self.frame if self.motion.photographed and not self.turned else None
+        drawn = self.player.pose(self.params, frame=frame)
+        return DrawnSplats(
+            drawn.means.copy(),
+            covariances(drawn.quats.astype(np.float64), drawn.scales.astype(np.float64)),
+            np.clip(drawn.colors(np.ascontiguousarray(eye, dtype=np.float32)), 0.0, 1.0),
+            drawn.opacities[:, None].copy(),
+        )
+
+    def refresh(self) -> bool:
+        """Look again what a training has left; returns whether there are other Gaussians than before."""
+        self.now = training_now(self.run)
+        source = newest_splats(self.run, self.now)
+        if source is None or source == self.source:
+            return False
+        self.player, self.source = open_player(self.run, self.template, source), source
+        return True
+
+
+def open_run(run: Path, template: Template, *, capture: Path | None = None, params: Path | None = None) -> RunSession:
+    """Open what a run has to show.
+
+    Args:
+        template: of the run. capture, params: in the place of those that the run remembers.
+
+    Raises:
+        InputError: a capture or parameters that cannot be read, models of another template.
+    """
+    shown = capture_of_run(run, capture)
+    motion = motion_of_run(run, template, shown, params)
+    session = RunSession(run, template, motion, shown, tracked=tracked_surface(run, template))
+    session.refresh()
+    return session
