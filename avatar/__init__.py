@@ -36,7 +36,7 @@ _EXPORTS: dict[str, str] = {
     "sample_on_mesh": "avatar.gaussians",
     "save_avatar": "avatar.models.model_file",
     "training_preset": "avatar.training.presets",
-    "write_splat_ply": "avatar.export",
+    "write_splat_ply": "avatar.formats",
 }
 
 __all__ = [*_EXPORTS]

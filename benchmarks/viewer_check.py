@@ -32,7 +32,8 @@ import torch
 import tyro
 from PIL import Image
 
-from avatar.export.splats import Splats, posed_splats, read_splat_ply, write_splat_ply
+from avatar.export.posed import posed_splats
+from avatar.formats import Splats, read_splat_ply, write_splat_ply
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh

@@ -77,7 +77,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "export": (
         "pipelines.commands.export",
         "Export",
-        "a trained student as one file for players, or a template as one closed, printable solid",
+        "a student or a template in files: for our players, for other programs (splats, rigs, scenes), for printers",
     ),
     "web": (
         "pipelines.commands.web",

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from avatar.export.splats import read_splat_ply
+from avatar.formats.ply import read_splat_ply
 from smplxpp import Template
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -32,6 +32,7 @@ STAGES = {
 FLOORS: dict[str, tuple[set[str], ...]] = {
     "avatar": (
         {"gaussians", "reconstruct", "runtime"},
+        {"formats"},
         {"rig"},
         {"data"},
         {"render"},
@@ -285,7 +286,7 @@ READS: dict[str, set[str]] = {
         *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
         "smplxpp/core/files/package_file.py",
         *("smplxpp/capture/readers/colmap_model.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/digests.py"),
-        *("smplxpp/capture/writers/arrays.py", "smplxpp/core/params.py", "avatar/export/splats.py"),  # written
+        *("smplxpp/capture/writers/arrays.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
         *("avatar/training/engine/metrics_log.py", "pipelines/runs/lock.py", "pipelines/commands/terminal.py"),
     },
 }

@@ -1,5 +1,6 @@
-"""Files that other viewers read."""
+"""What training made, for others: a pose as splats, a student as a bundle."""
 
-from avatar.export.splats import Splats, posed_splats, read_splat_ply, write_splat_ply
+from avatar.export.posed import posed_splats
+from avatar.formats import Splats, read_splat_ply, write_splat_ply
 
 __all__ = ["Splats", "posed_splats", "read_splat_ply", "write_splat_ply"]

@@ -41,8 +41,11 @@ class StudentFilm:
     clamp: bool
 
 
-def open_student(source: Path) -> AvatarBundle:
+def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
     """Read a bundle, or make one of a run's student.
+
+    Args:
+        exact: make it with every number in float32.
 
     Raises:
         InputError: neither.
@@ -53,7 +56,7 @@ def open_student(source: Path) -> AvatarBundle:
         return load_bundle(source)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"student{SUFFIX}"
-        export_bundle(source, path, name=None, licence="", params=None, exact=False)
+        export_bundle(source, path, name=None, licence="", params=None, exact=exact)
         return load_bundle(path)
 
 

@@ -1,28 +1,19 @@
-"""`smplxpp export RUN`: the student as a bundle for players (--out), or a closed surface for a printer (--solid)."""
+"""`smplxpp export`: a student or a template in files for players, other programs (--out) and printers (--solid)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 
-from pipelines.commands.export_bundle import check_bundle_path, export_bundle
-from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
-from pipelines.commands.templates import load_params_for, load_run_template
-from smplxpp.clean import SolidConfig, solid_of_parts
+from pipelines.commands.export_bundle import export_bundle
+from pipelines.commands.export_files import FileRequest, export_file, format_of
+from pipelines.commands.export_solid import SolidRequest, export_solid, tell_solid
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_positive
-from smplxpp.export.printing import check_solid_path, write_solid
-from smplxpp.metrics import self_intersections
-from smplxpp.metrics.distance import MM
-from smplxpp.template.template import BODY_PART, Template
-
-_GAP_MM = 10.0
 
 
 @dataclass(frozen=True)
@@ -30,39 +21,56 @@ class Export:
     """Options of `smplxpp export`."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` (and for --out `smplxpp train`) wrote."""
+    """Folder that `smplxpp build` and `smplxpp train` wrote, or a bundle NAME.avatar of its student."""
     out: OptionalPath = None
-    """Write the trained student there for players: NAME.avatar, one file that needs neither torch nor this run."""
+    """Write a file there; its suffix says which: .avatar (the student for our players), .ply .spz .sog (its splats in a
+    pose), .glb (see --model), .usdc (splats), .obj (the template). A name without a suffix: a folder, a file a frame,
+    with --format."""
+    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj"] = "auto"
+    """Format where the suffix does not tell: of a folder."""
+    model: Literal["student", "template"] = "student"
+    """What a GLB holds: the student's splats in a pose, or the template with skeleton, expressions and motion."""
     solid: OptionalPath = None
     """Write body and clothes as one closed surface there: .stl or .3mf (z up, on the bed), .ply or .glb (y up)."""
     params: OptionalPath = None
-    """Body parameters, any layout that `smplxpp params convert` reads: of the solid's pose, the T-pose without them; or
-    the motion that the bundle has to play, the poses that training saw without them."""
+    """Body parameters, any layout that `smplxpp params convert` reads: the pose, or the motion. Without them: the poses
+    that training saw (the template and a solid: the T-pose)."""
+    frame: int = 0
+    """Row of the parameters; of what moves the first one."""
+    stop: OptionalInt = None
+    """Of what moves: the row after the last one."""
+    step: int = 1
+    """Of what moves: take every step-th row."""
+    cloth: Literal["simulate", "skin"] = "simulate"
+    """What moves loose clothes in splats and OBJ files of --params: a simulation, or the joints alone."""
+    full_harmonics: bool = False
+    """Fill a PLY up with zeros to harmonics of degree 3: some importers (Unity's) take no others."""
+    up: Literal["y", "-y", "z"] = "y"
+    """The axis that points up in a PLY, whose users disagree; other formats say it themselves."""
     name: OptionalText = None
     """Name of the avatar in the bundle; by default that of the run's folder."""
     licence: str = ""
     """Licence of the avatar, as the bundle is to say it."""
     exact: bool = False
     """Keep every number of the bundle in float32, at about four times the size."""
-    frame: int = 0
-    """Row of the parameters."""
     height_mm: OptionalFloat = None
-    """Height of the person in the file, in the pose; life-size without it."""
+    """Height of the person in the solid, in the pose; life-size without it."""
     thickness_mm: float = 2.0
-    """Thickness of the cloth in the file's size, at every scale."""
+    """Thickness of the solid's cloth in the file's size, at every scale."""
     gap_mm: OptionalFloat = None
     """Cloth nearer to the body than this is filled down to it (in the file's size); without it 10 mm of the person."""
     units: Literal["mm", "cm", "m"] = "mm"
-    """Units of the file; a GLB is always in metres."""
+    """Units of the solid; a GLB is always in metres."""
     json: bool = False
     """Print what was written as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Write the bundle or the solid, whole or not at all."""
+        """Write what was asked for, whole or not at all."""
         if self.solid is not None and self.out is None:
             return self._solid(self.solid)
         if self.out is not None and self.solid is None:
-            return self._bundle(self.out)
+            name = format_of(self.out, self.format)
+            return self._bundle(self.out) if name == "avatar" else self._file(self.out, name)
         raise InputError(
             "options out and solid",
             expected="one of them",
@@ -71,14 +79,8 @@ class Export:
         )
 
     def _bundle(self, out: Path) -> dict[str, Any]:
-        check_bundle_path(out)
         report = export_bundle(
-            self.run_folder,
-            out,
-            name=self.name,
-            licence=self.licence,
-            params=self.params,
-            exact=self.exact,
+            self.run_folder, out, name=self.name, licence=self.licence, params=self.params, exact=self.exact
         )
         if not self.json:
             console = Console()
@@ -88,66 +90,33 @@ class Export:
                     console.print(f"  {piece:10} {size / 1e3:9.1f} kB", markup=False)
         return report
 
-    def _solid(self, solid: Path) -> dict[str, Any]:
-        """Make the solid, measure it, write it."""
-        check_solid_path(solid)
-        for name in ("thickness_mm", "height_mm", "gap_mm"):
-            if getattr(self, name) is not None:
-                require_positive(f"option {name}", getattr(self, name))
-        template = load_run_template(self.run_folder)
-        posed = self._posed(template)
-        scale = 1.0
-        if self.height_mm is not None:
-            scale = self.height_mm / MM / float(np.ptp(posed.vertices[np.unique(posed.faces), 1]))
-        posed = posed.with_vertices(posed.vertices * scale)
-        parts = {name: posed.submesh(template.part_faces(name))[0] for name in template.part_names}
-        gap = _GAP_MM * scale if self.gap_mm is None else self.gap_mm
-        config = SolidConfig(thickness=self.thickness_mm / MM, gap=gap / MM)
-        made = solid_of_parts(parts.pop(BODY_PART), parts, config=config)
-        volume = write_solid(solid, made.mesh, units=self.units)
-        report = {
-            "out": str(solid),
-            "scale": scale,
-            "thickness_mm": self.thickness_mm,
-            **made.report.as_dict(),
-            "file_volume_cm3": volume * 1e6,
-            "self_intersections": len(self_intersections(made.mesh)),
-        }
+    def _file(self, out: Path, name: str) -> dict[str, Any]:
+        request = FileRequest(
+            source=self.run_folder,
+            out=out,
+            format=name,
+            model=self.model,
+            params=self.params,
+            rows=(self.frame, self.stop, self.step),
+            simulate=self.cloth == "simulate",
+            full_harmonics=self.full_harmonics,
+            up=self.up,
+            quiet=self.json,
+        )
+        report = export_file(request)
         if not self.json:
-            _print(report, Console())
+            frames = f", {report['frames']} frames" if report["frames"] > 1 else ""
+            Console().print(f"{out}: {report['bytes'] / 1e6:.2f} MB{frames}", markup=False, soft_wrap=True)
+            for sentence in report["said"]:
+                Console(stderr=True).print(sentence, markup=False, soft_wrap=True)
         return report
 
-    def _posed(self, template: Template) -> TriangleMesh:
-        if self.params is None:
-            return template.mesh
-        params = load_params_for(template, self.params)
-        if not 0 <= self.frame < len(params):
-            raise InputError("option frame", expected=f"an index below {len(params)}", received=str(self.frame))
-        params = params.frame(self.frame)
-        # Where the person stands and which way it looks is of no use on a printer's bed.
-        still = replace(params, transl=np.zeros_like(params.transl))
-        return template.mesh.with_vertices(template.pose(still)[0])
-
-
-def _print(report: dict[str, Any], console: Console) -> None:
-    size = " x ".join(f"{length:.0f}" for length in report["size_mm"])
-    console.print(
-        f"{report['out']}: one closed, manifold piece of {report['faces']} faces, {size} mm, "
-        f"{report['volume_cm3']:.1f} cm3; read back, it is the same",
-        markup=False,
-        soft_wrap=True,
-    )
-    console.print(
-        f"walls, straight inward: 1 % below {report['wall_mm_p1']:.2f} mm, 5 % below {report['wall_mm_p5']:.2f}, "
-        f"median {report['wall_mm_median']:.2f}; {report['thin_share']:.1%} of the surface thinner than "
-        f"{0.9 * report['thickness_mm']:.2g} mm",
-        markup=False,
-        soft_wrap=True,
-    )
-    if report["self_intersections"]:
-        console.print(
-            f"{report['self_intersections']} pairs of faces cut each other in folds narrower than the cloth: slicers "
-            "join them, modellers may not",
-            markup=False,
-            soft_wrap=True,
+    def _solid(self, solid: Path) -> dict[str, Any]:
+        report = export_solid(
+            self.run_folder,
+            solid,
+            SolidRequest(self.params, self.frame, self.height_mm, self.thickness_mm, self.gap_mm, self.units),
         )
+        if not self.json:
+            tell_solid(report, Console())
+        return report

@@ -23,17 +23,6 @@ SUFFIX = ".avatar"
 _FPS = 20.0
 
 
-def check_bundle_path(path: Path) -> None:
-    """Raise `InputError` unless a bundle can be called so."""
-    if path.suffix.lower() != SUFFIX:
-        raise InputError(
-            f"output {path}",
-            expected=f"a name that ends with {SUFFIX}",
-            received=path.suffix or "no suffix",
-            remedy="`--solid` writes what printers take",
-        )
-
-
 def export_bundle(
     run: Path, out: Path, *, name: str | None, licence: str, params: Path | None, exact: bool
 ) -> dict[str, Any]:

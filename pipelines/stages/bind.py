@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data.views import View, read_views
-from avatar.export.splats import write_splat_ply
+from avatar.formats import write_splat_ply
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.metrics.view_quality import CONVENTION, mean_quality

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.evaluation.report import EvalReport, ModelFigures
-from avatar.export.splats import read_splat_ply, write_splat_ply
+from avatar.formats.ply import read_splat_ply, write_splat_ply
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
@@ -33,10 +33,10 @@ from smplxpp.body import load_body
 from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.template import Template
-from tests.avatar_export.test_splats import random_splats
 from tests.cloth.persons import person
 from tests.cloth.test_driver import garment
 from tests.dolls.dancing import gaussians, template
+from tests.formats.test_ply import random_splats
 from tests.fuzz.examine import Door
 from tests.models.test_model_file import make
 from tests.pipelines.test_evaluation_gates import surfaces, view

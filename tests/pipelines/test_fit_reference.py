@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from avatar.export.splats import read_splat_ply
+from avatar.formats.ply import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
 from avatar.training.engine.device import choose_device
 from pipelines.cli import main

@@ -21,7 +21,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avatar.export.splats import posed_splats
+from avatar.export.posed import posed_splats
 from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import C0, coefficient_count, sh_basis, view_colors

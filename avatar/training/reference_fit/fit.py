@@ -15,7 +15,8 @@ from torch import Tensor
 from avatar.data.one_frame import FRAME, OneFrame
 from avatar.data.sequence import Item, camera_centers_of
 from avatar.data.views import View
-from avatar.export.splats import Splats, posed_splats
+from avatar.export.posed import posed_splats
+from avatar.formats.splats import Splats
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.regularizers import offset_penalty, scale_penalty

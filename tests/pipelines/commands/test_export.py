@@ -93,7 +93,7 @@ def test_one_of_out_and_solid_is_asked_for(run: Path, tmp_path: Path, capsys):
     for options in ((), ("--out", tmp_path / "a.avatar", "--solid", tmp_path / "a.stl")):
         status, report = answer(capsys, run, *options)
         assert status == 2 and report["error"]["subject"] == "options out and solid"
-    status, report = answer(capsys, run, "--out", tmp_path / "a.glb")
+    status, report = answer(capsys, run, "--out", tmp_path / "a.xyz")
     assert status == 2 and ".avatar" in report["error"]["expected"]
     status, report = answer(capsys, run, "--out", tmp_path / "a.avatar")
     assert status == 2 and "smplxpp train" in report["error"]["remedy"]

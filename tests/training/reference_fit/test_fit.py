@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from avatar.data.views import View
-from avatar.export.splats import posed_splats
+from avatar.export.posed import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.metrics.view_quality import head_box
 from avatar.training.engine.device import choose_device

@@ -1,0 +1,144 @@
+"""World-space splats of one pose, as all files of splats hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from avatar.formats.harmonics import C0, MOST_COEFFICIENTS, rotate_sh
+from avatar.runtime.splatting import WorldSplats
+from smplxpp.core.errors import InputError
+
+REST_COUNTS = (0, 9, 24, 45)
+"""Numbers of harmonics beyond degree 0 that a splat may have: those of whole degrees, three colours each."""
+_FULLY = 1e-7
+"""Opacities stay so far away from 0 and 1, where the logit is infinite."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Splats:
+    """N Gaussians in the world as the file holds them; the arrays are kept as float32.
+
+    Attributes:
+        means: metres.
+        normals: unit, or 0 where unknown.
+        f_dc: coefficients of degree 0: the colour without view dependence is `0.5 + C0 f_dc`.
+        f_rest: coefficients of degree 1 and up in the world's axes; K = 0, 3, 8 or 15.
+        opacity_logits: before the sigmoid.
+        log_scales: logarithms of the standard deviations in metres.
+        quats: wxyz, any length but zero.
+
+    Raises:
+        InputError: arrays that do not fit each other, NaN or infinity, a quaternion of length 0.
+    """
+
+    means: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
+    f_dc: Float[np.ndarray, "N 3"]
+    f_rest: Float[np.ndarray, "N K 3"]
+    opacity_logits: Float[np.ndarray, " N"]
+    log_scales: Float[np.ndarray, "N 3"]
+    quats: Float[np.ndarray, "N 4"]
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            object.__setattr__(self, f.name, np.ascontiguousarray(getattr(self, f.name), dtype=np.float32))
+        N, K = len(self.means), self.f_rest.shape[1] if self.f_rest.ndim == 3 else -1
+        shapes: dict[str, tuple[int, ...]] = {
+            "means": (N, 3),
+            "normals": (N, 3),
+            "f_dc": (N, 3),
+            "f_rest": (N, K, 3),
+            "opacity_logits": (N,),
+            "log_scales": (N, 3),
+            "quats": (N, 4),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value.shape != shape:
+                raise InputError(f"splats: {name}", expected=f"shape {shape}", received=f"shape {value.shape}")
+            if not np.isfinite(value).all():
+                bad = int(np.argmin(np.isfinite(value.reshape(N, -1)).all(1)))
+                raise InputError(
+                    f"splats: {name}", expected="finite float32 values", received=f"others, first in splat {bad}"
+                )
+        if 3 * K not in REST_COUNTS:
+            raise InputError("splats: f_rest", expected="0, 3, 8 or 15 coefficients", received=str(K))
+        if N and not self.quats.any(1).all():
+            raise InputError("splats: quats", expected="quaternions of some length", received="zeros")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics."""
+        return round((self.f_rest.shape[1] + 1) ** 0.5) - 1
+
+    @property
+    def opacities(self) -> Float64[np.ndarray, " N"]:
+        """In (0, 1)."""
+        return 1.0 / (1.0 + np.exp(-self.opacity_logits.astype(np.float64)))
+
+    @property
+    def unit_quats(self) -> Float32[np.ndarray, "N 4"]:
+        """wxyz, of length 1, w not below 0."""
+        quats = self.quats.astype(np.float64)
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
+
+    def padded(self) -> Splats:
+        """Return the same splats with harmonics of all three degrees, those that they have not being zero."""
+        missing = MOST_COEFFICIENTS - self.f_rest.shape[1]
+        return replace(self, f_rest=np.pad(self.f_rest, ((0, 0), (0, missing), (0, 0))))
+
+    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Splats:
+        """Return the splats turned about the origin, their harmonics with them."""
+        R = np.asarray(rotation, np.float64)
+        return replace(
+            self,
+            means=self.means @ R.T,
+            normals=self.normals @ R.T,
+            f_rest=rotate_sh(self.f_rest, R[None], np.zeros(len(self), np.int64)),
+            quats=_turned_quats(R, self.quats),
+        )
+
+
+def world_splats(posed: WorldSplats) -> Splats:
+    """Return a pose of the runtime as files have it, the harmonics turned from the triangles' axes to the world's.
+
+    Args:
+        posed: what a player gave; its arrays are copied.
+    """
+    w, x, y, z = posed.quats.astype(np.float64).T
+    # A Gaussian is flat along its own first axis, which is the normal.
+    normals = np.stack([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    opacities = np.clip(posed.opacities.astype(np.float64), _FULLY, 1.0 - _FULLY)
+    return Splats(
+        means=posed.means.copy(),
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        f_dc=(posed.dc.astype(np.float64) - 0.5) / C0,
+        f_rest=rotate_sh(posed.sh, posed.rotations, posed.face),
+        opacity_logits=np.log(opacities / (1.0 - opacities)),
+        log_scales=np.log(posed.scales.astype(np.float64)),
+        quats=posed.quats / np.linalg.norm(posed.quats, axis=1, keepdims=True),
+    )
+
+
+def _turned_quats(R: Float[np.ndarray, "3 3"], quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
+    """Return Hamilton products of a rotation's quaternion and others, wxyz."""
+    # Rows of 4 q q^T; the longest is the best conditioned.
+    outer = np.array(
+        [
+            [1 + R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], 1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
+            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2]],
+            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2]],
+        ]
+    )
+    row = outer[np.argmax(np.diag(outer))]
+    w, x, y, z = row / np.linalg.norm(row)
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return np.asarray(quats, np.float64) @ left.T

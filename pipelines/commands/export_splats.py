@@ -1,0 +1,94 @@
+"""A student's splats in files: one pose, a file a frame, or a USD that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from pipelines.commands.animate_student import motion_for, open_student
+from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
+from smplxpp.core.params import BodyParams
+
+if TYPE_CHECKING:
+    from avatar.formats import Splats
+    from avatar.runtime import AvatarPlayer
+
+# What turns +y to the axis that is to point up.
+_TURNS = {"-y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+
+
+def writers(
+    request: FileRequest,
+) -> tuple[float | None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]:
+    """Return frames a second, what writes each file with the number of frames in it, and what went otherwise.
+
+    Raises:
+        InputError: no student, parameters of another body, rows that are not there.
+    """
+    from avatar.runtime import AvatarPlayer
+
+    bundle = open_student(request.source, exact=True)
+    player = AvatarPlayer(bundle)
+    motion = player.motion if request.params is None else motion_for(bundle, request.params)
+    motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
+    moves = request.is_series or (request.format == "usd" and request.params is not None)
+    rows = request.chosen(len(motion), moves=moves)
+    fps = request.rate(motion) if moves and len(rows) > 1 else None
+    said: list[str] = []
+    splats = _posed(player, motion, rows, simulate=request.simulate and request.params is not None, said=said)
+    shown = track(
+        splats,
+        total=len(rows),
+        description="frames",
+        console=Console(stderr=True),
+        disable=request.quiet or fps is None,
+    )
+    if request.format == "usd":
+        from avatar.formats.splat_usd import write_splat_usd
+
+        return fps, iter([(len(rows), partial(write_splat_usd, frames=shown, fps=fps))]), said
+    write = _writer(request)
+    return fps, ((1, partial(write, splats=one)) for one in shown), said
+
+
+def _posed(
+    player: AvatarPlayer, motion: BodyParams, rows: range, *, simulate: bool, said: list[str]
+) -> Iterator[Splats]:
+    """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
+    from avatar.formats import world_splats
+
+    rate = frames_a_second(motion)
+    simulate = simulate and bool(player.bundle.garments)
+    if not simulate:
+        for k in rows:
+            yield world_splats(player.pose(motion.frame(k)))
+        return
+    for k in range(max(0, rows[0] - round(PRE_ROLL * rate)), rows[-1] + 1):
+        posed = player.step(motion.frame(k), 1.0 / rate)
+        if k in rows:
+            yield world_splats(posed)
+    said += player.said
+
+
+def _writer(request: FileRequest) -> Callable[..., None]:
+    """Return what writes one pose: `write(path, splats=...)`."""
+    from avatar import formats
+
+    if request.format != "ply":
+        return {
+            "spz": formats.write_splat_spz,
+            "sog": formats.write_splat_sog,
+            "glb": formats.write_splat_glb,
+        }[request.format]
+
+    def write(path: Path, *, splats: Splats) -> None:
+        turned = splats if request.up == "y" else splats.turned(_TURNS[request.up])
+        formats.write_splat_ply(path, turned.padded() if request.full_harmonics else turned)
+
+    return write

@@ -1,0 +1,91 @@
+"""A run's template in files: rigged as GLB or USD, its surface as OBJ, a file a frame where it moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
+
+from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
+from pipelines.commands.templates import load_params_for, load_run_template
+from pipelines.runs.layout import GARMENTS
+from smplxpp.cloth.garment_file import load_garments
+from smplxpp.cloth.play import play
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.template.template import Template
+
+Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]
+
+
+def writers(request: FileRequest) -> Writers:
+    """Return frames a second, what writes each file with the number of frames in it, and what went otherwise.
+
+    Raises:
+        InputError: no template, parameters of another body, rows that are not there, a series without a motion.
+    """
+    template = load_run_template(request.source)
+    params = None if request.params is None else load_params_for(template, request.params)
+    if request.format == "obj":
+        return _surfaces(request, template, params)
+    if request.is_series:
+        raise InputError(
+            f"output {request.out}",
+            expected=f"a file: a template's {request.format} holds the motion itself",
+            received="a folder",
+        )
+    chosen = None
+    if params is not None:
+        rows = request.chosen(len(params), moves=True)
+        chosen = replace(params.select(list(rows)), fps=request.rate(params))
+    from smplxpp.export import write_glb
+
+    fps = None if chosen is None else chosen.fps
+    return (
+        fps,
+        iter([(1 if chosen is None else len(chosen), partial(write_glb, template=template, animation=chosen))]),
+        [],
+    )
+
+
+def _surfaces(request: FileRequest, template: Template, params: BodyParams | None) -> Writers:
+    from smplxpp.export import write_obj
+
+    if params is None:
+        if request.is_series:
+            raise InputError("option params", expected="a motion, for a file a frame", received="none")
+        return None, iter([(1, partial(write_obj, template=template))]), []
+    rows = request.chosen(len(params), moves=request.is_series)
+    said: list[str] = []
+    surfaces = track(
+        _posed(request, template, params, rows, said),
+        total=len(rows),
+        description="frames",
+        console=Console(stderr=True),
+        disable=request.quiet or len(rows) == 1,
+    )
+    files = ((1, partial(write_obj, template=replace(template, vertices=surface))) for surface in surfaces)
+    return request.rate(params) if request.is_series else None, files, said
+
+
+def _posed(
+    request: FileRequest, template: Template, params: BodyParams, rows: range, said: list[str]
+) -> Iterator[Float[np.ndarray, "V 3"]]:
+    """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
+    path, rate = request.source / GARMENTS, frames_a_second(params)
+    if not request.simulate or not path.is_file():
+        for k in rows:
+            yield template.pose(params.frame(k))[0]
+        return
+    begin = max(0, rows[0] - round(PRE_ROLL * rate))
+    whole = params.select(slice(begin, rows[-1] + 1))
+    surfaces = play(template, load_garments(path, template), whole, fps=rate, said=said)
+    for k, surface in enumerate(surfaces, start=begin):
+        if k in rows:
+            yield surface
