@@ -266,7 +266,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             bake=_Steps(250, 3e-4, 2.0),
             compensate=500,
             # Faster, what few frames teach the blend shapes of their poses costs new ones.
-            late=0.5,
+            late=0.15,
         ),
     ),
 }
