@@ -24,12 +24,12 @@ class Export:
     """Folder that `smplxpp build` and `smplxpp train` wrote, or a bundle NAME.avatar of its student."""
     out: OptionalPath = None
     """Write a file there; its suffix says which: .avatar (the student for our players), .ply .spz .sog (its splats in a
-    pose), .glb (see --model), .usdc (splats), .obj (the template). A name without a suffix: a folder, a file a frame,
-    with --format."""
-    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj"] = "auto"
-    """Format where the suffix does not tell: of a folder."""
+    pose), .glb and .usdc (see --model), .obj (the template), .bvh and .npz (a motion). A name without a suffix: a
+    folder, a file a frame, with --format."""
+    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj", "bvh", "amass"] = "auto"
+    """Format where the suffix does not tell: of a folder, or of an .npz."""
     model: Literal["student", "template"] = "student"
-    """What a GLB holds: the student's splats in a pose, or the template with skeleton, expressions and motion."""
+    """What a GLB or USD has: the student's splats in a pose, or the template with skeleton, expressions and motion."""
     solid: OptionalPath = None
     """Write body and clothes as one closed surface there: .stl or .3mf (z up, on the bed), .ply or .glb (y up)."""
     params: OptionalPath = None

@@ -13,7 +13,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder
 
 __all__ = ["FileRequest", "export_file", "format_of"]
-_SPLATS, _TEMPLATE = (f"pipelines.commands.export_{name}" for name in ("splats", "template"))
+_SPLATS, _TEMPLATE, _MOTION = (f"pipelines.commands.export_{name}" for name in ("splats", "template", "motion"))
 _ROOM = {
     ("student", "ply"): _SPLATS,
     ("student", "spz"): _SPLATS,
@@ -21,8 +21,10 @@ _ROOM = {
     ("student", "glb"): _SPLATS,
     ("student", "usd"): _SPLATS,
     ("template", "glb"): _TEMPLATE,
+    ("template", "usd"): _TEMPLATE,
     ("template", "obj"): _TEMPLATE,
 }
+_ALONE = {"bvh": _MOTION, "amass": _MOTION}
 Write = Callable[[Path], None]
 
 
@@ -37,7 +39,7 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         MissingExtraError: a package of an extra that is not installed.
     """
     model = "template" if request.format == "obj" else request.model
-    room = _ROOM.get((model, request.format))
+    room = _ALONE.get(request.format) or _ROOM.get((model, request.format))
     if room is None:
         raise InputError(
             f"output {request.out}",

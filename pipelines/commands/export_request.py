@@ -24,6 +24,8 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "glb": (".glb",),
     "usd": (".usdc", ".usda", ".usd"),
     "obj": (".obj",),
+    "bvh": (".bvh",),
+    "amass": (".npz",),
 }
 IN_SERIES = ("ply", "spz", "sog", "glb", "obj")
 """Formats that hold one pose, of which a folder can hold many; a USD holds a motion by itself."""

@@ -44,18 +44,15 @@ def writers(request: FileRequest) -> Writers:
     if params is not None:
         rows = request.chosen(len(params), moves=True)
         chosen = replace(params.select(list(rows)), fps=request.rate(params))
-    from smplxpp.export import write_glb
+    from smplxpp.export.gltf import write_glb
+    from smplxpp.export.usd import write_usd
 
-    fps = None if chosen is None else chosen.fps
-    return (
-        fps,
-        iter([(1 if chosen is None else len(chosen), partial(write_glb, template=template, animation=chosen))]),
-        [],
-    )
+    write = partial(write_glb if request.format == "glb" else write_usd, template=template, animation=chosen)
+    return None if chosen is None else chosen.fps, iter([(1 if chosen is None else len(chosen), write)]), []
 
 
 def _surfaces(request: FileRequest, template: Template, params: BodyParams | None) -> Writers:
-    from smplxpp.export import write_obj
+    from smplxpp.export.obj import write_obj
 
     if params is None:
         if request.is_series:

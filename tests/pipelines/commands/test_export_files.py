@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from avatar.runtime import AvatarPlayer
 from pipelines.cli import main
 from pipelines.commands.export_request import SUFFIXES, format_of
 from pipelines.runs.layout import STUDENT, TEMPLATE
+from smplxpp.body import load_params
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
@@ -116,6 +118,11 @@ def test_the_template_moves_as_glb_and_stands_as_obj(folder, tmp_path, capsys):
     out = tmp_path / "a.glb"
     report = export(capsys, folder / "run", "--out", out, "--model", "template", *shown, "--stop", 4)
     assert report["frames"] == 4 and "animations" in GlbReader(out).json
+    if find_spec("pxr"):
+        report = export(
+            capsys, folder / "run", "--out", tmp_path / "a.usdc", "--model", "template", *shown, "--frame", 2
+        )
+        assert report["frames"] == 4 and report["bytes"] > 1000
     report = export(capsys, folder / "run", "--out", tmp_path / "still.glb", "--model", "template")
     assert report["frames"] == 1 and "animations" not in GlbReader(tmp_path / "still.glb").json
     template = Template.load(folder / "run" / TEMPLATE)
@@ -160,3 +167,29 @@ def test_a_suffix_tells_the_format_where_one_has_it():
     assert format_of(Path("a.usda"), "auto") == "usd"
     with pytest.raises(InputError, match="format ply or spz"):
         format_of(Path("folder"), "auto")
+
+
+def test_a_motion_becomes_bvh_and_amass(folder, tmp_path, capsys):
+    for source in ("run", "me.avatar"):
+        report = export(
+            capsys, folder / source, "--out", tmp_path / "a.bvh", "--params", folder / "motion.npz", "--step", 2
+        )
+        assert (report["frames"], report["fps"]) == (3, 10.0)
+        assert "Frames: 3" in (tmp_path / "a.bvh").read_text()
+        options = ("--format", "amass", "--params", folder / "motion.npz")
+        report = export(capsys, folder / source, "--out", tmp_path / "a.npz", *options)
+        assert report["frames"] == 6
+        body = Template.load(folder / "run" / TEMPLATE).body
+        z_up = replace(load_params(tmp_path / "a.npz"), expression=np.zeros((6, 0)))
+        y_up = replace(dance(), expression=np.zeros((6, 0)))
+        ours, theirs = (body.forward(it.without_shape()).joints for it in (y_up, z_up))
+        # float32 in the bundle
+        np.testing.assert_allclose(theirs, np.stack([ours[..., 0], -ours[..., 2], ours[..., 1]], axis=-1), atol=1e-5)
+    for name in ("a.bvh", "a.npz"):
+        (tmp_path / name).unlink()
+        report = export(
+            capsys, folder / "run", "--out", tmp_path / name, "--format", {"a.bvh": "bvh"}.get(name, "amass")
+        )
+        assert report["error"]["subject"] == "option params"
+    report = export(capsys, folder / "run", "--out", tmp_path / "a.npz")
+    assert report["error"]["subject"] == "option params" and list(tmp_path.iterdir()) == []

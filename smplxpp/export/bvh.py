@@ -1,0 +1,102 @@
+"""A motion as BVH, the skeleton file of animation programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
+
+UNITS_A_METRE = 100.0
+"""BVH has no unit of its own; animation programs take it as centimetres."""
+_FPS = 30.0
+_PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Xrotation Yrotation"
+# Of the bone that a joint without children ends: as long as so much of the one before it.
+_END = 0.6
+
+
+def write_bvh(
+    path: str | Path, body: BodyModel, params: BodyParams, *, joints: Float[np.ndarray, "J 3"] | None = None
+) -> None:
+    """Write a motion and the skeleton that makes it, whole or not at all.
+
+    The skeleton rests in the T-pose, in centimetres with +Y up; the root has six channels, every other joint three, in
+    the order Z X Y (`R = R_z R_x R_y`), degrees, without jumps from frame to frame where that can be. Hands are
+    complete. Left out: expressions, and what they and the shape do to the joints.
+
+    Args:
+        body: J joints, whose names they get. params: T frames, at their `fps` or 30 a second.
+        joints: at rest, metres; None: those of the mean shape.
+
+    Raises:
+        InputError: no frames, a rate that is not positive, a body of several roots.
+    """
+    fps = params.fps or _FPS
+    require_positive("frames a second of the motion", fps)
+    roots = np.flatnonzero(body.parents < 0)
+    if not len(params) or roots.tolist() != [0]:
+        received = f"{len(params)} frames, roots {roots.tolist()}"
+        raise InputError("motion for BVH", expected="at least one frame, and one root first", received=received)
+    rest = body.joint_regressor @ body.v_template if joints is None else np.asarray(joints, np.float64)
+    offsets = UNITS_A_METRE * (rest - np.where(body.parents[:, None] >= 0, rest[body.parents], 0.0))
+    order = _depth_first(body)
+    lines = ["HIERARCHY", *_node(body, offsets, 0, ""), "MOTION"]
+    lines += [f"Frames: {len(params)}", f"Frame Time: {1.0 / fps:.8f}"]
+    turns = euler_zxy(body.joint_rotations(params))[:, order].reshape(len(params), -1)
+    places = UNITS_A_METRE * (rest[0] + params.transl)
+    pattern = " ".join(["%.6f"] * (3 + turns.shape[1]))
+    lines += [pattern % tuple(row) for row in np.hstack([places, turns]).tolist()]
+    atomic_write_text(path, "\n".join(lines) + "\n")
+
+
+def euler_zxy(rotations: Float[np.ndarray, "T J 3 3"]) -> Float64[np.ndarray, "T J 3"]:
+    """Return angles in degrees with `R = R_z(a) R_x(b) R_y(c)`, each frame's nearest to those of the frame before."""
+    T, J = rotations.shape[:2]
+    upright = rotations.reshape(-1, 3, 3)
+    b = np.arcsin(np.clip(upright[:, 2, 1], -1.0, 1.0))
+    a = np.arctan2(-upright[:, 0, 1], upright[:, 1, 1])
+    c = np.arctan2(-upright[:, 2, 0], upright[:, 2, 2])
+    # Where the first and the last axis are one, only their sum counts: the first takes it.
+    locked = np.abs(upright[:, 2, 1]) > 1.0 - 1e-9
+    a = np.where(locked, np.arctan2(upright[:, 1, 0], upright[:, 0, 0]), a)
+    out = np.degrees(np.stack([a, b, np.where(locked, 0.0, c)], axis=1)).reshape(T, J, 3)
+    other = out * [1.0, -1.0, 1.0] + 180.0  # the second solution
+    for k in range(1, T):
+        near = [one + 360.0 * np.rint((out[k - 1] - one) / 360.0) for one in (out[k], other[k])]
+        far = [np.abs(one - out[k - 1]).sum(axis=1, keepdims=True) for one in near]
+        out[k] = np.where(far[0] <= far[1], near[0], near[1])
+    return out
+
+
+def _depth_first(body: BodyModel) -> list[int]:
+    """Return joints as the file's hierarchy has them."""
+    order, waiting = [], [0]
+    while waiting:
+        joint = waiting.pop()
+        order.append(joint)
+        waiting += np.flatnonzero(body.parents == joint)[::-1].tolist()
+    return order
+
+
+def _node(body: BodyModel, offsets: Float[np.ndarray, "J 3"], joint: int, indent: str) -> list[str]:
+    """Return the lines of a joint and all below it."""
+    children = np.flatnonzero(body.parents == joint).tolist()
+    inner = indent + "  "
+    kind, channels = ("JOINT", f"3 {_TURN}") if indent else ("ROOT", f"6 {_PLACE} {_TURN}")
+    lines = [f"{indent}{kind} {body.joint_names[joint]}", f"{indent}{{", f"{inner}{_offset(offsets[joint])}"]
+    lines.append(f"{inner}CHANNELS {channels}")
+    for child in children:
+        lines += _node(body, offsets, child, inner)
+    if not children:
+        lines += [f"{inner}End Site", f"{inner}{{", f"{inner}  {_offset(_END * offsets[joint])}", f"{inner}}}"]
+    return [*lines, f"{indent}}}"]
+
+
+def _offset(offset: Float[np.ndarray, " 3"]) -> str:
+    return "OFFSET " + " ".join(f"{number:.6f}" for number in offset)

@@ -1,0 +1,182 @@
+"""A template, with its skin, expressions and motion, as USD (UsdSkel)."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from smplxpp.core.errors import GeometryWarning
+from smplxpp.core.labels import LABELS
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_positive
+from smplxpp.export.gltf_animation import DEFAULT_FPS, joint_motion
+from smplxpp.export.gltf_skin import rest_offsets
+from smplxpp.export.usd_stage import open_usd, usd_modules
+from smplxpp.template.template import BODY_PART, Template
+
+_ROOT = "template"
+# A vertex that an expression of one unit moves by less, in metres, is left out of that blend shape.
+_STILL = 1e-6
+
+
+def write_usd(path: str | Path, template: Template, *, animation: BodyParams | None = None) -> None:
+    """Write the template as a `SkelRoot`, whole or not at all.
+
+    A mesh a part with all its skin weights, normals, linear colours (`displayColor`) and a material of its label; one
+    skeleton; the expressions as blend shapes of the body; the motion as a `SkelAnimation`, one time code a frame.
+    UsdSkel's skinning then gives what `template.pose(animation)` gives, to float32, but for pose correctives. Metres,
+    +Y up.
+
+    Args:
+        path: .usdc, .usda or .usd.
+        animation: T frames, played at their `fps` or 30 a second.
+
+    Raises:
+        InputError: another suffix, or an animation that the template cannot play.
+        MissingExtraError: no usd-core.
+
+    Warns:
+        GeometryWarning: an animation of a template with pose correctives, which UsdSkel has no place for.
+    """
+    pxr = usd_modules("a template as USD")
+    if animation is not None and template.body.posedirs is not None:
+        warnings.warn("animation: the pose correctives of the template are left out", GeometryWarning, stacklevel=2)
+    fps = None if animation is None else animation.fps or DEFAULT_FPS
+    if fps is not None:
+        require_positive("frames a second of the animation", fps)
+    with open_usd(path, default=_ROOT, fps=fps) as stage:
+        pxr.UsdSkel.Root.Define(stage, f"/{_ROOT}")
+        joints = _add_skeleton(pxr, stage, template)
+        shapes = _add_parts(pxr, stage, template)
+        if animation is not None:
+            _add_motion(pxr, stage, template, animation, (joints, shapes))
+            stage.SetEndTimeCode(len(animation) - 1)
+
+
+def _add_skeleton(pxr: SimpleNamespace, stage: Any, template: Template) -> list[str]:
+    """Add the skeleton at rest; return the paths of its joints."""
+    names = [_identifier(name) for name in template.body.joint_names]
+    paths: list[str] = []
+    for name, parent in zip(names, template.body.parents, strict=True):
+        paths.append(name if parent < 0 else f"{paths[parent]}/{name}")
+    skeleton = pxr.UsdSkel.Skeleton.Define(stage, f"/{_ROOT}/skeleton")
+    skeleton.CreateJointsAttr(paths)
+    skeleton.CreateBindTransformsAttr(_translations(pxr, template.joints))
+    skeleton.CreateRestTransformsAttr(_translations(pxr, rest_offsets(template)))
+    return paths
+
+
+def _add_parts(pxr: SimpleNamespace, stage: Any, template: Template) -> list[str]:
+    """Add a mesh a part; return the names of the body's blend shapes."""
+    Vt, shapes = pxr.Vt, []
+    normals = template.mesh.vertex_normals.astype(np.float32)
+    influences = template.weights.joint_indices.shape[1]
+    for index, name in enumerate(template.part_names):
+        faces = template.faces[template.part_faces(name)]
+        if not len(faces):
+            continue
+        rows = np.flatnonzero(template.vertex_part == index)
+        points = np.ascontiguousarray(template.vertices[rows], np.float32)
+        mesh = pxr.UsdGeom.Mesh.Define(stage, f"/{_ROOT}/{_identifier(name)}")
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+        # Parts follow each other in the vertices, so the part's own indices are these.
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy((faces - rows[0]).astype(np.int32).ravel()))
+        mesh.CreateSubdivisionSchemeAttr("none")
+        mesh.CreateDoubleSidedAttr(name != BODY_PART)
+        mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals[rows]))
+        mesh.SetNormalsInterpolation("vertex")
+        colors = mesh.CreateDisplayColorPrimvar("vertex")
+        colors.Set(Vt.Vec3fArray.FromNumpy(_linear(template.vertex_colors[rows])))
+        binding = pxr.UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+        binding.CreateSkeletonRel().SetTargets([f"/{_ROOT}/skeleton"])
+        binding.CreateGeomBindTransformAttr(pxr.Gf.Matrix4d(1.0))
+        joints = template.weights.joint_indices[rows].astype(np.int32).ravel()
+        weights = template.weights.joint_weights[rows].astype(np.float32).ravel()
+        binding.CreateJointIndicesPrimvar(False, influences).Set(Vt.IntArray.FromNumpy(joints))
+        binding.CreateJointWeightsPrimvar(False, influences).Set(Vt.FloatArray.FromNumpy(weights))
+        _add_material(pxr, stage, template, mesh, rows)
+        if name == BODY_PART:
+            shapes = _add_expressions(pxr, stage, template, mesh)
+    return shapes
+
+
+def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any) -> list[str]:
+    names, targets = [], []
+    for k, expression in enumerate(template.body.expression_names):
+        offsets = np.ascontiguousarray(template.body.exprdirs[:, :, k], np.float32)
+        rows = np.flatnonzero(np.square(offsets).sum(axis=1) > _STILL**2)
+        shape = pxr.UsdSkel.BlendShape.Define(stage, mesh.GetPath().AppendChild(_identifier(expression)))
+        shape.CreateOffsetsAttr(pxr.Vt.Vec3fArray.FromNumpy(offsets[rows]))
+        shape.CreatePointIndicesAttr(pxr.Vt.IntArray.FromNumpy(rows.astype(np.int32)))
+        names.append(_identifier(expression))
+        targets.append(shape.GetPath())
+    if names:
+        binding = pxr.UsdSkel.BindingAPI(mesh.GetPrim())
+        binding.CreateBlendShapesAttr(names)
+        binding.CreateBlendShapeTargetsRel().SetTargets(targets)
+    return names
+
+
+def _add_material(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any, rows: np.ndarray) -> None:
+    """Add a preview surface in the colours of the vertices, named by the part's commonest label."""
+    label = LABELS[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    path = mesh.GetPath().AppendChild(f"{_identifier(label.name)}_material")
+    types = pxr.Sdf.ValueTypeNames
+    material = pxr.UsdShade.Material.Define(stage, path)
+    surface = pxr.UsdShade.Shader.Define(stage, path.AppendChild("surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", types.Float).Set(0.9)
+    reader = pxr.UsdShade.Shader.Define(stage, path.AppendChild("color"))
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    reader.CreateInput("varname", types.String).Set("displayColor")
+    color = reader.CreateOutput("result", types.Float3)
+    surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
+    pxr.UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+
+
+def _add_motion(
+    pxr: SimpleNamespace, stage: Any, template: Template, params: BodyParams, named: tuple[list[str], list[str]]
+) -> None:
+    joints, shapes = named
+    rotations, translations = joint_motion(template, params)
+    xyzw = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().astype(np.float32)
+    xyzw = xyzw.reshape(*rotations.shape[:2], 4)
+    weights = np.zeros((len(params), len(shapes)), np.float32)
+    given = min(params.expression.shape[1], len(shapes))
+    weights[:, :given] = params.expression[:, :given]
+    motion = pxr.UsdSkel.Animation.Define(stage, f"/{_ROOT}/motion")
+    motion.CreateJointsAttr(joints)
+    motion.CreateScalesAttr(pxr.Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
+    if shapes:
+        motion.CreateBlendShapesAttr(shapes)
+    for k in range(len(params)):
+        motion.CreateTranslationsAttr().Set(pxr.Vt.Vec3fArray.FromNumpy(translations[k].astype(np.float32)), k)
+        motion.CreateRotationsAttr().Set(pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(xyzw[k])), k)
+        if shapes:
+            motion.CreateBlendShapeWeightsAttr().Set(pxr.Vt.FloatArray.FromNumpy(weights[k]), k)
+    skeleton = pxr.UsdSkel.BindingAPI.Apply(stage.GetPrimAtPath(f"/{_ROOT}/skeleton"))
+    skeleton.CreateAnimationSourceRel().SetTargets([motion.GetPath()])
+
+
+def _translations(pxr: SimpleNamespace, offsets: np.ndarray) -> Any:
+    return pxr.Vt.Matrix4dArray([pxr.Gf.Matrix4d(1.0).SetTranslate(tuple(map(float, row))) for row in offsets])
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """sRGB bytes as linear floats (IEC 61966-2-1)."""
+    c = colors / 255.0
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _identifier(name: str) -> str:
+    """A name that paths of USD can have."""
+    kept = "".join(letter if letter.isascii() and (letter.isalnum() or letter == "_") else "_" for letter in name)
+    return kept if kept and not kept[0].isdigit() else f"_{kept}"
