@@ -14,11 +14,14 @@ from avatar.runtime.bundle import AvatarBundle, load_bundle
 from avatar.runtime.clothes import Clothes
 from avatar.runtime.field import Field
 from avatar.runtime.kernels import SurfaceKernel, WorldKernel, add_basis, joint_transforms
+from avatar.runtime.relighting import facing_normals, relit_picture
 from avatar.runtime.skeleton import skeleton_body
 from avatar.runtime.splatting import Splatter, WorldSplats
 from smplxpp.cloth.driver import ClothShape, DriverConfig
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.light import Relighting
+from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.core.params import BodyParams
 from smplxpp.native import thread_count
 
@@ -170,19 +173,43 @@ class AvatarPlayer:
         return out
 
     def draw(
-        self, camera: Camera, *, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self,
+        camera: Camera,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        relighting: Relighting | None = None,
     ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
         """Return the last pose as a camera sees it: sRGB, not clamped, and its opacity.
+
+        Args:
+            relighting: the picture is shown in another light, by the normals that are drawn beside it.
 
         Raises:
             InputError: what `Splatter.draw` refuses.
         """
         begin = self._clock()
-        drawn = self._splatter.draw(
+        image, alpha = self._splatter.draw(
             self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads
         )
+        if relighting is not None:
+            facing = facing_normals(self.normals, self._splats, camera.position)
+            normals, _ = self._splatter.draw(
+                self._splats, camera, eps2d=self._eps2d, threads=self.threads, features=facing
+            )
+            image = relit_picture(image, alpha, normals, relighting, background)
         self.seconds["draw"] = self._clock() - begin
-        return drawn
+        return image, alpha
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "N 3"]:
+        """The unit normals of the posed surface where the Gaussians hang on it, smooth over its triangles."""
+        t = self.bundle.tensors
+        faces = t["surface.faces"]
+        smooth = TriangleMesh(self._posed, faces).vertex_normals
+        u, v = t["gaussians.barycentric"].T.astype(np.float64)
+        corners = smooth[faces[self._face_of]]
+        bary = np.stack([u, v, 1.0 - u - v], axis=1)
+        return normalize_rows(np.einsum("nk,nkx->nx", bary, corners)).astype(np.float32)
 
     @property
     def vertices(self) -> Float32[np.ndarray, "V 3"]:

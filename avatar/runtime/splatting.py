@@ -95,12 +95,13 @@ class Splatter:
         eps2d: float = 0.1,
         threads: int = 1,
         seconds: np.ndarray | None = None,
+        features: Float32[np.ndarray, "N 3"] | None = None,
     ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
         """Return the picture, sRGB and not clamped, and its opacity.
 
         Args:
             camera: a pinhole. background: sRGB. eps2d: pixels squared by which splats are blurred.
-            seconds: float64, added to by `STAGES`.
+            seconds: float64, added to by `STAGES`. features: in the place of colours; None: the splats' own.
 
         Raises:
             InputError: a parallel camera, a picture too large, or splats that would fill the memory.
@@ -109,7 +110,9 @@ class Splatter:
             raise InputError(f"camera {camera.name!r}", expected="a pinhole", received="an orthographic one")
         check_size(camera.width, camera.height, "picture")
         count, size = len(splats.means), (camera.height, camera.width)
-        colors = splats.colors(camera.position.astype(np.float32), threads=threads)
+        colors = features
+        if colors is None:
+            colors = splats.colors(camera.position.astype(np.float32), threads=threads)
         view = np.ascontiguousarray(camera.cam_from_world, dtype=np.float32)
         K, behind = np.ascontiguousarray(camera.K, dtype=np.float32), np.array(background, dtype=np.float32)
         gaussians = (splats.means, splats.quats, splats.scales, splats.opacities, colors)

@@ -16,10 +16,12 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import StudentFilm, motion_for, open_student, student_frames
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
+from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
+from pipelines.figures.style import ShadeStyle
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS
 from smplxpp.cloth import Garment, cut_garment
@@ -77,6 +79,8 @@ class Animate:
     """Frame after the last."""
     step: int = 1
     """Take every step-th frame."""
+    lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
+    """The light that the person is shown in."""
     json: bool = False
     """Print what was written as JSON."""
     _said: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
@@ -130,6 +134,7 @@ class Animate:
             width=self.width,
             simulate=bool(simulated),
             clamp=self.outside == "clamp",
+            relighting=self.lighting.relighting(),
         )
         cameras, frames = student_frames(bundle, motion, shown, film, self._said)
         shown_frames = track(
@@ -155,6 +160,8 @@ class Animate:
     def _check_options(self, suffix: str) -> None:
         if suffix == ".glb" and self._of_student:
             raise InputError(f"output {self.out}", expected=".mp4, .gif or a folder for a student", received=".glb")
+        if suffix == ".glb" and self.lighting.environment is not None:
+            raise InputError("option environment", expected="a film or pictures", received=f"output {self.out}")
         if self.interpolate is not None:
             require_positive("option interpolate", self.interpolate)
             if self.step != 1 or not self._of_student:
@@ -246,11 +253,18 @@ class Animate:
             "weights": lambda: blend_joint_colors(template.weights),
             "none": lambda: None,
         }[self.colors]()
+        relighting = self.lighting.relighting()
+        # The light is in the colours then; the figure's own would come on top.
+        style = None if relighting is None else ShadeStyle(relief=0.0)
         pairs = zip(posed, cameras, strict=True)
         for vertices, camera in track(
             pairs, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json
         ):
-            yield render_shaded(template.mesh.with_vertices(vertices), camera, vertex_colors=colors)
+            mesh, shown = template.mesh.with_vertices(vertices), colors
+            if relighting is not None and colors is not None:
+                lit = relighting.colors(colors / 255.0, mesh.vertex_normals)
+                shown = np.round(255.0 * lit).astype(np.uint8)
+            yield render_shaded(mesh, camera, vertex_colors=shown, style=style)
 
 
 def _pose_blocks(template: Template, params: BodyParams) -> Iterator[Float[np.ndarray, "V 3"]]:

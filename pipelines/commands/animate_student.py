@@ -15,6 +15,7 @@ from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
 from smplxpp.body import load_params
 from smplxpp.core.camera import Camera
+from smplxpp.core.light import Relighting
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 
@@ -32,6 +33,7 @@ class StudentFilm:
     Attributes:
         view: name of a view, or "turntable". height, width: pixels; no width: as wide as the motion needs.
         simulate: the loose clothes. clamp: joints turn no farther than in training.
+        relighting: the light that the person is shown in; None: that of the capture.
     """
 
     view: str
@@ -39,6 +41,7 @@ class StudentFilm:
     width: int | None
     simulate: bool
     clamp: bool
+    relighting: Relighting | None = None
 
 
 def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
@@ -120,6 +123,6 @@ def _pictures(
             continue
         if not film.simulate:
             player.pose(motion.frame(k))
-        image, _ = player.draw(picture[k], background=_BACKGROUND)
+        image, _ = player.draw(picture[k], background=_BACKGROUND, relighting=film.relighting)
         yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     said += player.said

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import webbrowser
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.label import wait
+from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import OptionalPath, require_avatar
 from pipelines.commands.templates import load_run_template
 from smplxpp.core.validation import require_between
@@ -28,6 +29,8 @@ class View:
     """Capture whose photographs and frames are shown; by default the one that the run was made from."""
     params: OptionalPath = None
     """Motion to go through, any layout that `smplxpp params convert` reads; by default the capture's frames."""
+    lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
+    """The light that the Gaussians are shown in."""
     port: int = 8080
     """Port to listen at, on this machine alone; the next free one where it is taken."""
     no_browser: bool = False
@@ -43,7 +46,13 @@ class View:
         require_between("option port", self.port, 1, _LARGEST_PORT)
         require_avatar("the viewer of a run")
         template = load_run_template(self.run_folder)
-        session = open_run(self.run_folder, template, capture=self.capture, params=self.params)
+        session = open_run(
+            self.run_folder,
+            template,
+            capture=self.capture,
+            params=self.params,
+            relighting=self.lighting.relighting(),
+        )
         window = open_run_window(session, port=self.port)
         Console(stderr=self.json).print(f"{window.address}  (Ctrl-C ends it)", highlight=False)
         try:

@@ -6,6 +6,7 @@ with the pose. No path tracing: light that bounces is estimated from the surface
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from smplxpp.core.camera import Camera
+from smplxpp.core.light import Irradiance, panorama_directions
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh, view_directions
 
@@ -42,27 +44,67 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray,
 
     `E(n) = 1/pi integral of L(w) V(w) max(n . w, 0) dw`, with V from depth images along `w`.
     """
+
+    def stage(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 1"]:
+        return np.array([_GROUND + (_SKY - _GROUND) * 0.5 * (1.0 + direction[1])])
+
+    return _gathered(mesh, config, stage)[..., 0]
+
+
+def stage_light() -> Irradiance:
+    """The light of `vertex_light`, without the shadows."""
+    coefficients = np.zeros((9, 3))
+    coefficients[0] = 0.5 * (_SKY + _GROUND) * np.sqrt(4.0 * np.pi)
+    coefficients[1] = 0.5 * (_SKY - _GROUND) * np.sqrt(4.0 * np.pi / 3.0)
+    return Irradiance(coefficients)
+
+
+def environment_light(
+    mesh: TriangleMesh, config: LightConfig, panorama: Float[np.ndarray, "h w 3"]
+) -> Float64[np.ndarray, "2 N 3"]:
+    """Return the same in the light of a panorama (`smplxpp.core.light`), shadows that the person casts included."""
+    height, width = panorama.shape[:2]
+    toward = panorama_directions(height, width).reshape(-1, 3)
+    edges = np.cos(np.linspace(0.0, np.pi, height + 1))
+    solid = np.repeat(edges[:-1] - edges[1:], width)
+    # Every pixel's light comes from the nearest of the directions, so that none is lost between them.
+    nearest = np.argmax(toward @ view_directions(config.directions).T, axis=1)
+    total = np.zeros((config.directions, 3))
+    np.add.at(total, nearest, solid[:, None] * panorama.reshape(-1, 3))
+    share = np.bincount(nearest, solid, minlength=config.directions)
+    mean = total / np.maximum(share, 1e-12)[:, None] * (share / share.mean())[:, None]
+    brightness = {tuple(d): c for d, c in zip(view_directions(config.directions).tolist(), mean, strict=True)}
+    return _gathered(mesh, config, lambda direction: brightness[tuple(direction.tolist())])
+
+
+def _gathered(
+    mesh: TriangleMesh,
+    config: LightConfig,
+    radiance: Callable[[Float64[np.ndarray, " 3"]], Float64[np.ndarray, " C"]],
+) -> Float64[np.ndarray, "2 N C"]:
+    """Gather the light that reaches each vertex, on both sides."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     radius = 0.51 * float(np.linalg.norm(high - low))
     directions = view_directions(config.directions)
     normals = mesh.vertex_normals
     lifted = [mesh.vertices + side * config.lift * normals for side in (1.0, -1.0)]
 
-    def from_one(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "2 N"]:
+    def from_one(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "2 N C"]:
         camera = Camera.orthographic_view(
             center=0.5 * (low + high), direction=direction, half_extent=radius, size=config.resolution
         )
         depth = rasterize_mesh(mesh, camera, threads=1).depth
-        brightness = _GROUND + (_SKY - _GROUND) * 0.5 * (1.0 + direction[1])
+        brightness = radiance(direction)
         facing = normals @ direction
-        out = np.zeros((2, mesh.vertex_count))
+        out = np.zeros((2, mesh.vertex_count, len(brightness)))
         for k, cosine in enumerate((facing, -facing)):
             lit = np.flatnonzero(cosine > 0.0)
-            out[k, lit] = brightness * cosine[lit] * _visible(camera, depth, lifted[k][lit], config.slack)
+            visible = _visible(camera, depth, lifted[k][lit], config.slack)
+            out[k, lit] = brightness * cosine[lit, None] * visible[:, None]
         return out
 
     with ThreadPoolExecutor(2) as pool:
-        total = sum(pool.map(from_one, directions), np.zeros((2, mesh.vertex_count)))
+        total = sum(pool.map(from_one, directions), np.zeros((2, mesh.vertex_count, 1)))
     return total * (4.0 / config.directions)
 
 

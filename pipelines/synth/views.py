@@ -19,6 +19,7 @@ from smplxpp.raster import MeshMaps, rasterize_mesh
 # How far from a garment's border its cover is taken for lasting (a skirt's hem swings), and how far skin may lie below.
 _FROM_BORDER = {"upper": 0.035, "lower": 0.13}
 _BELOW = 0.09
+_DARKEST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +30,13 @@ class LitFrame:
         mesh: all layers' vertices with the faces that are shown.
         face: index of each shown face among the person's.
         light: of the outer and the inner side, from `vertex_light`.
+        environment: the same from `environment_light`, in whose place it shines; None: `light` does.
     """
 
     mesh: TriangleMesh
     face: Int[np.ndarray, " M"]
     light: Float[np.ndarray, "2 V"]
+    environment: Float[np.ndarray, "2 V 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,7 @@ def render_view(
     maps = rasterize_mesh(frame.mesh, fine)
     hit = np.flatnonzero(maps.face_id.ravel() >= 0)
     color = np.zeros((fine.height * fine.width, 3), np.float32)
-    color[hit] = _shaded(person, frame, fine, maps, hit, atlas)
+    color[hit] = _shaded(person, frame, fine, maps, hit, atlas) * _other_light(frame, fine, maps, hit)
     count = _pooled(maps.mask[..., None].astype(np.float32), s)
     linear = _pooled(color.reshape(fine.height, fine.width, 3), s) / np.maximum(count, 1)
     alpha = count[..., 0] / s**2
@@ -163,6 +166,20 @@ def _looked_up(
     corner_light = np.where(back[:, None], frame.light[1][frame.mesh.faces], frame.light[0][frame.mesh.faces])
     light = np.einsum("pk,pk->p", bary, corner_light.astype(np.float32).take(shown, axis=0))
     return bounced(light, albedo)
+
+
+def _other_light(
+    frame: LitFrame, camera: Camera, maps: MeshMaps, pixels: Int[np.ndarray, " P"]
+) -> Float[np.ndarray, "P 3"] | float:
+    """Return by what the frame's environment changes the colours; what bounces changes as what comes straight does."""
+    if frame.environment is None:
+        return 1.0
+    shown = maps.face_id.ravel()[pixels]
+    bary, corners = maps.barycentric.reshape(-1, 3)[pixels], frame.mesh.faces[shown]
+    side = _back_faces(frame.mesh, camera)[shown].astype(np.int64)[:, None]
+    light = np.einsum("pk,pk->p", bary, frame.light[side, corners])
+    other = np.einsum("pk,pkc->pc", bary, frame.environment[side, corners])
+    return other / np.maximum(light, _DARKEST)[:, None]
 
 
 def _back_faces(mesh: TriangleMesh, camera: Camera) -> Bool[np.ndarray, " M"]:

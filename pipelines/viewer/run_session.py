@@ -17,6 +17,7 @@ from pipelines.viewer.training_now import TrainingNow, training_now
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
 from smplxpp.core.labels import display_colors
+from smplxpp.core.light import Relighting
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_choice
@@ -63,6 +64,8 @@ class RunSession:
         run: its folder. template, motion: posed, and through which frames. capture: the photographs; None: none.
         player: draws the Gaussians of `source`; None: the run has none yet. tracked: the surface that was followed.
         now: the training that is under way.
+        relighting: another light than the capture's, which the Gaussians are shown in; None: there is none.
+        relit: whether they are.
         at: row of the motion. turned: degrees about x, y and z by which joints are turned beyond the frame's pose.
         expression: added to the frame's coefficients.
     """
@@ -75,6 +78,8 @@ class RunSession:
     source: SplatSource | None = None
     tracked: Surface | None = None
     now: TrainingNow | None = None
+    relighting: Relighting | None = None
+    relit: bool = True
     at: int = 0
     turned: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     expression: dict[str, float] = field(default_factory=dict)
@@ -159,10 +164,13 @@ class RunSession:
             return None
         frame = self.frame if self.motion.photographed and not self.turned else None
         drawn = self.player.pose(self.params, frame=frame)
+        colors = np.clip(drawn.colors(np.ascontiguousarray(eye, dtype=np.float32)), 0.0, 1.0)
+        if self.relighting is not None and self.relit:
+            colors = self.relighting.colors(colors, self.player.normals)
         return DrawnSplats(
             drawn.means.copy(),
             covariances(drawn.quats.astype(np.float64), drawn.scales.astype(np.float64)),
-            np.clip(drawn.colors(np.ascontiguousarray(eye, dtype=np.float32)), 0.0, 1.0),
+            colors,
             drawn.opacities[:, None].copy(),
         )
 
@@ -176,17 +184,25 @@ class RunSession:
         return True
 
 
-def open_run(run: Path, template: Template, *, capture: Path | None = None, params: Path | None = None) -> RunSession:
+def open_run(
+    run: Path,
+    template: Template,
+    *,
+    capture: Path | None = None,
+    params: Path | None = None,
+    relighting: Relighting | None = None,
+) -> RunSession:
     """Open what a run has to show.
 
     Args:
         template: of the run. capture, params: in the place of those that the run remembers.
+        relighting: another light for the Gaussians.
 
     Raises:
         InputError: a capture or parameters that cannot be read, models of another template.
     """
     shown = capture_of_run(run, capture)
     motion = motion_of_run(run, template, shown, params)
-    session = RunSession(run, template, motion, shown, tracked=tracked_surface(run, template))
+    session = RunSession(run, template, motion, shown, tracked=tracked_surface(run, template), relighting=relighting)
     session.refresh()
     return session

@@ -81,6 +81,7 @@ class RunWindow:
         has_splats = session.player is not None
         with gui.add_folder("Show"):
             self._splats = gui.add_checkbox("Gaussians", has_splats, disabled=not has_splats)
+            self._light = gui.add_checkbox("in the new light", True, visible=session.relighting is not None)
             for layer in session.layers:
                 self._layers[layer.name] = gui.add_checkbox(layer.name, not has_splats)
             self._tracked = gui.add_checkbox("followed surface", False, disabled=session.tracked is None)
@@ -110,6 +111,7 @@ class RunWindow:
         self._play.on_update(lambda _: None if self._play.value else self._photograph())
         for box in (self._splats, self._tracked, self._joint, *self._layers.values()):
             box.on_update(lambda _: self._redraw())
+        self._light.on_update(lambda _: self._relight())
         self._coloring.on_update(lambda _: self._recolor())
         self._turned.on_update(lambda _: self._show_turned())
         for axis in self._axes:
@@ -127,6 +129,11 @@ class RunWindow:
             self._redraw()
             if not self._play.value:
                 self._photograph()
+
+    @one_at_a_time
+    def _relight(self) -> None:
+        self.session.relit = bool(self._light.value)
+        self._redraw()
 
     @one_at_a_time
     def _recolor(self) -> None:

@@ -43,6 +43,12 @@ def srgb8_from_linear(color: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "
     return table[(np.clip(color, 0.0, 1.0) * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.int32)]
 
 
+def srgb_from_linear(color: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    """Turn linear light in 0..1 into sRGB values in 0..1."""
+    x = np.asarray(color, dtype=np.float64)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
 @cache
 def _linear_table() -> np.ndarray:
     return linear_from_srgb(np.arange(256) / 255.0)

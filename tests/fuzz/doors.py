@@ -18,8 +18,10 @@ from smplxpp.capture.images import read_alpha, read_color, read_normals
 from smplxpp.capture.images import read_labels as read_label_image
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
+from smplxpp.core.files.hdr_file import read_radiance
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
+from smplxpp.core.light import Irradiance
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
@@ -31,6 +33,7 @@ from smplxpp.segment.labels import find_label_set
 from tests.capture.scene import make_scene
 from tests.capture.test_readers import CAMERA_NAMES
 from tests.capture.writers import WRITERS
+from tests.core.files.radiance import write_radiance
 from tests.fuzz.examine import Door
 from tests.fuzz.run_doors import run_doors
 
@@ -281,6 +284,22 @@ def _hand_doors() -> list[Door]:
     ]
 
 
+def _light_doors() -> list[Door]:
+    """Panoramas, with flat rows and with packed ones."""
+
+    def write(path: Path, packed: bool) -> None:
+        write_radiance(path, np.random.default_rng(1).uniform(0.0, 5.0, (9, 18, 3)), packed=packed)
+
+    return [
+        Door(
+            f"panorama {kind}",
+            lambda folder, kind=kind: write(folder / "x.hdr", kind == "packed"),
+            lambda folder: Irradiance.of_environment(read_radiance(folder / "x.hdr")),
+        )
+        for kind in ("flat", "packed")
+    ]
+
+
 def _image_doors() -> list[Door]:
     noise = np.random.default_rng(3).integers(0, 255, (24, 20, 4)).astype(np.uint8)
 
@@ -349,6 +368,14 @@ def _basic_doors() -> list[Door]:
 def doors() -> dict[str, Door]:
     """Every door by name."""
     every = [_capture_door(name) for name in WRITERS] + _params_doors() + _keypoint_doors()
-    every += _mesh_doors() + _label_doors() + _hand_doors() + _image_doors() + _detector_doors() + _basic_doors()
+    every += (
+        _mesh_doors()
+        + _label_doors()
+        + _hand_doors()
+        + _image_doors()
+        + _light_doors()
+        + _detector_doors()
+        + _basic_doors()
+    )
     every += run_doors()
     return {door.name: door for door in every}

@@ -1,0 +1,60 @@
+"""Options of a light that people are shown in, and what they make of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.commands.options import OptionalFloat, OptionalPath
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.hdr_file import read_radiance
+from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.validation import require_positive
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Options of another light."""
+
+    environment: OptionalPath = None
+    """Show the person in the light of this panorama: equirectangular, Radiance (.hdr), straight up in its first row."""
+    environment_turn: float = 0.0
+    """Degrees about the vertical by which that light is turned."""
+    exposure: OptionalFloat = None
+    """Factor on that light; by default it is as bright in the mean as white light, so that colours keep their level."""
+    capture_light: OptionalPath = None
+    """Panorama of the light of the capture, which is divided out; by default white light, the same from everywhere."""
+
+    def relighting(self) -> Relighting | None:
+        """Read the light; None where none is asked for.
+
+        Raises:
+            InputError: no such picture, no light in it; options of a light without one.
+        """
+        if self.exposure is not None:
+            require_positive("option exposure", self.exposure)
+        if self.environment is None:
+            if self.environment_turn or self.exposure is not None or self.capture_light is not None:
+                raise InputError(
+                    "option environment",
+                    expected="a panorama, for --environment-turn, --exposure and --capture-light",
+                    received="none",
+                )
+            return None
+        light = read_light(self.environment, turn=self.environment_turn).exposed(self.exposure)
+        captured = Irradiance.uniform() if self.capture_light is None else read_light(self.capture_light).exposed()
+        return Relighting(light, captured)
+
+
+def read_light(path: Path, *, turn: float = 0.0) -> Irradiance:
+    """Read a panorama as light.
+
+    Raises:
+        InputError: no such picture, or no light in it.
+    """
+    try:
+        return Irradiance.of_environment(read_radiance(path), turn=turn)
+    except InputError as error:
+        if error.subject != "panorama":
+            raise
+        raise InputError(f"light {path}", expected=error.expected, received=error.received) from None

@@ -1,0 +1,131 @@
+"""Light from all around as what a matt surface takes of it: nine harmonics of the irradiance, and colours under it.
+
+Ramamoorthi and Hanrahan, An efficient representation for irradiance environment maps (SIGGRAPH 2001). TaoAvatar shades
+its pictures so: "we use the raw rendered image as the base color and apply shading with new environment light based on
+the rendered normal map". What the captured light has done is divided out where it is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
+from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_positive
+
+# Of the cosine lobe over pi, by degree: 1, 2/3, 1/4, and what odd degrees above have: nothing.
+_LOBE = np.repeat([1.0, 2.0 / 3.0, 0.25], [1, 3, 5])
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_DARKEST = 0.02  # of a captured light: colours there would be noise
+
+
+@dataclass(frozen=True, eq=False)
+class Irradiance:
+    """Light that a matt surface takes, over pi: a white one in it has this radiance.
+
+    Attributes:
+        coefficients: of the light's own radiance, real harmonics up to degree 2, by colour.
+    """
+
+    coefficients: Float64[np.ndarray, "9 3"]
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.coefficients, dtype=np.float64)
+        if values.shape != (9, 3) or not np.isfinite(values).all():
+            raise InputError("light", expected="9 x 3 finite coefficients", received=f"shape {values.shape}, or NaN")
+        object.__setattr__(self, "coefficients", values)
+
+    @staticmethod
+    def uniform(radiance: float = 1.0) -> Irradiance:
+        """White light, the same from everywhere: what a capture is taken to have had where nobody knows better."""
+        coefficients = np.zeros((9, 3))
+        coefficients[0] = radiance * np.sqrt(4.0 * np.pi)
+        return Irradiance(coefficients)
+
+    @staticmethod
+    def of_environment(picture: Float[np.ndarray, "H W 3"], *, turn: float = 0.0) -> Irradiance:
+        """Take the harmonics of a panorama, an equirectangular picture in linear light, its first row straight above.
+
+        The middle column is +X and columns go on to +Z, as in glTF's viewers.
+
+        Args:
+            turn: degrees about +Y by which the light is turned.
+
+        Raises:
+            InputError: negative light, NaN or infinity, or no light at all.
+        """
+        if not np.isfinite(picture).all() or picture.min(initial=0.0) < 0.0 or not picture.any():
+            raise InputError("panorama", expected="finite light, not negative, some of it", received="others")
+        height, width = picture.shape[:2]
+        edges = np.cos(np.linspace(0.0, np.pi, height + 1))
+        solid = (edges[:-1] - edges[1:]) * (2.0 * np.pi / width)
+        total = np.zeros((9, 3))
+        for row in range(height):  # not all at once: panoramas are large
+            of_row = harmonics(panorama_directions(height, width, turn=turn, rows=slice(row, row + 1))[0])
+            total += solid[row] * of_row.T @ picture[row].astype(np.float64)
+        return Irradiance(total)
+
+    @property
+    def mean(self) -> float:
+        """Luminance of the light, the mean over all directions."""
+        return float(_LUMINANCE @ self.coefficients[0] / np.sqrt(4.0 * np.pi))
+
+    def exposed(self, factor: float | None = None) -> Irradiance:
+        """Return the light times a factor; None: as bright, in the mean, as white light of radiance 1."""
+        if factor is None:
+            factor = 1.0 / max(self.mean, 1e-12)
+        require_positive("exposure", factor)
+        return Irradiance(factor * self.coefficients)
+
+    def at(self, normals: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3"]:
+        """Return the irradiance over pi of surfaces with these unit normals, never negative."""
+        return np.maximum(harmonics(normals) @ (_LOBE[:, None] * self.coefficients), 0.0)
+
+
+def harmonics(directions: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 9"]:
+    """Return the real spherical harmonics of degree 0 to 2, orthonormal over the sphere."""
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    one = np.full_like(x, 0.5 / np.sqrt(np.pi))
+    a, b, c = np.sqrt(3.0 / (4.0 * np.pi)), np.sqrt(15.0 / (4.0 * np.pi)), np.sqrt(5.0 / (16.0 * np.pi))
+    second = [b * x * y, b * y * z, c * (3.0 * z * z - 1.0), b * x * z, 0.5 * b * (x * x - y * y)]
+    return np.stack([one, a * y, a * z, a * x, *second], axis=-1)
+
+
+def panorama_directions(
+    height: int, width: int, *, turn: float = 0.0, rows: slice = slice(None)
+) -> Float64[np.ndarray, "H W 3"]:
+    """Return where the middles of an equirectangular picture's pixels lie: unit vectors, +Y up."""
+    polar = ((np.arange(height) + 0.5) * np.pi / height)[rows]
+    around = ((np.arange(width) + 0.5) / width - 0.5) * 2.0 * np.pi - np.radians(turn)
+    level = np.sin(polar)[:, None]
+    up = np.broadcast_to(np.cos(polar)[:, None], (len(polar), width))
+    return np.stack([level * np.cos(around), up, level * np.sin(around)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Relighting:
+    """One light in another's place.
+
+    Attributes:
+        light: new. captured: in which the colours were photographed.
+    """
+
+    light: Irradiance
+    captured: Irradiance
+
+    def factor(self, normals: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3"]:
+        """Return by what linear colours of surfaces change; 1 where there is no normal."""
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        unit = normals / np.maximum(length, 1e-9)
+        change = self.light.at(unit) / np.maximum(self.captured.at(unit), _DARKEST)
+        return np.where(length > 1e-6, change, 1.0)
+
+    def colors(
+        self, srgb: Float[np.ndarray, "*N 3"], normals: Float[np.ndarray, "*N 3"]
+    ) -> Float64[np.ndarray, "*N 3"]:
+        """Return sRGB colours in [0, 1] under the new light; beyond white is cut off."""
+        linear = linear_from_srgb(np.clip(srgb, 0.0, 1.0)) * self.factor(normals)
+        return srgb_from_linear(np.minimum(linear, 1.0))
