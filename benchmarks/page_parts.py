@@ -331,6 +331,15 @@ PARTS = (
         "torch's colours count as `world`, the runtime's as `draw`. On two threads the machine was too busy to be "
         "timed.",
     ),
+    Part(
+        "relighting",
+        "The student in another light",
+        "The student of the embedded person, preset `demo`, tracked inputs, trained in the stage's soft light; "
+        "the held-out camera, training frames with true surfaces, drawn by the capture's maker in three panoramas as "
+        "the truth. PSNR of the person, dB. Relit: nine harmonics of the panorama on splatted normals. `own light`: "
+        "the student in the light that it was trained in, against pictures in that light. The column before it starts "
+        "from the true picture and true normals: what shadows that nine harmonics do not have cost.",
+    ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),

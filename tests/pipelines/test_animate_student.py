@@ -11,9 +11,12 @@ from PIL import Image
 
 from avatar.models.model_file import save_avatar
 from pipelines.commands.animate import Animate
+from pipelines.commands.lighting import Lighting
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
+from smplxpp.core.light import panorama_directions
 from tests.cloth.test_driver import swaying
+from tests.core.files.radiance import write_radiance
 from tests.dolls.dancing import dance, write_dance_run
 from tests.runtime.bundles import student, write, write_dressed
 
@@ -89,6 +92,32 @@ def test_loose_clothes_of_a_bundle_are_simulated(tmp_path):
     skinned, other = film(tmp_path, tmp_path / "b", cloth="skin")
     assert simulated["simulated"] == ["lower"] and skinned["simulated"] == []
     assert len(one) == len(other) == 3 and np.abs(one[-1].astype(int) - other[-1]).max() > 10
+
+
+def test_another_light(folder, tmp_path):
+    """A lamp to the person's left, which is on the picture's right: that side brightens, the other darkens."""
+    lamp = np.exp(4.0 * (panorama_directions(16, 32) @ [1.0, 0.0, 0.0] - 1.0))[..., None] * np.ones(3)
+    write_radiance(tmp_path / "lamp.hdr", lamp)
+    for source, model in (("me.avatar", "student"), ("run", "template")):
+        options = {"source": source, "model": model, "stop": 1}
+        _, (plain,) = film(folder, tmp_path / f"{model} a", **options)
+        _, (lit,) = film(folder, tmp_path / f"{model} b", lighting=Lighting(tmp_path / "lamp.hdr"), **options)
+        seen = (plain < 245).any(axis=2) & (lit < 245).any(axis=2)
+        middle = np.argwhere(seen)[:, 1].mean()
+        columns = np.broadcast_to(np.arange(plain.shape[1]), seen.shape)
+        sides = [seen & (columns > middle), seen & (columns < middle)]
+        right, left = (lit[side].mean() / plain[side].mean() for side in sides)
+        assert right > 1.2 * left, model
+    turned = Lighting(tmp_path / "lamp.hdr", environment_turn=180.0)
+    _, (other,) = film(folder, tmp_path / "c", stop=1, lighting=turned)
+    assert np.abs(other.astype(int) - pictures(tmp_path / "student b")[0]).max() > 60
+    with pytest.raises(InputError, match="environment"):
+        film(folder, tmp_path / "d", lighting=Lighting(exposure=2.0))
+    with pytest.raises(InputError, match="light"):
+        film(folder, tmp_path / "e", lighting=Lighting(tmp_path / "none.hdr"))
+    with pytest.raises(InputError, match="environment"):
+        lit = Lighting(tmp_path / "lamp.hdr")
+        Animate(folder / "run", folder / "motion.npz", tmp_path / "a.glb", lighting=lit).run()
 
 
 def test_a_student_is_no_glb(folder, tmp_path):

@@ -26,7 +26,9 @@ from pipelines.viewer.run_models import covariances
 from pipelines.viewer.run_session import open_run
 from pipelines.viewer.run_window import RunWindow, open_run_window
 from pipelines.viewer.training_now import training_now
+from smplxpp.core.colors import linear_from_srgb
 from smplxpp.core.errors import InputError
+from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.rotations import matrix_from_rotvec
 from tests.dolls.dancing import dance, gaussians, template, varied, write_dance, write_dance_run
 from tests.runtime.bundles import student
@@ -164,6 +166,20 @@ def test_a_motion_that_is_given(trained, tmp_path):
     assert session.motion.fps == 25.0 and len(session.motion.numbers) == 6 and not session.motion.photographed
     with pytest.raises(InputError):
         open_run(trained, template(), capture=tmp_path)
+
+
+def test_another_light(trained):
+    dark = Relighting(Irradiance.uniform(0.25), Irradiance.uniform())
+    window = open_run_window(open_run(trained, template(), relighting=dark), port=free_port())
+    try:
+        assert window._light.visible
+        lit = colors(window)
+        window._light.value = False
+        window._relight()
+        plain = colors(window)
+        np.testing.assert_allclose(linear_from_srgb(lit), 0.25 * linear_from_srgb(plain), atol=1e-3)
+    finally:
+        window.close()
 
 
 # --- a training that goes on -----------------------------------------------------------------------------------------
