@@ -17,7 +17,8 @@ class Field:
         self._sets = np.repeat(t["field.sets"], 3, axis=1).astype(np.float32)
         self._codes, about = t["field.codes"], bundle.about
         self._row = {frame: row for row, frame in enumerate(about.frames)}
-        self._null = np.zeros_like(self._codes[0]) if about.null_code_shown else self._codes[0]
+        self.null_code = np.zeros_like(self._codes[0]) if about.null_code_shown else self._codes[0]
+        """Of poses that training did not see."""
         encodings = positional_encoding(t["field.points"], (bundle.sizes["X"] - 3) // 6)
         member, cloth = t["field.member"], t["field.cloth"]
 
@@ -40,7 +41,7 @@ class Field:
     ) -> Float32[np.ndarray, "C 3"]:
         """Return the control points' displacements, metres; the next call writes them anew."""
         row = None if frame is None else self._row.get(frame)
-        code = self._null if row is None else self._codes[row]
+        code = self.null_code if row is None else self._codes[row]
         frames = np.concatenate([theta * self._sets, np.broadcast_to(code, (len(self._sets), len(code)))], axis=1)
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         self._body(frames, self._moved, threads)

@@ -13,7 +13,9 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder
 
 __all__ = ["FileRequest", "export_file", "format_of"]
-_SPLATS, _TEMPLATE, _MOTION = (f"pipelines.commands.export_{name}" for name in ("splats", "template", "motion"))
+_SPLATS, _TEMPLATE, _MOTION, _STEP = (
+    f"pipelines.commands.export_{name}" for name in ("splats", "template", "motion", "step")
+)
 _ROOM = {
     ("student", "ply"): _SPLATS,
     ("student", "spz"): _SPLATS,
@@ -24,7 +26,7 @@ _ROOM = {
     ("template", "usd"): _TEMPLATE,
     ("template", "obj"): _TEMPLATE,
 }
-_ALONE = {"bvh": _MOTION, "amass": _MOTION}
+_ALONE = {"onnx": _STEP, "bvh": _MOTION, "amass": _MOTION}
 Write = Callable[[Path], None]
 
 

@@ -24,6 +24,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "glb": (".glb",),
     "usd": (".usdc", ".usda", ".usd"),
     "obj": (".obj",),
+    "onnx": (".onnx",),
     "bvh": (".bvh",),
     "amass": (".npz",),
 }

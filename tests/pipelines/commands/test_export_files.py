@@ -160,6 +160,16 @@ def test_what_does_not_go_together_is_refused_before_anything_is_written(folder,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_step_becomes_onnx(folder, tmp_path, capsys):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    for source in ("run", "me.avatar"):
+        report = export(capsys, folder / source, "--out", tmp_path / "a.onnx")
+        assert (report["format"], report["fps"]) == ("onnx", None)
+        session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
+        assert {one.name for one in session.get_inputs()} == {"pose", "transl", "expression", "eye"}
+
+
 def test_a_suffix_tells_the_format_where_one_has_it():
     for name, suffixes in SUFFIXES.items():
         for suffix in suffixes:

@@ -1,0 +1,242 @@
+"""Parts of a bundle's step as ONNX: skeleton, field, blend shapes, the way to the world, colours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar.formats.harmonics import sh_basis
+from avatar.formats.onnx_graph import Graph
+from avatar.runtime.bundle import AvatarBundle
+from avatar.runtime.field import Field, positional_encoding
+from avatar.runtime.player import THICKNESS
+
+_SMALL = 1e-4  # squared angles below take the series of sin t / t
+_MIN_EDGE = 1e-6
+
+
+def skeleton(g: Graph, bundle: AvatarBundle, pose: str, transl: str, expression: str) -> tuple[str, str]:
+    """Return transforms of the joints (J, 12), and the T-pose's vertices with expression and pose correctives (V, 3)."""
+    t, J = bundle.tensors, bundle.sizes["J"]
+    parents = t["skeleton.parents"]
+    face = g.reshape(expression, bundle.sizes["E"], 1)
+    moved = g("MatMul", t["skeleton.expression"].reshape(3 * J, -1), face)
+    joints = g("Add", t["skeleton.joints"], g.reshape(moved, J, 3))
+    turns = _rotations(g, pose, J)
+    above = g.gather(joints, np.maximum(parents, 0))
+    roots = (parents < 0)[:, None].astype(np.float32)
+    offsets = g("Add", g("Sub", joints, g("Mul", above, 1.0 - roots)), g("Mul", transl, roots))
+    bottom = np.tile(np.eye(4, dtype=np.float32)[3], (J, 1, 1))
+    local = g("Concat", g("Concat", turns, g.reshape(offsets, J, 3, 1), axis=2), bottom, axis=1)
+    depth = np.zeros(J, int)
+    for j in range(1, J):
+        depth[j] = depth[parents[j]] + 1
+    # A level of the tree at a time; `place` says where among those done a joint lies.
+    done, place = g.gather(local, np.flatnonzero(depth == 0)), np.zeros(J, int)
+    count = int((depth == 0).sum())
+    for level in range(1, depth.max() + 1):
+        own = np.flatnonzero(depth == level)
+        new = g("MatMul", g.gather(done, place[parents[own]]), g.gather(local, own))
+        done, place[own] = g("Concat", done, new, axis=0), count + np.arange(len(own))
+        count += len(own)
+    posed = g.gather(done, place)
+    R = g("Slice", posed, *(g.constant(v, np.int64) for v in ([0, 0], [3, 3], [1, 2])))
+    at = g("Slice", posed, *(g.constant(v, np.int64) for v in ([0, 3], [3, 4], [1, 2])))
+    shift = g("Sub", at, g("MatMul", R, g.reshape(joints, J, 3, 1)))
+    transforms = g.reshape(g("Concat", R, shift, axis=2), J, 12)
+    features = g.reshape(g("Sub", g.gather(turns, np.arange(1, J)), np.eye(3)), 9 * (J - 1), 1)
+    rest, V = g.constant(t["surface.vertices"]), bundle.sizes["V"]
+    for name, drives in (("expression", face), ("pose", features)):
+        basis = t.get(f"surface.{name}")
+        if basis is not None and len(basis):
+            own_rows = g.reshape(g("MatMul", basis.reshape(-1, basis.shape[2]), drives), len(basis), 3)
+            rest = g("Add", rest, g.spread(own_rows, t[f"surface.{name}_rows"], V, 3))
+    return transforms, rest
+
+
+def _rotations(g: Graph, pose: str, J: int) -> str:
+    """Return matrices (J, 3, 3) of axis-angles: `R = I + a K + b K^2`."""
+    squared = g.sum(g("Mul", pose, pose), 1, keep=True)
+
+    def sinc(square: str) -> str:
+        angle = g("Sqrt", g("Max", square, _SMALL))
+        series = g("Sub", 1.0, g("Mul", square, g("Sub", 1.0 / 6.0, g("Mul", square, 1.0 / 120.0))))
+        return g("Where", g("Less", square, _SMALL), series, g("Div", g("Sin", angle), angle))
+
+    half = sinc(g("Mul", squared, 0.25))
+    a, b = sinc(squared), g("Mul", 0.5, g("Mul", half, half))
+    cross = np.zeros((3, 3, 3), np.float32)
+    for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[x, z, y], cross[x, y, z] = 1.0, -1.0
+    K = g.reshape(g("MatMul", pose, cross.reshape(3, 9)), J, 3, 3)
+    of_a, of_b = (g("Mul", g.reshape(one, J, 1, 1), matrix) for one, matrix in ((a, K), (b, g("MatMul", K, K))))
+    return g("Add", g("Add", of_a, of_b), np.eye(3))
+
+
+def field(g: Graph, bundle: AvatarBundle, theta: str) -> str:
+    """Return displacements of the vertices (V, 3): the field at its control points, interpolated."""
+    t, sizes = bundle.tensors, bundle.sizes
+    whole = Field(bundle)
+    code = g.input("code", sizes["Z"], default=whole.null_code)
+    sets = np.repeat(t["field.sets"], 3, axis=1)
+    codes = g("Expand", g.reshape(code, 1, sizes["Z"]), g.constant([len(sets), sizes["Z"]], np.int64))
+    frames = g("Concat", g("Mul", theta, sets), codes, axis=1)
+    encodings = positional_encoding(t["field.points"], (sizes["X"] - 3) // 6)
+
+    def network(name: str, rows: np.ndarray) -> str:
+        own = {key.split(".", 2)[2]: value for key, value in t.items() if key.startswith(f"field.{name}.")}
+        of_frame = g("Gemm", frames, own["of_frame.weight"], own["of_frame.bias"], transB=1)
+        of_point = encodings[rows] @ own["of_point.weight"].T
+        x = g("Relu", g("Add", g.gather(of_frame, t["field.member"][rows]), of_point))
+        for weight, bias in zip(own["hidden.weight"], own["hidden.bias"], strict=True):
+            x = g("Relu", g("Gemm", x, weight, bias, transB=1))
+        return g("Gemm", x, own["last.weight"], own["last.bias"], transB=1)
+
+    moved, cloth = network("body", np.arange(sizes["C"])), t["field.cloth"]
+    if len(cloth):
+        moved = g("Add", moved, g.spread(network("cloth", cloth), cloth, sizes["C"], 3))
+    neighbours, shares = whole.interpolation
+    return g.sum(g("Mul", g.gather(moved, neighbours), shares[:, :, None]), 1)
+
+
+def known(g: Graph, bundle: AvatarBundle, theta: str) -> str | None:
+    """Return how much a pose counts as one that training saw (1), None where all do."""
+    poses = bundle.tensors.get("poses.known")
+    if poses is None:
+        return None
+    scale = float(bundle.tensors["poses.scale"])
+    away = g("Sub", poses, theta)
+    nearest = g("ReduceMin", g.sum(g("Mul", away, away), 1), axes=[0], keepdims=1)
+    over = g("Relu", g("Div", g("Sub", g("Sqrt", nearest), scale), scale))
+    return g("Exp", g("Mul", -0.5, g("Mul", over, over)))
+
+
+def blend_shapes(g: Graph, bundle: AvatarBundle, side: str, drives: str, share: str | None = None) -> str:
+    """Return what one side's shapes add to position and colour (N, 6)."""
+    t, N = bundle.tensors, bundle.sizes["N"]
+    own = {key.split(".", 2)[2]: value for key, value in t.items() if key.startswith(f"blend.{side}.")}
+    values, rows = own["values"], own.get("rows", np.arange(N))
+    shapes, _, held = values.shape
+    if not shapes or not held:
+        return g.constant(np.zeros((N, 6)))
+    x = g("Relu", g("Gemm", drives, own["first.weight"], own["first.bias"], transB=1))
+    for weight, bias in zip(own["hidden.weight"], own["hidden.bias"], strict=True):
+        x = g("Relu", g("Gemm", x, weight, bias, transB=1))
+    x = g("Gemm", x, own["last.weight"], own["last.bias"], transB=1)
+    if share is not None:
+        x = g("Mul", x, share)
+    steps = own.get("step", np.ones((shapes, 6), np.float32))
+    scaled = g("Mul", g.reshape(x, len(own["last.bias"]) // shapes, shapes, 1), steps)
+    part = t.get("blend.part")
+    # (M, n, 6): each row's own coefficients, or the only ones; steps stay the bytes that they are in the file.
+    scaled = g.gather(scaled, np.zeros(1) if part is None else part[rows])
+    numbers = g("Cast", g.constant(values.transpose(2, 0, 1), values.dtype.type), to=1)
+    added = g.sum(g("Mul", numbers, scaled), 1)
+    if "exponent" in own:
+        added = g("Mul", added, np.exp2(own["exponent"])[:, None])
+    return g.spread(added, rows, N, 6)
+
+
+def world(g: Graph, bundle: AvatarBundle, posed: str, added: str | None) -> tuple[str, str, str, str, str]:
+    """Return means, quats, scales and colours of the Gaussians, and their triangles' rotations (N, 3, 3)."""
+    t, F, N = bundle.tensors, bundle.sizes["F"], bundle.sizes["N"]
+    of = np.repeat(np.arange(F), t["gaussians.per_face"])
+    faces = t["surface.faces"]
+    v1, v2, v3 = (g.gather(posed, faces[:, k]) for k in range(3))
+    a, b, c = g("Sub", v2, v1), g("Sub", v3, v1), g("Sub", v3, v2)
+    normal, middle = _cross(g, a, b), g("Add", a, b)
+    n, q = (g("Div", one, g.norm(one)) for one in (normal, middle))
+    columns = [g.reshape(one, F, 3, 1) for one in (n, q, _cross(g, n, q))]
+    R = g("Concat", *columns, axis=2)
+    lengths = g("Add", g("Add", g.norm(a), g.norm(b)), g.norm(c))
+    edge = g("Max", g("Div", lengths, 3.0), _MIN_EDGE)
+    u, v = t["gaussians.barycentric"].T
+    weights = np.stack([u, v, 1.0 - u - v], axis=1)
+    local, dc = g.constant(t["gaussians.offset"]), g.constant(t["gaussians.dc"])
+    if added is not None:
+        parts = g.split("Split", 2, added, g.constant([3, 3], np.int64), axis=1)
+        local, dc = (g("Add", own, part) for own, part in zip((local, dc), parts, strict=True))
+    frames = g.gather(R, of)
+    means = g.reshape(g("MatMul", frames, g.reshape(local, N, 3, 1)), N, 3)
+    for corner, weight in zip((v1, v2, v3), weights.T, strict=True):
+        means = g("Add", means, g("Mul", g.gather(corner, of), weight[:, None]))
+    flat = np.full((N, 1), THICKNESS)
+    scales = g("Mul", g.gather(edge, of), np.hstack([flat, np.exp(t["gaussians.log_scales"])]))
+    turns = g.reshape(g.gather(_quats(g, R, F), of), N, 4, 1)
+    pairs = g.reshape(g("Mul", turns, t["gaussians.quats"][:, None, :]), N, 16)
+    return means, g("MatMul", pairs, _hamilton()), scales, dc, frames
+
+
+def colors(g: Graph, bundle: AvatarBundle, seen: tuple[str, str, str], eye: str) -> str:
+    """Return colours towards a point (N, 3): `max(0, dc + sum_k sh_k Y_k(R^T d))`."""
+    means, frames, dc = seen
+    sh, N = bundle.tensors["gaussians.sh"], bundle.sizes["N"]
+    if sh.shape[1]:
+        away = g("Sub", means, eye)
+        away = g.reshape(g("Div", away, g.norm(away)), N, 1, 3)
+        x, y, z = g.split("Split", 3, g.reshape(g("MatMul", away, frames), N, 3), axis=1)
+        basis = _harmonics(g, (x, y, z), sh.shape[1])
+        dc = g("Add", dc, g.sum(g("Mul", g.reshape(basis, N, sh.shape[1], 1), sh), 1))
+    return g("Relu", dc)
+
+
+def _harmonics(g: Graph, xyz: tuple[str, str, str], count: int) -> str:
+    """Return harmonics of degree 1 and up (N, count), as sums of products of coordinates."""
+    x, y, z = xyz
+    powers = {"": g("Add", g("Mul", x, 0.0), 1.0), "x": x, "y": y, "z": z}
+    names = ["xx", "yy", "zz", "xy", "yz", "xz"] if count > 3 else []
+    names += ["xxx", "xxy", "xxz", "xyy", "xyz", "xzz", "yyy", "yyz", "yzz", "zzz"] if count > 8 else []
+    for name in names:
+        powers[name] = g("Mul", powers[name[:-1]], powers[name[-1]])
+    return g("MatMul", g("Concat", *powers.values(), axis=1), _coefficients(list(powers), count))
+
+
+def _coefficients(names: list[str], count: int) -> np.ndarray:
+    """Return (monomials, harmonics), found from values: harmonics are sums of these monomials exactly."""
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
+    monomials = np.stack([_product(directions, name) for name in names], axis=1)
+    basis = sh_basis(directions, round((count + 1) ** 0.5) - 1)
+    return np.linalg.lstsq(monomials, basis, rcond=None)[0]
+
+
+def _product(directions: np.ndarray, name: str) -> np.ndarray:
+    return np.prod([directions[:, "xyz".index(letter)] for letter in name] or [np.ones(len(directions))], axis=0)
+
+
+def _cross(g: Graph, a: str, b: str) -> str:
+    """Return cross products along the last axis of (F, 3)."""
+    orders = [g.constant(order, np.int32) for order in ([1, 2, 0], [2, 0, 1])]
+    a1, a2, b1, b2 = (g("Gather", one, order, axis=1) for one in (a, b) for order in orders)
+    return g("Sub", g("Mul", a1, b2), g("Mul", a2, b1))
+
+
+def _quats(g: Graph, R: str, F: int) -> str:
+    """Return unit quaternions wxyz (F, 4): the longest row of `4 q q^T`, which is linear in the rotation."""
+    rows = np.zeros((9, 4, 4), np.float32)
+    for k, signs in enumerate(((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))):
+        rows[[0, 4, 8], k, k] = signs
+    for i, j, plus, minus in ((0, 1, 7, 5), (0, 2, 2, 6), (0, 3, 3, 1)):
+        rows[plus, [i, j], [j, i]], rows[minus, [i, j], [j, i]] = 1.0, -1.0
+    for i, j, one, other in ((1, 2, 1, 3), (1, 3, 2, 6), (2, 3, 5, 7)):
+        rows[one, [i, j], [j, i]] = rows[other, [i, j], [j, i]] = 1.0
+    outer = g("Add", g("MatMul", g.reshape(R, F, 9), rows.reshape(9, 16)), np.eye(4).reshape(16))
+    diagonal = g("Gather", outer, g.constant([0, 5, 10, 15], np.int32), axis=1)
+    best = g("Cast", g("ArgMax", diagonal, axis=1, keepdims=1), to=1)
+    chosen = g("Cast", g("Equal", best, np.arange(4.0)[None]), to=1)
+    row = g.sum(g("Mul", g.reshape(outer, F, 4, 4), g.reshape(chosen, F, 4, 1)), 1)
+    return g("Div", row, g.norm(row))
+
+
+def _hamilton() -> np.ndarray:
+    """Return (16, 4): products of two quaternions' numbers to the numbers of their product, wxyz."""
+    out = np.zeros((4, 4, 4), np.float32)
+    terms = (
+        ((0, 0, 1), (1, 1, -1), (2, 2, -1), (3, 3, -1)),
+        ((0, 1, 1), (1, 0, 1), (2, 3, 1), (3, 2, -1)),
+        ((0, 2, 1), (1, 3, -1), (2, 0, 1), (3, 1, 1)),
+        ((0, 3, 1), (1, 2, 1), (2, 1, -1), (3, 0, 1)),
+    )
+    for k, row in enumerate(terms):
+        for i, j, sign in row:
+            out[i, j, k] = sign
+    return out.reshape(16, 4)
