@@ -10,9 +10,15 @@ from typing import Any
 import numpy as np
 
 from avatar.export.bundle import BundleExtras, write_bundle
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
+from smplxpp.cloth import GarmentConfig, cut_garment
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
+from tests.cloth.persons import OVER, PART, person, standing
 from tests.dolls.dancing import dance
 from tests.dolls.doll import place_camera
 from tests.runtime.bundles import student
@@ -20,6 +26,8 @@ from tests.runtime.bundles import student
 FPS = 10.0
 BACKGROUND = (0.2, 0.4, 0.6)
 NAME = "Doll <script>"
+SWAY_FPS = 20.0
+_COARSE = GarmentConfig(spacing=0.06, collider_spacing=0.04)
 
 
 @cache
@@ -32,6 +40,20 @@ def write_avatar(path: Path) -> bytes:
     """Write the doll with everything that a student can have; return the file's bytes."""
     write_bundle(path, student("whole"), BundleExtras(name=NAME, licence="CC0", motion=motion()))
     return path.read_bytes()
+
+
+def write_dressed(path: Path, motion: BodyParams, *, layers: int = 1) -> Path:
+    """Write the person of balls in one skirt or two.
+
+    No two of their threads are as long: of equal ways to what holds the cloth either could be taken.
+    """
+    template, rng = person(layers=layers), np.random.default_rng(0)
+    garments = [cut_garment(template, part, standing(), _COARSE) for part in (PART, OVER)[:layers]]
+    garments = [replace(g, lengths=g.lengths * (1.0 + 1e-3 * rng.random(len(g.lengths)))) for g in garments]
+    config = StudentConfig(FieldConfig(width=8, hidden_layers=2, code_size=4), None, control_points=40)
+    it = Student(config, Rig(template), sample_on_mesh(template, SamplingConfig(count=500)), (0, 1))
+    write_bundle(path, it, BundleExtras(name="dressed", garments=garments, motion=replace(motion, fps=SWAY_FPS)))
+    return path
 
 
 def camera(angle: float = 40.0) -> Camera:

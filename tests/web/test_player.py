@@ -14,9 +14,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar.runtime import AvatarPlayer
 from pipelines.web.page import page_files, single_page
 from pipelines.web.server import PageServer
-from tests.web.avatars import NAME, asked, camera, decibels, drawn, write_avatar
+from smplxpp.core.params import BodyParams
+from tests.cloth.test_driver import swaying
+from tests.dolls.doll import place_camera
+from tests.web.avatars import (
+    BACKGROUND,
+    NAME,
+    SWAY_FPS,
+    asked,
+    camera,
+    decibels,
+    drawn,
+    write_avatar,
+    write_dressed,
+)
 from tests.web.chromium import Page, find_chromium
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
@@ -122,6 +136,41 @@ def test_one_file_opens_from_disk_and_asks_no_network(browser, avatar, tmp_path)
     assert decibels(browser.picture(asked(camera(), 3)) / 255.0, image, alpha > 0.5) > 38.0
     assert browser.evaluate("fetch('https://example.invalid').then(() => 'sent', () => 'refused')") == "refused"
     assert all("Content Security Policy" in error for error in browser.errors), browser.errors
+
+
+def test_loose_clothes_are_simulated(browser, tmp_path):
+    """A cold start and steps from there are the runtime's; live, the cloth goes on when the pose stands still."""
+    path = tmp_path / "dressed.avatar"
+    write_dressed(path, BodyParams.concatenate([swaying(k / SWAY_FPS) for k in range(16)]))
+    page = tmp_path / "player.html"
+    page.write_bytes(single_page(path.read_bytes(), name=NAME))
+    browser.go(page.as_uri())
+    browser.errors.clear()
+    browser.evaluate("smplxppPlayer.player.playing = false")
+    view, player = place_camera("view", 30.0, size=(192, 256), height=0.7, target=0.7), AvatarPlayer(path, threads=1)
+
+    def check(frame: int, got: np.ndarray) -> np.ndarray:
+        image, alpha = player.draw(view, background=BACKGROUND)
+        assert decibels(got / 255.0, np.clip(image, 0.0, 1.0), alpha > 0.5) > 38.0, frame
+        return got
+
+    motion = player.motion
+    assert motion is not None
+    for frame in (0, 5, 10, 15):
+        player.step(motion.frame(frame), 5.0 / SWAY_FPS)
+        more = {} if frame == 0 else {"seconds": 5.0 / SWAY_FPS}
+        asked_for = {**asked(view, 0), "time": frame / SWAY_FPS, **more}
+        simulated = check(frame, browser.picture(asked_for))
+    player.pose(motion.frame(15))
+    skinned = check(15, browser.picture({**asked_for, "seconds": None}))
+    assert np.abs(simulated.astype(int) - skinned).max() > 50
+    before = browser.evaluate("smplxppPlayer.player.update(), smplxppPlayer.player.pictures")
+    end = time.monotonic() + 300
+    while browser.evaluate("smplxppPlayer.player.pictures") < before + 3:
+        assert time.monotonic() < end, "the cloth does not go on"
+        time.sleep(0.1)
+    assert browser.evaluate("[...document.querySelectorAll('.switch')].at(-1).textContent") == "Clothes are simulated"
+    assert browser.errors == []
 
 
 def damaged(avatar: Path) -> dict[str, tuple[bytes, str]]:

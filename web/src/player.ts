@@ -3,6 +3,7 @@
 import type { Pose } from "./avatar/avatar.ts";
 import { RECORD } from "./avatar/deform.ts";
 import { duration, poseAt, restPose, turned } from "./avatar/motion.ts";
+import { LONGEST_FOLLOWED } from "./cloth/driver.ts";
 import { orbitCamera, type Camera, type Orbit } from "./render/camera.ts";
 import type { Renderer } from "./render/renderer.ts";
 import type { Reply, Request, Summary } from "./worker/protocol.ts";
@@ -14,6 +15,8 @@ export const BACKGROUND: readonly [number, number, number] = [0.071, 0.078, 0.09
 const COVERED = 64;
 /** Share of the picture's height that the person fills, and how wide she may reach, in her heights. */
 const FILLED = 0.78, ARMS = 0.72;
+/** Metres a second below which clothes count as still, and seconds after which they are left alone. */
+const STILL = 0.03, SETTLED = 6;
 /** How many pictures the shown rates are means over. */
 const MEMORY = 20;
 
@@ -21,6 +24,7 @@ const MEMORY = 20;
 export interface Rates {
   fps: number;
   deform: number;
+  cloth: number;
   sort: number;
   draw: number | null;
 }
@@ -31,6 +35,8 @@ export interface View {
   time: number;
   camera: Camera;
   background?: readonly [number, number, number];
+  /** Of loose clothes since the last picture; left out: they start anew, null: they are not simulated. */
+  seconds?: number | null;
 }
 
 type Frame = Extract<Reply, { kind: "frame" }>;
@@ -48,7 +54,9 @@ export class Player {
   readonly expressions = new Map<number, number>();
   /** How many have been drawn. */
   pictures = 0;
-  readonly rates: Rates = { fps: 0, deform: 0, sort: 0, draw: null };
+  readonly rates: Rates = { fps: 0, deform: 0, cloth: 0, sort: 0, draw: null };
+  /** Loose clothes are simulated. */
+  simulating = true;
   /** Called after each picture. */
   onpicture: () => void = () => {};
   onerror: (message: string) => void = () => {};
@@ -61,6 +69,9 @@ export class Player {
   private asked = 0;
   private ready: Frame | null = null;
   private changed = true;
+  /** Seconds since something that is shown has changed by itself or by hand, and of the clothes since the last request. */
+  private quiet = 0;
+  private elapsed = Infinity;
   private still = false;
   private before = 0;
   private lastDrawn = 0;
@@ -79,6 +90,7 @@ export class Player {
     if (reply.kind !== "opened") throw new Error(reply.kind === "failed" ? reply.message : "no avatar");
     this.summary = reply.summary;
     this.time = 0;
+    this.elapsed = Infinity;
     this.hidden.clear();
     this.turns.clear();
     this.expressions.clear();
@@ -100,6 +112,14 @@ export class Player {
   /** Something that is shown has changed. */
   update(): void {
     this.changed = true;
+    this.quiet = 0;
+  }
+
+  /** Goes to a time of the motion. */
+  seek(time: number): void {
+    this.time = time;
+    this.elapsed = Infinity;
+    this.update();
   }
 
   /** Draws one view, whatever else is going on, and returns its (H, W, 4) bytes from the top. */
@@ -108,12 +128,14 @@ export class Player {
     try {
       await this.queue;
       this.ready = null;
-      const reply = await this.ask(this.request(view), []);
+      const { seconds = Infinity } = view;
+      const reply = await this.ask(this.request(view, seconds), []);
       if (reply.kind !== "frame") throw new Error(reply.kind === "failed" ? reply.message : "no picture");
       this.show(reply, view.background);
       return await this.renderer.pixels();
     } finally {
       this.still = false;
+      this.elapsed = Infinity;
       this.update();
     }
   }
@@ -134,9 +156,13 @@ export class Player {
     this.tick = requestAnimationFrame(this.step);
     const passed = Math.min(0.25, (now - this.before) / 1000);
     this.before = now;
+    this.quiet += passed;
+    this.elapsed += passed * (this.playing ? this.speed : 1);
     if (this.playing && this.duration > 0) {
-      this.time = (this.time + passed * this.speed) % this.duration;
-      this.changed = true;
+      const next = this.time + passed * this.speed;
+      if (next < this.duration) this.time = next;
+      else this.seek(next % this.duration);
+      this.update();
     }
     if (this.still || this.renderer.lost) {
       this.changed = true;
@@ -147,10 +173,17 @@ export class Player {
     const frame = this.ready;
     this.ready = null;
     // The worker goes on while the page draws.
+    if (!this.asked && !this.changed && this.elapsed < Infinity) this.elapsed = 0;
     if (!this.asked && this.changed) {
       this.changed = false;
-      this.ask(this.request({ time: this.time, camera: this.camera() }), []).then((reply) => {
-        if (reply.kind === "frame") this.ready = reply;
+      const seconds = !this.simulating ? null : this.elapsed < Infinity ? Math.min(this.elapsed, LONGEST_FOLLOWED) : Infinity;
+      this.elapsed = this.simulating ? 0 : Infinity;
+      this.ask(this.request({ time: this.time, camera: this.camera() }, seconds), []).then((reply) => {
+        if (reply.kind === "frame") {
+          this.ready = reply;
+          // Clothes go on when nothing else does.
+          if (reply.speed > STILL && this.quiet < SETTLED) this.changed = true;
+        }
         else if (reply.kind === "failed") this.onerror(reply.message);
       });
     }
@@ -170,9 +203,9 @@ export class Player {
     return { ...camera, cy: camera.cy - 0.5 * COVERED * ratio };
   }
 
-  private request({ time, camera }: View): Request {
+  private request({ time, camera }: View, seconds: number | null): Request {
     return {
-      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted: !this.renderer.sorts,
+      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted: !this.renderer.sorts, seconds,
       records: this.spare.pop() ?? null,
     };
   }
@@ -198,6 +231,7 @@ export class Player {
     if (this.lastDrawn && now - this.lastDrawn < 2000) rates.fps = 1000 / mean(rates.fps && 1000 / rates.fps, now - this.lastDrawn);
     this.lastDrawn = now;
     rates.deform = mean(rates.deform, frame.deform);
+    rates.cloth = mean(rates.cloth, frame.cloth);
     rates.sort = mean(rates.sort, frame.sort);
     rates.draw = this.renderer.milliseconds;
     ++this.pictures;

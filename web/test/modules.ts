@@ -6,3 +6,6 @@ export { readBundle } from "../src/bundle/read.ts";
 export { sha256Here } from "../src/bundle/sha256.ts";
 export { orbitCamera } from "../src/render/camera.ts";
 export { Native } from "../src/native/memory.ts";
+export { ClothDriver } from "../src/cloth/driver.ts";
+export { pinned, shareOf } from "../src/cloth/garment.ts";
+export { buildModel } from "../src/cloth/model.ts";

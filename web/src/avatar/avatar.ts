@@ -1,5 +1,7 @@
 /** What the player knows of an avatar once its bundle is read: plain typed arrays, rows one after the other. */
 
+import type { Garment } from "../cloth/garment.ts";
+
 /** Joints, and how expressions move them at rest. */
 export interface Skeleton {
   names: string[];
@@ -152,6 +154,8 @@ export interface Avatar {
   blendShapes: BlendShapes | null;
   known: KnownPoses | null;
   gaussians: Gaussians;
+  /** Loose clothes to be simulated, the inner ones first. */
+  garments: Garment[];
   motion: Motion | null;
   /** Of the file. */
   bytes: number;

@@ -40,6 +40,17 @@ export function poseAt(motion: Motion, time: number): Pose {
   return { rotations, translation: mixed(motion.translation), expression: mixed(motion.expression) };
 }
 
+/** The pose on the way from one to another, joints on the sphere, the rest along lines; `share` in [0, 1]. */
+export function between(start: Pose, end: Pose, share: number): Pose {
+  const mixed = (a: Float64Array, b: Float64Array) => a.map((value, i) => (1 - share) * value + share * b[i]);
+  const rotations = new Float64Array(end.rotations.length);
+  for (let i = 0; i < rotations.length; i += 3) {
+    const [a, b] = [start, end].map((pose) => quaternionFromRotvec(pose.rotations, i));
+    rotations.set(rotvecFromQuaternion(slerp(a, b, share)), i);
+  }
+  return { rotations, translation: mixed(start.translation, end.translation), expression: mixed(start.expression, end.expression) };
+}
+
 /** A pose with joints turned further: axis-angle vectors, radians, in the joints' own frames. */
 export function turned(pose: Pose, turns: ReadonlyMap<number, readonly [number, number, number]>): Pose {
   const rotations = pose.rotations.slice();

@@ -126,7 +126,7 @@ function decoded(full: string, tensor: Tensor, tensors: Map<string, Tensor>, nam
   for (const word of ["step", "start"] as const) {
     const other = tensors.get(`${name}.${word}`)?.values;
     if (!other) continue;
-    if (!other.length || out.length % other.length) {
+    if (other.length ? out.length % other.length : out.length) {
       throw new BundleError(`${full}.${word}`, `numbers for the last axes`, `${other.length}`, EXPORT_AGAIN);
     }
     for (let i = 0, k = 0; i < out.length; ++i, k = k + 1 === other.length ? 0 : k + 1) {

@@ -3,10 +3,11 @@
 import type { Avatar, BlendShapes, BlendSide, Field, FieldNetwork, Gaussians, Layer } from "../avatar/avatar.ts";
 import { encodedPoints } from "../avatar/networks.ts";
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
+import { readGarments } from "./garments.ts";
 import { Tensors } from "./layout.ts";
 import { readMotion } from "./motion.ts";
 import { sha256 } from "./sha256.ts";
-import { unpackTensors, type Tensor } from "./tensors.ts";
+import { unpackTensors, type Piece } from "./tensors.ts";
 import { unzip } from "./zip.ts";
 
 const FORMAT = "smplxpp-avatar", VERSION = 1;
@@ -42,7 +43,7 @@ export async function readBundle(data: Uint8Array<ArrayBuffer>): Promise<Avatar>
     throw new BundleError("the avatar", `version ${VERSION} or older`, `version ${manifest.version}`,
       "open it with the player of the smplxpp that wrote it");
   }
-  const tensors = new Map<string, Map<string, Tensor>>();
+  const unpacked = new Map<string, Piece>();
   for (const [name, { file = "", bytes, sha256: digest }] of Object.entries(manifest.pieces ?? {})) {
     const content = pieces.get(file);
     if (!content) throw new BundleError("the avatar", `a piece ${file}`, "none", EXPORT_AGAIN);
@@ -50,10 +51,13 @@ export async function readBundle(data: Uint8Array<ArrayBuffer>): Promise<Avatar>
       throw new BundleError(`piece ${name}`, "the bytes that the manifest's digest is of",
         "others: the file is damaged or was changed", EXPORT_AGAIN);
     }
-    // Cloth is simulated by the desktop's runtime alone.
-    if (name !== "garments") tensors.set(name, unpackTensors(content, `piece ${name}`));
+    unpacked.set(name, unpackTensors(content, `piece ${name}`));
   }
-  return assembled(manifest, new Tensors(tensors), tensors.get("motion"), data.length);
+  const tensors = new Tensors(new Map([...unpacked].map(([name, piece]) => [name, piece.tensors])));
+  const avatar = assembled(manifest, tensors, data.length), [motion, garments] = [unpacked.get("motion"), unpacked.get("garments")];
+  if (motion) avatar.motion = readMotion(motion.tensors, avatar, tensors);
+  if (garments) avatar.garments = readGarments(garments.tensors, garments.about, avatar, tensors);
+  return avatar;
 }
 
 function parsed(text: Uint8Array | undefined): Manifest {
@@ -69,9 +73,7 @@ function parsed(text: Uint8Array | undefined): Manifest {
   return manifest;
 }
 
-function assembled(
-  manifest: Manifest, t: Tensors, motion: Map<string, Tensor> | undefined, bytes: number,
-): Avatar {
+function assembled(manifest: Manifest, t: Tensors, bytes: number): Avatar {
   const { J, E, V } = t.sizes, model = manifest.model ?? {};
   const parents = t.ints("skeleton.parents");
   const ordered = parents[0] === -1 && parents.every((parent, j) => j === 0 || (parent >= 0 && parent < j));
@@ -80,7 +82,7 @@ function assembled(
     list?.length === count ? list.map(String) : Array.from({ length: count }, (_, k) => `${word} ${k + 1}`);
   const parts = t.ints("surface.parts"), partCount = parts.reduce((most, part) => Math.max(most, part), 0) + 1;
   const faces = t.ints("surface.faces");
-  const avatar: Avatar = {
+  return {
     name: String(model.name ?? "avatar"),
     licence: String(model.licence ?? ""),
     provenance: model.provenance ?? {},
@@ -109,11 +111,10 @@ function assembled(
     blendShapes: t.has("blend.head.values") ? blendShapes(t, Boolean(model.jaw)) : null,
     known: t.has("poses.known") ? { poses: t.floats("poses.known"), scale: t.floats("poses.scale")[0] } : null,
     gaussians: gaussians(t, faces, parts),
+    garments: [],
     motion: null,
     bytes,
   };
-  if (motion) avatar.motion = readMotion(motion, avatar, t);
-  return avatar;
 }
 
 function layer(t: Tensors, name: string, part = 0, of = 1): Layer {

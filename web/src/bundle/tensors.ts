@@ -27,8 +27,16 @@ const KINDS: Record<string, { bytes: number; make: (buffer: ArrayBuffer) => Numb
   BOOL: { bytes: 1, make: (buffer) => new Uint8Array(buffer) },
 };
 
-/** Returns the tensors of a piece by name. */
-export function unpackTensors(data: Uint8Array<ArrayBuffer>, subject: string): Map<string, Tensor> {
+const METADATA = "__metadata__";
+
+/** The tensors of a piece by name, and what else it says. */
+export interface Piece {
+  tensors: Map<string, Tensor>;
+  about: unknown;
+}
+
+/** Takes a piece apart. */
+export function unpackTensors(data: Uint8Array<ArrayBuffer>, subject: string): Piece {
   const wrong = (received: string) => new BundleError(subject, "tensors behind a header", received, EXPORT_AGAIN);
   const length = data.length < 8 ? Infinity : Number(new DataView(data.buffer, data.byteOffset).getBigUint64(0, true));
   if (length > data.length - 8) throw wrong(`${data.length} bytes of something else`);
@@ -39,13 +47,19 @@ export function unpackTensors(data: Uint8Array<ArrayBuffer>, subject: string): M
     throw wrong("a damaged header");
   }
   const tensors = new Map<string, Tensor>();
+  let about: unknown;
   for (const [name, { dtype = "", shape = [], data_offsets: span = [] }] of Object.entries(header)) {
-    if (name === "__metadata__") continue;
+    if (name === METADATA) continue;
     const kind = KINDS[dtype], [first, last] = span;
     const size = shape.reduce((product, n) => product * n, 1) * (kind?.bytes ?? NaN);
     if (!(first >= 0 && last - first === size && last <= data.length - 8 - length)) throw wrong(`a damaged ${name}`);
     const start = data.byteOffset + 8 + length + first;
     tensors.set(name, { dtype, shape, values: kind.make(data.buffer.slice(start, start + size)) });
   }
-  return tensors;
+  try {
+    about = JSON.parse((header[METADATA] as { about?: string } | undefined)?.about ?? "null");
+  } catch {
+    throw wrong("a damaged description");
+  }
+  return { tensors, about };
 }

@@ -104,8 +104,7 @@ export class App {
       toggle();
     });
     this.scrub.addEventListener("input", () => {
-      player.time = Number(this.scrub.value) * player.duration;
-      player.update();
+      player.seek(Number(this.scrub.value) * player.duration);
     });
     this.speed.addEventListener("click", () => {
       player.speed = SPEEDS[(SPEEDS.indexOf(player.speed) + 1) % SPEEDS.length];
@@ -144,8 +143,9 @@ export class App {
     const now = performance.now();
     if (now - this.lastRates < RATES_EVERY) return;
     this.lastRates = now;
-    const { fps, deform, sort, draw } = player.rates;
+    const { fps, deform, cloth, sort, draw } = player.rates;
     const parts = [`pose ${deform.toFixed(1)}`];
+    if (player.summary!.garments.length && player.simulating) parts.push(`cloth ${cloth.toFixed(1)}`);
     if (!player.renderer.sorts) parts.push(`sort ${sort.toFixed(1)}`);
     if (draw !== null) parts.push(`draw ${draw.toFixed(1)}`);
     const size = `${(player.summary!.bytes / 1e6).toFixed(1)} MB`;

@@ -41,15 +41,25 @@ function readable(name: string): string {
 
 function parts(player: Player): HTMLElement {
   const rows = player.summary!.partNames.map((name, part) => {
-    const box = element("input", { type: "checkbox", checked: true });
-    box.addEventListener("change", () => {
-      if (box.checked) player.hidden.delete(part);
+    return toggle(readable(name), (shown) => {
+      if (shown) player.hidden.delete(part);
       else player.hidden.add(part);
       player.update();
     });
-    return element("label", { class: "switch" }, readable(name), box);
   });
+  if (player.summary!.garments.length) {
+    rows.push(toggle("Clothes are simulated", (simulated) => {
+      player.simulating = simulated;
+      player.update();
+    }, player.simulating));
+  }
   return page(...rows);
+}
+
+function toggle(name: string, set: (on: boolean) => void, on = true): HTMLElement {
+  const box = element("input", { type: "checkbox", checked: on });
+  box.addEventListener("change", () => set(box.checked));
+  return element("label", { class: "switch" }, name, box);
 }
 
 function face(player: Player): HTMLElement {

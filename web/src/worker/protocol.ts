@@ -13,6 +13,8 @@ export type Request =
       hidden: number[];
       /** In the order of depth; else as they come, for a renderer that sorts. */
       sorted: boolean;
+      /** Of loose clothes' time since the last frame; Infinity: they start anew, null: they are not simulated. */
+      seconds: number | null;
       /** Memory to fill, given back by the page. */
       records: ArrayBuffer | null;
     };
@@ -23,6 +25,8 @@ export interface Summary {
   licence: string;
   provenance: Record<string, string>;
   partNames: string[];
+  /** Parts that are simulated. */
+  garments: string[];
   expressionNames: string[];
   jointNames: string[];
   count: number;
@@ -37,5 +41,11 @@ export interface Summary {
 /** From the worker. */
 export type Reply =
   | { kind: "opened"; summary: Summary }
-  | { kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; depths: [number, number]; deform: number; sort: number }
+  | {
+      kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; depths: [number, number];
+      /** Milliseconds. */
+      deform: number; cloth: number; sort: number;
+      /** Of the fastest particle of the clothes, metres a second. */
+      speed: number;
+    }
   | { kind: "failed"; message: string };

@@ -3,6 +3,7 @@
 import type { Avatar } from "../avatar/avatar.ts";
 import { Deformer, RECORD } from "../avatar/deform.ts";
 import { poseAt, restPose } from "../avatar/motion.ts";
+import { ClothDriver } from "../cloth/driver.ts";
 import { BundleError } from "../bundle/errors.ts";
 import { readBundle } from "../bundle/read.ts";
 import { eye, NEAR } from "../render/camera.ts";
@@ -15,6 +16,7 @@ const thread = self as unknown as {
 };
 
 let deformer: Deformer | null = null;
+let clothes: ClothDriver | null = null;
 
 thread.onmessage = async (event) => {
   try {
@@ -29,6 +31,7 @@ thread.onmessage = async (event) => {
 async function open(data: ArrayBuffer): Promise<[Reply, Transferable[]]> {
   const avatar = await readBundle(new Uint8Array(data));
   deformer = new Deformer(avatar);
+  clothes = avatar.garments.length ? new ClothDriver(deformer, avatar.garments) : null;
   return [{ kind: "opened", summary: summary(avatar, deformer) }, []];
 }
 
@@ -44,6 +47,7 @@ function summary(avatar: Avatar, first: Deformer): Summary {
     licence: avatar.licence,
     provenance: avatar.provenance,
     partNames: avatar.partNames,
+    garments: avatar.garments.map(({ part }) => part),
     expressionNames: avatar.expressionNames,
     jointNames: avatar.skeleton.names,
     count: avatar.gaussians.count,
@@ -59,7 +63,10 @@ function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferab
   if (!deformer) throw new Error("no avatar is open");
   const { camera } = request;
   const started = performance.now();
-  deformer.pose(request.pose);
+  const simulated = request.seconds === null ? null : clothes;
+  const cloth = simulated && simulated.follow(request.pose, request.seconds!);
+  const moved = performance.now();
+  deformer.pose(request.pose, cloth);
   const posed = performance.now();
   // Where the page sorts, this only leaves out what is hidden or behind the camera.
   const { count, depths } = deformer.order(camera.view.slice(8, 12), NEAR, request.hidden, request.sorted);
@@ -68,6 +75,6 @@ function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferab
   const records = request.records?.byteLength === size ? request.records : new ArrayBuffer(size);
   new Float32Array(records).set(deformer.recordsFor(eye(camera), count));
   const packed = performance.now();
-  const deform = posed - started + (packed - sorted), sort = sorted - posed;
-  return [{ kind: "frame", records, count, camera, depths, deform, sort }, [records]];
+  const times = { cloth: moved - started, deform: posed - moved + (packed - sorted), sort: sorted - posed };
+  return [{ kind: "frame", records, count, camera, depths, speed: simulated ? simulated.speed : 0, ...times }, [records]];
 }

@@ -1,0 +1,203 @@
+/** Loose clothes along a motion, pose after pose (`smplxpp/cloth/driver.py`, which has the equations). */
+
+import type { Pose } from "../avatar/avatar.ts";
+import type { Deformer, Displaced } from "../avatar/deform.ts";
+import { between } from "../avatar/motion.ts";
+import { multiply, quaternionFromRotvec, rotvecFromQuaternion } from "../math/rotations.ts";
+import type { Garment } from "./garment.ts";
+import { GarmentThread } from "./thread.ts";
+
+/** Seconds: a longer step is a cut; the ramp of a cold start, its rest at the end, and its steps. */
+const LONGEST_STEP = 0.26, RAMP = 0.7, HOLD = 0.2, RAMP_STEP = 1 / 30;
+/** Metres a second of what holds the cloth; faster motion is a cut. */
+const TELEPORT = 12;
+/** Metres of the root from what places are measured from, beyond which that follows it. */
+const FAR = 4;
+/** Of a blend of rotations; below, its inverse blows up what the cloth did. */
+const LEAST_DETERMINANT = 0.2;
+/** Seconds between pictures beyond which a motion is not followed. */
+export const LONGEST_FOLLOWED = 1;
+
+/** How cold starts go, seconds. */
+export interface Start {
+  ramp: number;
+  hold: number;
+}
+
+/** What a garment needs of the surface: vertices of the avatar and what moves them. */
+interface Rows {
+  particles: Int32Array;
+  collider: Int32Array;
+  /** Of each vertex of the collider the vertex that an inner garment carries: [garment, index]. */
+  under: Map<number, [number, number]>;
+}
+
+export class ClothDriver {
+  private readonly threads: GarmentThread[];
+  private readonly rows: Rows[];
+  private readonly displaced: Displaced;
+  /** What places are measured from: near the person, so that float32 knows micrometres wherever that stands. */
+  private origin = [0, 0, 0];
+  private last: Pose | null = null;
+
+  constructor(private readonly deformer: Deformer, garments: readonly Garment[], private readonly start: Start = { ramp: RAMP, hold: HOLD }) {
+    const { native, avatar: { mesh, gaussians } } = deformer, V = mesh.vertices.length / 3;
+    this.threads = garments.map((garment) => new GarmentThread(native, garment));
+    this.rows = garments.map(({ particles, collider }, k) => {
+      const under = new Map<number, [number, number]>();
+      garments.slice(0, k).forEach(({ vertices }, inner) => {
+        const place = new Map(Array.from(vertices, (vertex, i) => [vertex, i]));
+        collider.vertices.forEach((vertex, i) => place.has(vertex) && under.set(i, [inner, place.get(vertex)!]));
+      });
+      return { particles, collider: collider.vertices, under };
+    });
+    const share = new Float32Array(V);
+    this.threads.forEach(({ garment, share: own }) => garment.vertices.forEach((vertex, i) => (share[vertex] = own[i])));
+    const keep = Float32Array.from(gaussians.face, (face) => {
+      const corners = mesh.faces.subarray(3 * face, 3 * face + 3);
+      return 1 - (share[corners[0]] + share[corners[1]] + share[corners[2]]) / 3;
+    });
+    this.displaced = { displacements: native.floats(3 * V), share: native.keep(share), keep: native.keep(keep) };
+  }
+
+  /** (n, 3) where the particles of each garment are in the world, metres. */
+  get particles(): Float32Array[] {
+    return this.threads.map(({ position }) => position.view.map((value, i) => value + this.origin[i % 3]));
+  }
+
+  /** The speed of the fastest particle, metres a second. */
+  get speed(): number {
+    return Math.max(...this.threads.map((thread) => thread.speed));
+  }
+
+  /** Forgets the state: the next step starts cold. */
+  restart(): void {
+    this.last = null;
+  }
+
+  /** Goes on to a pose `seconds` after the last as `step` does, by poses between them where pictures are far apart. */
+  follow(pose: Pose, seconds: number): Displaced {
+    if (this.last && seconds === 0) return this.shaped(pose);
+    const steps = Math.max(1, Math.ceil(seconds / LONGEST_STEP)), { last } = this;
+    if (!(seconds <= LONGEST_FOLLOWED)) this.restart();
+    else if (last) for (let k = 1; k < steps; ++k) this.move(between(last, pose, k / steps), seconds / steps);
+    return this.step(pose, seconds / steps);
+  }
+
+  /** Goes on to a pose; the first one, and one that cloth could not have followed to, start cold. */
+  step(pose: Pose, seconds: number): Displaced {
+    this.move(pose, seconds);
+    return this.shaped(pose);
+  }
+
+  private move(pose: Pose, seconds: number): void {
+    if (!this.last || !(seconds > 0 && seconds <= LONGEST_STEP) || !this.advance(pose, seconds, false)) this.begin(pose);
+    this.last = pose;
+  }
+
+  /** Comes to a first pose from the reference pose, where the cloth hangs as it was scanned. */
+  private begin(pose: Pose): void {
+    const start = facingAs(this.threads[0].garment.reference, pose);
+    const steps = Math.round(this.start.ramp / RAMP_STEP), still = Math.round(this.start.hold / RAMP_STEP);
+    this.origin = this.root(pose);
+    this.joints(steps ? start : pose);
+    this.threads.forEach((thread, k) => thread.reset(this.places(this.rows[k].particles), this.places(this.rows[k].collider)));
+    for (let k = 1; k < steps; ++k) {
+      const t = k / steps;
+      this.advance(between(start, pose, t * t * (3 - 2 * t)), RAMP_STEP, true);
+    }
+    for (let k = 0; k < still + Math.min(steps, 1); ++k) this.advance(pose, RAMP_STEP, true);
+  }
+
+  /** Moves all garments on to a pose; false, and nothing moved, where what holds them went too fast. */
+  private advance(pose: Pose, seconds: number, atAnySpeed: boolean): boolean {
+    const root = this.root(pose), away = root.map((value, k) => value - this.origin[k]);
+    if (away.some((value) => Math.abs(value) > FAR)) {
+      this.origin = root;
+      for (const thread of this.threads) thread.shift(away.map((value) => -value));
+    }
+    this.joints(pose);
+    const own = this.rows.map(({ particles }) => this.places(particles));
+    if (!atAnySpeed && own.some((places, k) => this.threads[k].wayTo(places) > TELEPORT * seconds)) return false;
+    this.threads.forEach((thread, k) => {
+      const { collider, under } = this.rows[k], surface = this.places(collider);
+      // Where an inner garment lies it counts as it is.
+      for (const inner of new Set([...under.values()].map(([one]) => one))) this.threads[inner].carry();
+      for (const [i, [inner, at]] of under) {
+        const { carried, share } = this.threads[inner], { view } = carried;
+        for (let c = 0; c < 3; ++c) surface[3 * i + c] += share[at] * (view[3 * at + c] - surface[3 * i + c]);
+      }
+      thread.advance(own[k], surface, seconds);
+    });
+    return true;
+  }
+
+  /** Where the first joint is in the world, metres. */
+  private root({ translation, expression }: Pose): number[] {
+    const { rest, byExpression } = this.deformer.avatar.skeleton, size = expression.length;
+    return [0, 1, 2].map((k) => expression.reduce((sum, value, e) => sum + byExpression[k * size + e] * value, rest[k] + translation[k]));
+  }
+
+  /** Brings the skeleton to a pose, measured from the origin. */
+  private joints(pose: Pose): void {
+    this.deformer.joints({ ...pose, translation: pose.translation.map((value, k) => value - this.origin[k]) });
+  }
+
+  /** Where skinning has some vertices, (R, 3) metres from the origin; the parts know no expression. */
+  private places(vertices: Int32Array): Float32Array {
+    const { mesh } = this.deformer.avatar, rest = this.deformer.rest.view, out = new Float32Array(3 * vertices.length);
+    vertices.forEach((v, row) => {
+      const m = this.blended(v), from = mesh.parts[v] ? mesh.vertices : rest;
+      const x = from[3 * v], y = from[3 * v + 1], z = from[3 * v + 2];
+      for (let r = 0; r < 3; ++r) out[3 * row + r] = m[4 * r] * x + m[4 * r + 1] * y + m[4 * r + 2] * z + m[4 * r + 3];
+    });
+    return out;
+  }
+
+  private readonly blend = new Float64Array(12);
+
+  /** The transform of a vertex: (3, 4), good until the next call. */
+  private blended(v: number): Float64Array {
+    const { joints, weights, influences } = this.deformer.avatar.mesh, transforms = this.deformer.transforms.view, m = this.blend;
+    m.fill(0);
+    for (let k = v * influences; k < (v + 1) * influences; ++k) {
+      const weight = weights[k], at = 12 * joints[k];
+      if (weight === 0) continue;
+      for (let i = 0; i < 12; ++i) m[i] += weight * transforms[at + i];
+    }
+    return m;
+  }
+
+  /** Takes the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`. */
+  private shaped(pose: Pose): Displaced {
+    this.joints(pose);
+    for (const thread of this.threads) thread.carry();
+    const { vertices: rest } = this.deformer.avatar.mesh, out = this.displaced.displacements.view;
+    for (const { garment, carried } of this.threads) {
+      const places = carried.view;
+      garment.vertices.forEach((v, i) => {
+        const m = this.blended(v);
+        const a = places[3 * i] - m[3], b = places[3 * i + 1] - m[7], c = places[3 * i + 2] - m[11];
+        const xx = m[5] * m[10] - m[6] * m[9], xy = m[2] * m[9] - m[1] * m[10], xz = m[1] * m[6] - m[2] * m[5];
+        const volume = m[0] * xx + m[4] * xy + m[8] * xz;
+        // Joints that turn against each other flatten a blend; such a vertex stays with skinning.
+        const sound = volume > LEAST_DETERMINANT, over = 1 / volume, at = 3 * v;
+        const yx = m[6] * m[8] - m[4] * m[10], yy = m[0] * m[10] - m[2] * m[8], yz = m[2] * m[4] - m[0] * m[6];
+        const zx = m[4] * m[9] - m[5] * m[8], zy = m[1] * m[8] - m[0] * m[9], zz = m[0] * m[5] - m[1] * m[4];
+        out[at] = sound ? (xx * a + xy * b + xz * c) * over - rest[at] : 0;
+        out[at + 1] = sound ? (yx * a + yy * b + yz * c) * over - rest[at + 1] : 0;
+        out[at + 2] = sound ? (zx * a + zy * b + zz * c) * over - rest[at + 2] : 0;
+      });
+    }
+    return this.displaced;
+  }
+}
+
+/** A pose where another one stands and looks: its place, turned about the vertical alone. */
+function facingAs(reference: Pose, pose: Pose): Pose {
+  const [own, its] = [reference, pose].map(({ rotations }) => quaternionFromRotvec(rotations, 0));
+  const heading = ([w, x, y, z]: number[]) => Math.atan2(2 * (x * z + w * y), 1 - 2 * (x * x + y * y));
+  const half = 0.5 * (heading(its) - heading(own)), rotations = reference.rotations.slice();
+  rotations.set(rotvecFromQuaternion(multiply([Math.cos(half), 0, Math.sin(half), 0], own)));
+  return { ...reference, rotations, translation: pose.translation };
+}

@@ -1,0 +1,159 @@
+/** One garment through time: its particles, and where skinning had it at the last moments (`smplxpp/cloth/thread.py`). */
+
+import type { Block, Native } from "../native/memory.ts";
+import { Embedding } from "./embedding.ts";
+import { pinned, shareOf, type Garment } from "./garment.ts";
+import { buildModel } from "./model.ts";
+
+/** Seconds of a substep at most, substeps between two searches for contacts, metres a second at most. */
+const SUBSTEP = 1 / 500, CONTACTS_EVERY = 8, MOST_SPEED = 8, GRAVITY = 9.81;
+/** Metres that what is carried keeps from the skin. */
+const FINE_MARGIN = 0.002;
+/** Length of an edge over that at rest from which the cloth is taken to have exploded. */
+const MOST_STRETCH = 4;
+
+/** Places of the last moment but one, the last, now, and the next as it would come without acceleration. */
+class Moments {
+  readonly blocks: Block<Float32Array>[];
+  private known = 0;
+
+  constructor(native: Native, count: number) {
+    this.blocks = Array.from({ length: 4 }, () => native.floats(3 * count));
+  }
+
+  /** The last places that were told. */
+  get now(): Float32Array {
+    return this.blocks[2].view;
+  }
+
+  restart(places: Float32Array): void {
+    this.now.set(places);
+    this.known = 1;
+  }
+
+  tell(places: Float32Array): void {
+    const [before, last, now, next] = this.blocks.map((block) => block.view);
+    if (this.known > 1) before.set(last);
+    last.set(now);
+    if (this.known < 2) for (let i = 0; i < now.length; ++i) before[i] = Math.fround(2 * last[i]) - places[i];
+    now.set(places);
+    for (let i = 0; i < now.length; ++i) next[i] = Math.fround(2 * now[i]) - last[i];
+    this.known = 2;
+  }
+
+  shift(by: readonly number[]): void {
+    for (const { view } of this.blocks) for (let i = 0; i < view.length; ++i) view[i] += by[i % 3];
+  }
+}
+
+export class GarmentThread {
+  /** (n, 3) metres from the driver's origin, and metres a second. */
+  readonly position: Block<Float32Array>;
+  readonly velocity: Block<Float32Array>;
+  /** (N, 3) where the carried vertices are, after `carry`. */
+  readonly carried: Block<Float32Array>;
+  /** (N,) */
+  readonly share: Float32Array;
+  private readonly pins: Int32Array;
+  private readonly mostSquared: Float64Array;
+  private readonly edges: Int32Array;
+  private readonly embedding: Embedding;
+  private readonly normals: Block<Float32Array>;
+  private readonly model: Block<Uint8Array>;
+  private readonly forces: Block<Float64Array>;
+  private readonly moments: Block<Uint8Array>;
+  private readonly places: Moments;
+  private readonly surfaces: Moments;
+  private readonly colliderFaces: Block<Int32Array>;
+  private readonly deepest: Block<Float32Array>;
+
+  constructor(private readonly native: Native, readonly garment: Garment) {
+    const { fabric, collider } = garment, n = garment.particles.length, c = collider.vertices.length;
+    const fixed = pinned(garment), model = buildModel(garment, fixed);
+    this.pins = Int32Array.from([...fixed.keys()].filter((i) => fixed[i]));
+    this.share = shareOf(garment);
+    this.edges = model.edges;
+    this.mostSquared = Float64Array.from(model.lengths, (length) => (MOST_STRETCH * length + 0.01) ** 2);
+    this.embedding = new Embedding(garment);
+    [this.position, this.velocity] = [native.floats(3 * n), native.floats(3 * n)];
+    [this.carried, this.normals] = [native.floats(garment.corners.length), native.floats(garment.corners.length)];
+    this.colliderFaces = native.keep(collider.faces);
+    this.deepest = native.keep(collider.deepest);
+    this.model = native.struct([n, garment.faces.length / 3, model.edges.length / 2, model.bend.length, c, collider.faces.length / 3], [
+      ...[model.inverseMass, garment.faces, model.edges, model.lengths, model.stretch, model.compress, model.hinges, model.curvature,
+        model.restCurvature, model.bend].map((array) => native.keep<Float32Array | Int32Array>(array)),
+      null, native.keep(model.anchor), native.keep(model.tether), this.colliderFaces, native.keep(collider.margin), this.deepest,
+    ]);
+    this.forces = native.keep(Float64Array.of(
+      GRAVITY, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, 0, MOST_SPEED));
+    [this.places, this.surfaces] = [new Moments(native, n), new Moments(native, c)];
+    this.moments = native.struct([], [...this.places.blocks, ...this.surfaces.blocks]);
+  }
+
+  /** Puts the particles where skinning has them, at rest. */
+  reset(places: Float32Array, surface: Float32Array): void {
+    this.rest(places);
+    this.places.restart(places);
+    this.surfaces.restart(surface);
+  }
+
+  /** The longest way, metres, of what holds the garment from the last moment to places (n, 3). */
+  wayTo(places: Float32Array): number {
+    const { now } = this.places;
+    let most = 0;
+    for (const i of this.pins) {
+      most = Math.max(most, Math.hypot(places[3 * i] - now[3 * i], places[3 * i + 1] - now[3 * i + 1], places[3 * i + 2] - now[3 * i + 2]));
+    }
+    return most;
+  }
+
+  /** Goes on to new places of the particles (n, 3) and of what they touch (c, 3); where that breaks down, to the body. */
+  advance(places: Float32Array, surface: Float32Array, seconds: number): void {
+    this.places.tell(places);
+    this.surfaces.tell(surface);
+    const substeps = Math.max(1, Math.ceil(seconds / SUBSTEP - 1e-6));
+    this.native.run("cloth_advance", this.model, this.forces, this.moments, seconds, substeps, CONTACTS_EVERY, this.position, this.velocity);
+    if (!this.sound()) this.rest(places);
+  }
+
+  /** Brings what the garment carries to where the particles are, `FINE_MARGIN` outside of what it touches. */
+  carry(): void {
+    const { embedding, garment: { collider, vertices } } = this;
+    embedding.carry(this.position.view);
+    this.carried.view.set(embedding.points);
+    if (!collider.vertices.length) return;
+    this.normals.view.set(embedding.normals);
+    this.native.run("cloth_push_out", BigInt(vertices.length), this.carried, this.normals, BigInt(collider.vertices.length),
+      this.surfaces.blocks[2], this.colliderFaces, BigInt(collider.faces.length / 3), FINE_MARGIN, this.deepest);
+  }
+
+  /** Moves all that is remembered, metres. */
+  shift(by: readonly number[]): void {
+    const { view } = this.position;
+    for (let i = 0; i < view.length; ++i) view[i] += by[i % 3];
+    this.places.shift(by);
+    this.surfaces.shift(by);
+  }
+
+  /** The speed of the fastest particle that is not held, metres a second, against places that do not move. */
+  get speed(): number {
+    const { view } = this.velocity;
+    let most = 0;
+    for (let i = 0; i < view.length; i += 3) most = Math.max(most, view[i] ** 2 + view[i + 1] ** 2 + view[i + 2] ** 2);
+    return Math.sqrt(most);
+  }
+
+  private rest(places: Float32Array): void {
+    this.position.view.set(places);
+    this.velocity.view.fill(0);
+  }
+
+  private sound(): boolean {
+    const x = this.position.view, { edges, mostSquared } = this;
+    if (!x.every(Number.isFinite) || !this.velocity.view.every(Number.isFinite)) return false;
+    return mostSquared.every((most, e) => {
+      const a = 3 * edges[2 * e], b = 3 * edges[2 * e + 1];
+      return (x[a] - x[b]) ** 2 + (x[a + 1] - x[b + 1]) ** 2 + (x[a + 2] - x[b + 2]) ** 2 <= most;
+    });
+  }
+}
