@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from avatar.export.bundle import BundleExtras, write_bundle
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
@@ -50,6 +51,7 @@ def write_dressed(path: Path, motion: BodyParams, *, layers: int = 1) -> Path:
     template, rng = person(layers=layers), np.random.default_rng(0)
     garments = [cut_garment(template, part, standing(), _COARSE) for part in (PART, OVER)[:layers]]
     garments = [replace(g, lengths=g.lengths * (1.0 + 1e-3 * rng.random(len(g.lengths)))) for g in garments]
+    torch.manual_seed(1)
     config = StudentConfig(FieldConfig(width=8, hidden_layers=2, code_size=4), None, control_points=40)
     it = Student(config, Rig(template), sample_on_mesh(template, SamplingConfig(count=500)), (0, 1))
     write_bundle(path, it, BundleExtras(name="dressed", garments=garments, motion=replace(motion, fps=SWAY_FPS)))

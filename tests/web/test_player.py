@@ -151,7 +151,8 @@ def test_loose_clothes_are_simulated(browser, tmp_path):
 
     def check(frame: int, got: np.ndarray) -> np.ndarray:
         image, alpha = player.draw(view, background=BACKGROUND)
-        assert decibels(got / 255.0, np.clip(image, 0.0, 1.0), alpha > 0.5) > 38.0, frame
+        # Rounding grows from step to step: 41 to 48 dB where the first picture has 62.
+        assert decibels(got / 255.0, np.clip(image, 0.0, 1.0), alpha > 0.5) > 35.0, frame
         return got
 
     motion = player.motion
@@ -164,11 +165,12 @@ def test_loose_clothes_are_simulated(browser, tmp_path):
     player.pose(motion.frame(15))
     skinned = check(15, browser.picture({**asked_for, "seconds": None}))
     assert np.abs(simulated.astype(int) - skinned).max() > 50
-    before = browser.evaluate("smplxppPlayer.player.update(), smplxppPlayer.player.pictures")
-    end = time.monotonic() + 300
-    while browser.evaluate("smplxppPlayer.player.pictures") < before + 3:
-        assert time.monotonic() < end, "the cloth does not go on"
-        time.sleep(0.1)
+    for change, pictures in (("update()", 1), ("turns.set(1, [-0.8, 0, 0]), smplxppPlayer.player.update()", 4)):
+        before = browser.evaluate(f"smplxppPlayer.player.pictures + 0 * [smplxppPlayer.player.{change}].length")
+        end = time.monotonic() + 300
+        while browser.evaluate("smplxppPlayer.player.pictures") < before + pictures:
+            assert time.monotonic() < end, "the cloth does not go on"
+            time.sleep(0.1)
     assert browser.evaluate("[...document.querySelectorAll('.switch')].at(-1).textContent") == "Clothes are simulated"
     assert browser.errors == []
 
