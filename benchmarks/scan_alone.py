@@ -3,8 +3,9 @@
     python -m benchmarks.scan_alone [--people 12] [--who NAME ...] [--seed 0] [--variants "as it is" "3 mm noise"]
 
 Scans are the fixture's, the captures' that are there, and procedural people (`benchmarks.people`); each is read as a
-file without parameters, labels, units and axis would be. The truth is looked at in measuring alone. Wrong facing: the
-pelvis' front more than 90 degrees off. Labels are those of `label_by_body`, on faces that the scanner saw.
+file without parameters, labels, units and axis would be, and gone through as `smplxpp build --scan` does. The truth is
+looked at in measuring alone. Wrong facing: the pelvis' front more than 90 degrees off. Labels are those of
+`label_by_body`, on faces that the scanner saw.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import tyro
 
 from benchmarks.machine import store_results
 from benchmarks.people import VARIANTS, PersonScan, captured, captured_names, people, person, variant
+from pipelines.stages.locate import sure_labels
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import convert_points, find_scan_frame
 from smplxpp.core.errors import InputError
@@ -78,8 +81,9 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
     begin = time.process_time()
     try:
         frame = find_scan_frame(scan.mesh.vertices, scan.mesh.faces)
-        vertices = convert_points(scan.mesh.vertices, units=frame.units, up=frame.up)
-        found = locate_body(body, scan.mesh.with_vertices(vertices), colors=scan.colors)
+        mesh = scan.mesh.with_vertices(convert_points(scan.mesh.vertices, units=frame.units, up=frame.up))
+        labeller = partial(sure_labels, mesh, body, scan.colors)
+        found = locate_body(body, mesh, colors=scan.colors, labeller=labeller)
     except InputError as error:
         return {"scan": scan.name, "refused": str(error)}
     seconds = time.process_time() - begin
@@ -97,7 +101,7 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
         "cpu_seconds": seconds,
     }
     if labels:
-        labelled = label_by_body(scan.mesh.with_vertices(vertices), body, found.params, colors=scan.colors)
+        labelled = label_by_body(mesh, body, found.params, colors=scan.colors)
         row["labels_right"] = float((labelled.face_labels == scan.face_labels)[scan.seen].mean())
     return row
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext, BuildInputs
 from smplxpp.body import load_body
 from smplxpp.capture import read_cameras
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import SKIN, display_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
@@ -30,7 +32,7 @@ from smplxpp.segment import (
     read_label_map,
     read_labels,
     segment_scan,
-    vote_on_faces,
+    vote_in_agreement,
 )
 
 DOUBTFUL = 0.5
@@ -124,7 +126,7 @@ def _by_body(scan: TriangleMesh, colors: np.ndarray | None, build: BuildContext)
 
 
 def _by_views(scan: TriangleMesh, colors: np.ndarray | None, build: BuildContext) -> SegmentedScan:
-    """Votes of label maps; what the body and the colours say where votes are few.
+    """Votes of label maps that agree; what the body and the colours say where votes are few.
 
     Raises:
         InputError: maps of cameras that the camera file does not have.
@@ -143,8 +145,15 @@ def _by_views(scan: TriangleMesh, colors: np.ndarray | None, build: BuildContext
     views = [
         (cameras[name], read_label_map(path, label_set=inputs.label_set)) for name, path in inputs.label_maps.items()
     ]
-    votes = vote_on_faces(scan, views)
-    return segment_scan(scan, votes=votes, colors=colors, prior=_by_body(scan, colors, build))
+    agreed = vote_in_agreement(scan, views)
+    said = tuple(
+        f"label map of {name} left out: the other views agree with {share:.0%} of it"
+        for name, share in agreed.left_out.items()
+    )
+    for words in said:
+        warnings.warn(words, GeometryWarning, stacklevel=2)
+    result = segment_scan(scan, votes=agreed.votes, colors=colors, prior=_by_body(scan, colors, build))
+    return replace(result, doubts=(*said, *result.doubts))
 
 
 def _by_file(scan: TriangleMesh, source_vertex: np.ndarray, build: BuildContext) -> SegmentedScan:

@@ -36,43 +36,63 @@ def vote_on_faces(
     Raises:
         InputError: sizes that do not agree, unknown ids, or no vote at all.
     """
-    votes = np.zeros(mesh.face_count * len(LABELS))
+    votes = np.zeros((mesh.face_count, len(LABELS)))
     for camera, labels in views:
-        labels = np.asarray(labels)
-        if labels.shape != (camera.height, camera.width):
-            raise InputError(
-                f"label map of camera {camera.name!r}",
-                expected=f"shape ({camera.height}, {camera.width})",
-                received=f"{labels.shape}",
-                remedy="scale the camera's intrinsics to the map's size",
-            )
-        if labels.min() < BACKGROUND or labels.max() >= len(LABELS):
-            raise InputError(
-                f"label map of camera {camera.name!r}",
-                expected=f"ids -1 to {len(LABELS) - 1}",
-                received=f"{labels.min()} to {labels.max()}",
-                remedy="map them with map_labels first",
-            )
-        maps = rasterize_mesh(mesh, camera)
-        foreground = labels != BACKGROUND
-        row, col = np.nonzero(maps.mask & foreground)
-        hit, share = maps.face_id[row, col], np.ones(len(row))
-        small, small_row, small_col, small_share = _smaller_than_a_pixel(mesh, camera, maps, foreground)
-        hit, share = np.concatenate([hit, small]), np.concatenate([share, small_share])
-        row, col = np.concatenate([row, small_row]), np.concatenate([col, small_col])
-        # A border of background: the edge of the image cuts the person off like a silhouette.
-        inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
-        cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
-        weight = share * np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
-        votes += np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=len(votes))
-    if not votes.any():
+        votes += votes_of_view(mesh, camera, labels)
+    require_votes(bool(votes.any()))
+    return votes
+
+
+def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray, "_ _"]) -> Float64[np.ndarray, "M L"]:
+    """What one view says; see `vote_on_faces`.
+
+    Raises:
+        InputError: sizes that do not agree, or unknown ids.
+    """
+    labels = np.asarray(labels)
+    if labels.shape != (camera.height, camera.width):
+        raise InputError(
+            f"label map of camera {camera.name!r}",
+            expected=f"shape ({camera.height}, {camera.width})",
+            received=f"{labels.shape}",
+            remedy="scale the camera's intrinsics to the map's size",
+        )
+    if labels.min() < BACKGROUND or labels.max() >= len(LABELS):
+        raise InputError(
+            f"label map of camera {camera.name!r}",
+            expected=f"ids -1 to {len(LABELS) - 1}",
+            received=f"{labels.min()} to {labels.max()}",
+            remedy="map them with map_labels first",
+        )
+    maps = rasterize_mesh(mesh, camera)
+    foreground = labels != BACKGROUND
+    row, col = np.nonzero(maps.mask & foreground)
+    hit, share = maps.face_id[row, col], np.ones(len(row))
+    small, small_row, small_col, small_share = _smaller_than_a_pixel(mesh, camera, maps, foreground)
+    hit, share = np.concatenate([hit, small]), np.concatenate([share, small_share])
+    row, col = np.concatenate([row, small_row]), np.concatenate([col, small_col])
+    # A border of background: the edge of the image cuts the person off like a silhouette.
+    inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
+    cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
+    weight = share * np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
+    votes = np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=mesh.face_count * len(LABELS))
+    # Of no pixels at all it counts integers.
+    return votes.astype(np.float64).reshape(mesh.face_count, len(LABELS))
+
+
+def require_votes(some: bool) -> None:
+    """Refuse views that have no vote on any face.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not some:
         raise InputError(
             "label maps",
             expected="views that see the scan",
             received="no labelled pixel on any face",
             remedy="check the cameras' convention (OpenCV, world to camera), units and the winding of the faces",
         )
-    return votes.reshape(mesh.face_count, len(LABELS))
 
 
 def _smaller_than_a_pixel(

@@ -17,6 +17,8 @@ class LocateConfig:
         candidates: of these, followed to the end.
         coarse_points, fine_points: of the surface, drawn by area, for the search and for the fit.
         dress_steps, finish_steps: Gauss-Newton steps of every candidate, and of the one that is chosen.
+        pose_prior: weight of the pose prior while the one that is chosen is fitted; clothes hide more of the joints
+            than the surface's points, each a witness, let on.
         seed: of the drawn points.
     """
 
@@ -28,6 +30,7 @@ class LocateConfig:
     fine_points: int = 6000
     dress_steps: int = 8
     finish_steps: int = 12
+    pose_prior: float = 3.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -35,4 +38,5 @@ class LocateConfig:
             require_at_least(f"search for a body: {name}", getattr(self, name), 1)
         for name in ("coarse_points", "fine_points"):
             require_at_least(f"search for a body: {name}", getattr(self, name), 100)
-        require_at_least("search for a body: seed", self.seed, 0)
+        for name in ("pose_prior", "seed"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 0)

@@ -130,7 +130,7 @@ class Search:
         state, steps = try_hands(self.kinematics, self.many, self.fine, found.state), self.config.finish_steps
         for k, reach in enumerate(np.geomspace(0.03, 0.015, steps)):
             term.reach = float(reach)
-            state = self._step(state, term, fingers=True)
+            state = self._step(state, term, self.config.pose_prior, fingers=True)
             self.progress("fit", (k + 1) / steps)
         return self._measured(found.name, state)
 
@@ -138,9 +138,9 @@ class Search:
         body = self.kinematics.body
         return Columns(np.array(joints), body.joint_count, 0, body.num_expressions, body.num_betas)
 
-    def _step(self, state: BodyState, term: Term, *, fingers: bool = False) -> BodyState:
+    def _step(self, state: BodyState, term: Term, pose_prior: float = 1.0, *, fingers: bool = False) -> BodyState:
         columns = self.columns_with_fingers if fingers else self.columns
-        priors = Priors(columns, np.zeros(1, dtype=np.int64), self.anatomy, RegisterConfig())
+        priors = Priors(columns, np.zeros(1, dtype=np.int64), self.anatomy, RegisterConfig(pose_prior=pose_prior))
         terms = [term] if self.pinned is None else [term, self.pinned]
         return descend(self.kinematics, columns, state, terms, priors)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,11 @@ def test_the_same_seed_finds_the_same_body(body, scan, located):
     again = locate_body(body, scan, config=QUICK)
     assert np.array_equal(again.params.full_pose, located.params.full_pose)
     assert np.array_equal(again.params.betas, located.params.betas)
+
+
+def test_a_heavier_prior_of_poses_turns_joints_less(body, scan, located):
+    stiff = locate_body(body, scan, config=replace(QUICK, pose_prior=300.0))
+    assert np.abs(stiff.params.body_pose).sum() < 0.8 * np.abs(located.params.body_pose).sum()
 
 
 def test_landmarks_overrule_the_surface(body, scan, truth):
