@@ -15,7 +15,7 @@ _MIN_EDGE = 1e-6
 
 
 def skeleton(g: Graph, bundle: AvatarBundle, pose: str, transl: str, expression: str) -> tuple[str, str]:
-    """Return transforms of the joints (J, 12), and the T-pose's vertices with expression and pose correctives (V, 3)."""
+    """Return transforms of the joints (J, 12), and T-pose vertices with expression and pose correctives (V, 3)."""
     t, J = bundle.tensors, bundle.sizes["J"]
     parents = t["skeleton.parents"]
     face = g.reshape(expression, bundle.sizes["E"], 1)

@@ -26,6 +26,7 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.core.labels import SKIN
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.distance import MM
+from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template
 
 
@@ -85,12 +86,15 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def _colored_body(template: Template, run: Path, body: BodyModel) -> Template:
-    """The template with the scan's colours on the skin that the scan shows."""
+    """The template with the scan's colours on the skin that the scan shows, and a mouth that is dark inside."""
     scan, colors, source_vertex = load_scan(run)
     skin = load_scan_labels(run, scan.face_count) == SKIN.id
     posed, _ = load_posed_body(run, body)
     body_colors, body_index = body_colors_from_scan(posed, scan, colors, skin)
     count = body.vertex_count
+    # The scan's nearest skin is that of the lips.
+    mouth = inside_of_mouth(template)[:count]
+    body_colors[mouth], body_index[mouth] = MOUTH_COLOR, -1
     scan_index = np.where(body_index >= 0, source_vertex[body_index], -1)
     return replace(
         template,

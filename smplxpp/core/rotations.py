@@ -61,6 +61,13 @@ def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarra
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
 
 
+def rotation_between(source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation R, applied as `source @ R`, that takes centred points closest to others (Kabsch 1976)."""
+    left, _, right = np.linalg.svd(np.asarray(source, np.float64).T @ target)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return left @ turn @ right
+
+
 def _sinc(xp: ModuleType, squared: Array) -> Array:
     """sin(t) / t as a function of t^2; both branches stay finite, so that gradients are clean at zero."""
     small = squared < _SMALL_SQUARED_ANGLE

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.rotations import rotation_between
 
 _STEPS = 15
 # Farther points are capped: a coat's hem must not outvote the hands.
@@ -64,12 +65,3 @@ def aligned(points: Float64[np.ndarray, "P 3"], body: TriangleMesh, tree: igl.AA
         here, there = points[used].mean(axis=0), closest[used].mean(axis=0)
         points = (points - here) @ rotation_between(points[used] - here, closest[used] - there) + there
     return points
-
-
-def rotation_between(
-    source: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray, "P 3"]
-) -> Float64[np.ndarray, "3 3"]:
-    """The rotation R, applied as `source @ R`, that takes centred points closest to others (Kabsch 1976)."""
-    left, _, right = np.linalg.svd(source.T @ target)
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return left @ turn @ right

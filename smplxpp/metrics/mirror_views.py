@@ -12,8 +12,9 @@ from scipy.ndimage import binary_erosion, uniform_filter
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.rotations import rotation_between
 from smplxpp.core.spread import spread
-from smplxpp.metrics.mirror import aligned, reflected, rotation_between, search_tree
+from smplxpp.metrics.mirror import aligned, reflected, search_tree
 from smplxpp.raster import rasterize_mesh
 
 # Pixels of a view that colours are averaged over, and that a silhouette is drawn in by: sampling, mixed edges.

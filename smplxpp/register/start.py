@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core.rotations import matrix_from_rotvec, rotation_between
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import LandmarkModel
 
@@ -81,9 +81,7 @@ def _span(points: Float64[np.ndarray, "n 3"]) -> bool:
 
 
 def _rigid(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation and move that take points onto others in the least-squares sense (Kabsch 1976)."""
+    """The rotation and move that take points onto others in the least-squares sense."""
     a, b = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ sign @ u.T
+    rotation = rotation_between(source - a, target - b).T
     return rotation, b - rotation @ a

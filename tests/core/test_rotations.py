@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from smplxpp.core.rotations import array_namespace, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.rotations import array_namespace, matrix_from_rotvec, rotation_between, rotvec_from_matrix
 
 axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3)
 # Angles in and around the delicate places: 0, the switch of the series, pi.
@@ -46,3 +46,12 @@ def test_torch_gives_the_same_numbers_and_gradients_at_zero():
     tensor = torch.tensor(rotvec, requires_grad=True)
     np.testing.assert_allclose(matrix_from_rotvec(tensor).detach().numpy(), matrix_from_rotvec(rotvec), atol=1e-15)
     assert torch.autograd.gradcheck(matrix_from_rotvec, (tensor,))
+
+
+@given(axes, angles)
+def test_points_are_turned_onto_others_and_never_mirrored(axis, angle):
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    turned = points @ Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle).as_matrix()
+    np.testing.assert_allclose(points @ rotation_between(points, turned), turned, atol=1e-12)
+    mirrored = rotation_between(points, turned * np.array([-1.0, 1.0, 1.0]))
+    assert np.linalg.det(mirrored) > 0.999

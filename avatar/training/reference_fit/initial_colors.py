@@ -18,9 +18,12 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.rig.rig import Rig
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
+from smplxpp.template.mouth import inside_of_mouth
 
 DEPTH_TOLERANCE = 0.015
 """Metres that a point may lie behind the surface and still count as seen."""
+MOUTH_TOLERANCE = 0.002
+"""The same for the inside of the mouth: teeth lie a centimetre behind lips, and are none."""
 MIN_COSINE = 0.2
 """Surfaces seen at a flatter angle than this give no colour: their pixels belong to the silhouette."""
 MIN_OPACITY = 0.99
@@ -38,8 +41,14 @@ def initial_gaussians(
         start.dc,
         mesh=rig.template.mesh.with_vertices(vertices),
         views=views,
+        tolerance=np.where(_in_mouth(rig, start), MOUTH_TOLERANCE, DEPTH_TOLERANCE),
     )
     return replace(start, dc=dc)
+
+
+def _in_mouth(rig: Rig, gaussians: BoundGaussians) -> Bool[np.ndarray, " N"]:
+    faces = rig.template.faces[gaussians.face_index.cpu().numpy()]
+    return np.asarray(inside_of_mouth(rig.template)[faces].all(axis=1))
 
 
 def colors_from_views(
@@ -49,6 +58,7 @@ def colors_from_views(
     *,
     mesh: TriangleMesh,
     views: Sequence[View],
+    tolerance: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
     """Return the mean colour of points over the views that see them, weighted by the pixels a square metre has there.
 
@@ -59,6 +69,7 @@ def colors_from_views(
         points, normals: in the world, metres; unit normals.
         fallback: colours of the points that no view sees.
         mesh: what hides points from cameras.
+        tolerance: metres that each may lie behind the surface and still count as seen; None: `DEPTH_TOLERANCE`.
 
     Returns:
         Colours, and which points some view saw.
@@ -80,7 +91,7 @@ def colors_from_views(
         seen = (
             inside & (cosine > MIN_COSINE) & np.isfinite(farthest[row, column]) & (opacity[row, column] > MIN_OPACITY)
         )
-        seen &= depth <= nearest[row, column] + DEPTH_TOLERANCE
+        seen &= depth <= nearest[row, column] + (DEPTH_TOLERANCE if tolerance is None else tolerance)
         index = np.flatnonzero(seen)
         image = view.foreground.cpu().numpy() / 255.0
         at = np.stack([y[index] - 0.5, x[index] - 0.5])

@@ -1,0 +1,51 @@
+"""The inside of a mouth that training never sees open keeps the colours that it starts with."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
+
+from avatar.data.sequence import FrameSequence
+from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
+from avatar.models.networks.blend_shapes import BlendShapes
+from smplxpp.core.spread import spread_inside
+from smplxpp.template.mouth import inside_of_mouth, shown_mouth
+
+LOOKED_AT = 12
+"""Frames of the training, at most, whose mouths are looked into."""
+
+
+def unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians) -> Bool[Tensor, " N"]:
+    """Mark the Gaussians inside the mouth whose triangle nobody ahead of the head sees in any frame looked at."""
+    rig = sequence.rig
+    inside = inside_of_mouth(rig.template)
+    shown = inside & False
+    if inside.any():
+        for frame in spread_inside(sequence.train_frames, LOOKED_AT):
+            shown |= shown_mouth(rig.template, inside, rig.places(sequence.motion(frame).without_cloth()))
+    faces = rig.template.faces
+    hidden = torch.tensor(inside[faces].all(axis=1) & ~shown[faces].any(axis=1), device=gaussians.face_index.device)
+    return hidden[gaussians.face_index]
+
+
+def hold_unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians, shapes: BlendShapes | None) -> None:
+    """Let no gradient reach what `unseen_mouth` marks: attributes and blend shapes of these Gaussians.
+
+    Behind closed lips gradients are a thousandth of what they are in front, and Adam takes full steps along them:
+    teeth would drift to the colours of lips and into places where an open mouth shows them.
+    """
+    learns = ~unseen_mouth(sequence, gaussians)
+    if bool(learns.all()):
+        return
+    for name in LEARNED:
+        _hold(getattr(gaussians, name), learns)
+    if shapes is not None:
+        for basis in (shapes.U, shapes.C):
+            _hold(basis, learns[shapes.active])
+
+
+def _hold(parameter: nn.Parameter, learns: Bool[Tensor, " N"]) -> None:
+    if parameter.requires_grad and parameter.numel():
+        factor = learns.to(parameter.dtype).view(-1, *[1] * (parameter.ndim - 1))
+        parameter.register_hook(lambda gradient: gradient * factor)

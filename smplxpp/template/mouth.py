@@ -1,0 +1,85 @@
+"""The inside of the mouth: what no photograph of closed lips shows, and an open mouth does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import rotation_between
+from smplxpp.raster import rasterize_mesh
+from smplxpp.template.template import Template
+
+MOUTH_COLOR = (72, 32, 30)
+"""sRGB of the inside of a mouth that nobody has seen: what lies in its shade."""
+
+_OPEN = (0.15, 0.3, 0.45)  # radians of the jaw
+_INSIDE = ("teeth", "tongue", "gum", "mouth")  # in names of a body's parts
+# Towards the viewer, in the frame of a head that looks along z.
+_VIEWS = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.4, 1.0], [0.0, -0.4, 1.0]])
+_HALF_EXTENT, _PIXELS = 0.16, 400  # of a view, metres; a pixel is 0.8 mm
+_MOUTH_RADIUS = 0.04  # metres about its middle
+_OF_HEAD = 0.95  # weight of the head from which a vertex moves with it alone
+
+
+def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
+    """Mark the vertices inside the mouth: teeth and tongue by name, and what views from ahead see of the head if its
+    jaw hangs down and do not see if it does not.
+
+    A body without joints "head" and "jaw", and one whose jaw uncovers nothing, has none that is not named.
+    """
+    body, inside = template.body, np.zeros(template.vertex_count, dtype=bool)
+    named = [k for k, name in enumerate(body.part_label_names) if any(word in name for word in _INSIDE)]
+    inside[: body.vertex_count] = np.isin(body.part_labels, named)
+    if not {"head", "jaw"} <= set(body.joint_names):
+        return inside
+    naked = template.naked()
+    rest = BodyParams.rest(betas=body.num_betas, expressions=body.num_expressions)
+    closed, *opened = (
+        _seen_from_ahead(naked, naked.pose(replace(rest, jaw_pose=np.array([[angle, 0.0, 0.0]])))[0])
+        for angle in (0.0, *_OPEN)
+    )
+    uncovered = np.any(opened, axis=0) & ~closed & (_weight(naked, "head", "jaw") > 0.5)
+    if uncovered.any():  # a jaw uncovers folds below the ears too
+        middle = np.median(naked.vertices[uncovered], axis=0)
+        uncovered &= np.linalg.norm(naked.vertices - middle, axis=1) < _MOUTH_RADIUS
+    inside[: body.vertex_count] |= uncovered
+    return inside
+
+
+def shown_mouth(
+    template: Template, inside: Bool[np.ndarray, " V"], posed: Float[np.ndarray, "V 3"]
+) -> Bool[np.ndarray, " V"]:
+    """Mark what somebody ahead of a posed head could see of the inside of the mouth.
+
+    Args:
+        template: the person. inside: its `inside_of_mouth`. posed: its vertices, metres.
+    """
+    seen, count = np.zeros_like(inside), template.body.vertex_count
+    if inside.any() and "head" in template.body.joint_names:
+        seen[:count] = _seen_from_ahead(template.naked(), posed[:count])
+    return seen & inside
+
+
+def _seen_from_ahead(naked: Template, posed: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
+    """Mark the vertices of the faces that views from ahead of the head see."""
+    seen = np.zeros(naked.vertex_count, dtype=bool)
+    head = _weight(naked, "head") > _OF_HEAD
+    if not head.any():
+        return seen
+    mesh = TriangleMesh(np.asarray(posed, dtype=np.float64), naked.faces)
+    rest, center = naked.vertices[head].mean(axis=0), mesh.vertices[head].mean(axis=0)
+    turn = rotation_between(naked.vertices[head] - rest, mesh.vertices[head] - center)
+    for direction in _VIEWS @ turn:
+        camera = Camera.orthographic_view(center=center, direction=direction, half_extent=_HALF_EXTENT, size=_PIXELS)
+        ids = rasterize_mesh(mesh, camera).face_id
+        seen[naked.faces[np.unique(ids[ids >= 0])]] = True
+    return seen
+
+
+def _weight(naked: Template, *joints: str) -> Float64[np.ndarray, " V"]:
+    return naked.weights.dense()[:, [naked.body.joint_names.index(joint) for joint in joints]].sum(axis=1)
