@@ -180,7 +180,7 @@ def test_stages_do_not_import_each_other(stage):
         ("raster", {"core", "native"}),
         ("skinning", {"core"}),
         ("body", {"core", "skinning"}),
-        ("template", {"core", "skinning", "body"}),
+        ("template", {"core", "native", "raster", "skinning", "body"}),
         ("cloth", {"core", "native", "skinning", "body", "template"}),
     ],
 )
