@@ -26,7 +26,9 @@ class Export:
     """Write a file there; its suffix says which: .avatar (the student for our players), .ply .spz .sog (its splats in a
     pose), .glb and .usdc (see --model), .obj (the template), .onnx (pose to splats), .bvh and .npz (a motion). A
     name without a suffix: a folder, a file a frame, with --format."""
-    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj", "onnx", "bvh", "amass"] = "auto"
+    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj", "onnx", "bvh", "amass", "webavatar"] = (
+        "auto"
+    )
     """Format where the suffix does not tell: of a folder, or of an .npz."""
     model: Literal["student", "template"] = "student"
     """What a GLB or USD has: the student's splats in a pose, or the template with skeleton, expressions and motion."""

@@ -26,7 +26,7 @@ _ROOM = {
     ("template", "usd"): _TEMPLATE,
     ("template", "obj"): _TEMPLATE,
 }
-_ALONE = {"onnx": _STEP, "bvh": _MOTION, "amass": _MOTION}
+_ALONE = {"onnx": _STEP, "webavatar": _STEP, "bvh": _MOTION, "amass": _MOTION}
 Write = Callable[[Path], None]
 
 

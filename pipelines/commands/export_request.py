@@ -27,6 +27,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "onnx": (".onnx",),
     "bvh": (".bvh",),
     "amass": (".npz",),
+    "webavatar": (".npz",),
 }
 IN_SERIES = ("ply", "spz", "sog", "glb", "obj")
 """Formats that hold one pose, of which a folder can hold many; a USD holds a motion by itself."""

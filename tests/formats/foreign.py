@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from avatar.formats import Splats
 from avatar.runtime.splatting import WorldSplats
 
 C0 = 0.28209479177387814
+# Joints of WebAvatar's Unity package.
+_PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15]
+_PARENTS += [20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38]
+_PARENTS += [21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53]
 
 
 def gsply_splats(path: Path) -> Splats:
@@ -86,6 +91,54 @@ def usd_splats(path: Path, code: float | None = None) -> Splats:
         opacity_logits=_logits(values("opacities").astype(np.float64)),
         log_scales=np.log(values("scales")),
         quats=np.array([[q.real, *q.imaginary] for q in quats]),
+    )
+
+
+def webavatar_played(
+    arrays: dict[str, np.ndarray], pose: np.ndarray, transl: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Play an npz as the Unity package's shaders do: places and rotations (wxyz) in a pose (55, 3)."""
+    joints = arrays["t_joints"].astype(float)
+
+    def transforms(turns: np.ndarray) -> np.ndarray:
+        out = np.tile(np.eye(4), (55, 1, 1))
+        for j, parent in enumerate(_PARENTS):
+            local = np.eye(4)
+            local[:3, :3] = Rotation.from_rotvec(turns[j]).as_matrix()
+            local[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0)
+            out[j] = local if parent < 0 else out[parent] @ local
+        return out
+
+    big = np.zeros((55, 3))
+    big[1, 2], big[2, 2] = np.radians(25), -np.radians(25)
+    G = transforms(pose) @ np.linalg.inv(transforms(big))
+    weights = arrays["weights_val"] / 255.0
+    own = G[arrays["weights_idx"]]
+    blended = np.einsum("nk,nkij->nij", weights, own)
+    places = np.einsum("nij,nj->ni", blended[:, :3, :3], arrays["_xyz"].astype(float)) + blended[:, :3, 3] + transl
+    turns = Rotation.from_matrix(own[:, :, :3, :3].reshape(-1, 3, 3)).as_quat().reshape(-1, 4, 4)
+    total = weights[:, :1] * turns[:, 0]
+    for k in range(1, 4):
+        sign = np.where(np.sum(total * turns[:, k], axis=1, keepdims=True) < 0, -1.0, 1.0)
+        total = total + weights[:, k : k + 1] * sign * turns[:, k]
+    mine = np.roll(arrays["_rotation"].astype(float), -1, axis=1)
+    quats = (Rotation.from_quat(total) * Rotation.from_quat(mine)).as_quat()
+    return places, np.roll(quats, 1, axis=1)
+
+
+def webavatar_splats(path: Path, pose: np.ndarray, transl: np.ndarray) -> Splats:
+    """Read an npz by numpy and play a pose of it."""
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    means, quats = webavatar_played(arrays, pose, transl)
+    return Splats(
+        means=means,
+        normals=np.zeros_like(means),
+        f_dc=arrays["_sh0"][:, 0] / C0,
+        f_rest=np.zeros((len(means), 0, 3)),
+        opacity_logits=_logits(arrays["opacity"] / 255.0),
+        log_scales=arrays["_scaling"],
+        quats=quats,
     )
 
 
