@@ -17,7 +17,7 @@ from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
     from avatar.formats import Splats
-    from avatar.runtime import AvatarPlayer
+    from avatar.runtime import AvatarBundle, AvatarPlayer
 
 # What turns +y to the axis that is to point up.
 _TURNS = {"-y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
@@ -40,7 +40,7 @@ def writers(
     moves = request.is_series or (request.format == "usd" and request.params is not None)
     rows = request.chosen(len(motion), moves=moves)
     fps = request.rate(motion) if moves and len(rows) > 1 else None
-    said: list[str] = []
+    said = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
     splats = _posed(player, motion, rows, simulate=request.simulate and request.params is not None, said=said)
     shown = track(
         splats,
@@ -55,6 +55,20 @@ def writers(
         return fps, iter([(len(rows), partial(write_splat_usd, frames=shown, fps=fps))]), said
     write = _writer(request)
     return fps, ((1, partial(write, splats=one)) for one in shown), said
+
+
+def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
+    """Say how many of the poses training did not see."""
+    from avatar.runtime.motion import PoseRange
+
+    limits = PoseRange.of(bundle)
+    outside = np.zeros(len(shown), bool) if limits is None else limits.outside(shown).any(axis=1)
+    if not outside.any():
+        return []
+    first = f", the first at {int(np.argmax(outside))}," if len(shown) > 1 else ""
+    return [
+        f"{int(outside.sum())} of {len(shown)} frames{first} turn joints more than 10 degrees farther than training saw"
+    ]
 
 
 def _posed(

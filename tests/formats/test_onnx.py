@@ -48,6 +48,20 @@ def test_onnxruntime_poses_as_the_player_does(tmp_path, kind, config):
         np.testing.assert_allclose(theirs["colors"], colors, atol=2e-5)
 
 
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_colours_of_other_degrees(tmp_path, degree):
+    write(tmp_path / "me.avatar", student("no field"), EXACT)
+    bundle = AvatarPlayer(tmp_path / "me.avatar", threads=1).bundle
+    count = (degree + 1) ** 2 - 1
+    sh = np.random.default_rng(degree).normal(scale=0.2, size=(bundle.sizes["N"], count, 3)).astype(np.float32)
+    bundle = replace(bundle, tensors={**bundle.tensors, "gaussians.sh": sh}, sizes={**bundle.sizes, "K": count})
+    player = AvatarPlayer(bundle, threads=1)
+    write_onnx(tmp_path / "me.onnx", bundle)
+    ours = player.pose(dance().frame(2)).colors(np.array([0.3, 1.0, 4.0], np.float32))
+    theirs = run(tmp_path / "me.onnx", player, dance().frame(2))["colors"]
+    np.testing.assert_allclose(theirs, ours, atol=2e-5)
+
+
 def test_a_code_of_the_training_is_taken(tmp_path):
     write(tmp_path / "me.avatar", student("control points"), EXACT)
     player = AvatarPlayer(tmp_path / "me.avatar", threads=1)

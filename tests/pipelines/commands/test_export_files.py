@@ -113,6 +113,15 @@ def test_loose_clothes_of_a_motion_are_simulated(tmp_path, capsys):
     assert np.abs(means["simulate"] - skinned).max() > 1e-3
 
 
+def test_poses_that_training_did_not_see_are_said(folder, tmp_path, capsys):
+    far = replace(dance(), body_pose=dance().body_pose + np.linspace(0.0, 2.0, len(dance()))[:, None], fps=20.0)
+    far.save(tmp_path / "far.npz")
+    options = ("--out", tmp_path / "s", "--format", "spz", "--params", tmp_path / "far.npz")
+    (sentence,) = export(capsys, folder / "me.avatar", *options)["said"]
+    assert "of 6 frames, the first at" in sentence
+    assert export(capsys, folder / "me.avatar", *options, "--stop", 1)["said"] == []
+
+
 def test_the_template_moves_as_glb_and_stands_as_obj(folder, tmp_path, capsys):
     shown = ("--params", folder / "motion.npz")
     out = tmp_path / "a.glb"
