@@ -168,7 +168,8 @@ class Bench:
         return {
             "vertexwise": round(mean(apart.values()), 2),
             "vertexwise_p95": round(mean(worst.values()), 1),
-            "worst_frame": {"frame": latest, "vertexwise": round(apart[latest], 1)},
+            "worst_frame": latest,
+            "vertexwise_there": round(apart[latest], 1),
             "p2s": _rounded(surface.p2s),
             "truth_to_mesh": _rounded(surface.truth_to_mesh),
             "psnr": round(self._psnr(sequence, track, gaussians), 2),
