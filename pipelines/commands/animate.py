@@ -14,11 +14,12 @@ from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import StudentFilm, motion_for, open_student, student_frames
+from pipelines.commands.animate_student import StudentFilm, open_student, student_frames
+from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import OptionalFloat, OptionalInt
-from pipelines.commands.templates import load_params_for, load_run_template
+from pipelines.commands.templates import load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from pipelines.figures.style import ShadeStyle
@@ -49,7 +50,8 @@ class Animate:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote, or a bundle NAME.avatar that `smplxpp export` wrote."""
     params: Path
-    """Body parameters, any layout that `smplxpp params convert` reads. Their shape is ignored: the template has one."""
+    """A motion: body parameters in any layout that `smplxpp params convert` reads, or a .bvh. Their shape is ignored:
+    the template has one."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
     model: Literal["template", "student"] = "template"
@@ -79,6 +81,8 @@ class Animate:
     """Frame after the last."""
     step: int = 1
     """Take every step-th frame."""
+    driving: Annotated[Driving, tyro.conf.arg(name="")] = field(default_factory=Driving)
+    """Whose motion it is."""
     lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
     """The light that the person is shown in."""
     json: bool = False
@@ -92,7 +96,7 @@ class Animate:
         if self._of_student:
             return self._student_film()
         template = load_run_template(self.run_folder)
-        params, fps, before = self._chosen(load_params_for(template, self.params))
+        params, fps, before = self._chosen(self.driving.load(self.params, unshaped(template.body)))
         garments = [] if self.cloth == "skin" or suffix == ".glb" else self._garments(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
@@ -117,9 +121,10 @@ class Animate:
     def _student_film(self) -> dict:
         """Draw the student frame by frame and write the film."""
         from avatar.runtime.motion import resampled
+        from avatar.runtime.skeleton import skeleton_body
 
         bundle = open_student(self.run_folder)
-        chosen, fps, whole = self._chosen(motion_for(bundle, self.params))
+        chosen, fps, whole = self._chosen(self.driving.load(self.params, skeleton_body(bundle)))
         motion = replace(whole, fps=fps * self.step)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
         shown = range(first, len(whole), self.step)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
+from pipelines.commands.driving import Driving
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
-from smplxpp.body import load_params
 from smplxpp.core.camera import Camera
 from smplxpp.core.light import Relighting
 from smplxpp.core.params import BodyParams
@@ -64,10 +64,10 @@ def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
 
 
 def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:
-    """Read a motion, in any layout, for a bundle's body."""
+    """Read a motion, in any layout or a .bvh, for a bundle's body."""
     from avatar.runtime.skeleton import skeleton_body
 
-    return load_params(path, body=skeleton_body(bundle))
+    return Driving().load(path, skeleton_body(bundle))
 
 
 def student_frames(

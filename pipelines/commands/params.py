@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
 from smplxpp.body import load_body
 from smplxpp.body.importers import LayoutName, detect_layout, load_params
@@ -23,7 +24,7 @@ class ParamsConvert:
     """Options of the command."""
 
     input: tyro.conf.Positional[Path]
-    """npz, json or pkl file, or a folder of numbered frames."""
+    """npz, json or pkl file, a folder of numbered frames, or a .bvh, whose motion is brought to the body."""
     out: Path
     """npz file to write: SMPL-X names, stacked frames."""
     layout: LayoutName = "auto"
@@ -48,16 +49,20 @@ class ParamsConvert:
         if self.out.suffix.lower() != ".npz":
             raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
         kept = _parse_frames(self.frames)
-        layout = detect_layout(self.input) if self.layout == "auto" else self.layout
-        params = load_params(
-            self.input,
-            layout=self.layout,
-            body=None if self.body is None else load_body(self.body),
-            person=self.person,
-            up=self.up,
-            flat_hand_mean=self.flat_hand_mean,
-            max_betas=self.betas,
-        ).select(kept)
+        if self.input.suffix.lower() == BVH:
+            layout = "bvh"
+            params = Driving(up=self.up).load(self.input, load_body(self.body)).select(kept)
+        else:
+            layout = detect_layout(self.input) if self.layout == "auto" else self.layout
+            params = load_params(
+                self.input,
+                layout=self.layout,
+                body=None if self.body is None else load_body(self.body),
+                person=self.person,
+                up=self.up,
+                flat_hand_mean=self.flat_hand_mean,
+                max_betas=self.betas,
+            ).select(kept)
         if not len(params):
             raise InputError("--frames", expected="a range that holds frames", received=str(self.frames))
         params.save(self.out)

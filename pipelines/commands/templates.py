@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
+from pipelines.commands.driving import Driving, unshaped
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -31,15 +29,9 @@ def load_run_template(run: Path) -> Template:
 
 
 def load_params_for(template: Template, path: Path) -> BodyParams:
-    """Frames of body parameters in any layout, for a template to pose.
-
-    Layouts that turn the body about the origin need its root joint. The identity is in the template already: without
-    shape directions the betas of the file do not move that joint a second time.
+    """A motion in any layout, or a .bvh, for a template to make.
 
     Raises:
         InputError: no file of parameters, or of another body.
     """
-    from smplxpp.body import load_params
-
-    body = template.body
-    return load_params(path, body=replace(body, shapedirs=np.zeros_like(body.shapedirs)))
+    return Driving().load(path, unshaped(template.body))

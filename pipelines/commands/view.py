@@ -28,7 +28,7 @@ class View:
     capture: OptionalPath = None
     """Capture whose photographs and frames are shown; by default the one that the run was made from."""
     params: OptionalPath = None
-    """Motion to go through, any layout that `smplxpp params convert` reads; by default the capture's frames."""
+    """Motion to go through, in any layout that `smplxpp params convert` reads; by default the capture's frames."""
     lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
     """The light that the Gaussians are shown in."""
     port: int = 8080

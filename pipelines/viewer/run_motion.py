@@ -14,6 +14,8 @@ from pipelines.stages.build_config import load_build
 from pipelines.stages.params_in_use import params_in_use
 from pipelines.stages.register_config import load_register
 from smplxpp.body import load_params
+from smplxpp.body.bvh_params import load_bvh
+from smplxpp.body.retarget import Skeleton
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -72,9 +74,12 @@ def motion_of_run(run: Path, template: Template, capture: Capture | None, given:
         InputError: a file that is given and holds no motion of this body.
     """
     if given is not None:
-        # The template has the identity: betas must not move the root's joint a second time.
-        body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
-        params = load_params(given, body=body).without_shape()
+        if given.suffix.lower() == ".bvh":
+            params = load_bvh(given, Skeleton.of(template.body))
+        else:
+            # The template has the identity: betas must not move the root's joint a second time.
+            body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
+            params = load_params(given, body=body).without_shape()
         return ShownMotion(params, tuple(range(len(params))), params.fps or _FPS, given.name)
     if capture is not None:
         found = {frame: own for frame in capture.frames if (own := capture.params(frame)) is not None}

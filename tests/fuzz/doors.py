@@ -12,7 +12,9 @@ import numpy as np
 from PIL import Image
 
 from pipelines.captures.detect_keypoints import standing_rows
-from smplxpp.body import load_params
+from smplxpp.body import load_body, load_params
+from smplxpp.body.bvh_params import load_bvh, read_joint_map
+from smplxpp.body.retarget import Skeleton
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.images import read_alpha, read_color, read_normals
 from smplxpp.capture.images import read_labels as read_label_image
@@ -26,6 +28,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
+from smplxpp.export.bvh import write_bvh
 from smplxpp.register.landmark_file import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels
@@ -284,6 +287,20 @@ def _hand_doors() -> list[Door]:
     ]
 
 
+def _motion_doors() -> list[Door]:
+    """A skeleton of another program with its motion, and names for its joints."""
+    body = load_body()
+    names = {"Hips": "pelvis", "LeftUpLeg": "left_hip"}
+    return [
+        Door(
+            "motion bvh",
+            lambda folder: write_bvh(folder / "m.bvh", body, BodyParams.rest(betas=0, expressions=0)),
+            lambda folder: load_bvh(folder / "m.bvh", Skeleton.of(body)),
+        ),
+        Door("joint map", lambda f: _write_json(f / "m.json", names), lambda f: read_joint_map(f / "m.json")),
+    ]
+
+
 def _light_doors() -> list[Door]:
     """Panoramas, with flat rows and with packed ones."""
 
@@ -374,6 +391,7 @@ def doors() -> dict[str, Door]:
         + _hand_doors()
         + _image_doors()
         + _light_doors()
+        + _motion_doors()
         + _detector_doors()
         + _basic_doors()
     )

@@ -1,0 +1,251 @@
+"""A BVH motion as parameters of a body: which of its joints are ours, and how its rest pose differs from a T-pose."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.body.bvh import BvhMotion, read_bvh
+from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.retarget import FEET, Skeleton, held_feet
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_object, as_text, read_json
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import rotvec_from_matrix
+
+OURS = SMPLX_JOINTS[:22]
+"""Joints that a motion can turn."""
+_LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
+NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
+# Ours -> what others call them, without blanks, dashes, prefixes and capitals; `S` is left or right, or l or r. The
+# first that a file has counts.
+_MIDDLE = {
+    "pelvis": "hips hip pelvis root bip01 bip01pelvis",
+    "spine1": "spine lowerback spine01 abdomen bip01spine chest torso",
+    "spine2": "spine1 spine02 chest2 bip01spine1 chestlower",
+    "spine3": "spine2 spine03 chest3 upperchest bip01spine2 chestupper chest4",
+    "neck": "neck neck1 neck01 bip01neck",
+    "head": "head bip01head",
+}
+_SIDES = {
+    "hip": "Supleg Shipjoint Sthigh thighS Supperleg Ship",
+    "knee": "Sleg Sshin calfS Slowleg Slowerleg Sknee Scalf",
+    "ankle": "Sfoot footS Sankle",
+    "foot": "Stoebase Stoe ballS Stoes Stoe0 Sball",
+    "collar": "Scollar clavicleS Sclavicle Sshoulder",
+    "shoulder": "Sarm Sshldr upperarmS Suparm Supperarm Sshoulder",
+    "elbow": "Sforearm lowerarmS Slowarm Slowerarm Selbow",
+    "wrist": "Shand handS Swrist",
+}
+_SPOKEN = {"left": ("left", "l"), "right": ("right", "r")}
+_FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
+_CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
+
+
+def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] | None = None) -> BodyParams:
+    """Read a BVH motion for a body: its limbs point where the file's do, its ways are in proportion to its legs.
+
+    Args:
+        joint_map: the file's names to ours, in the place of those that are known.
+
+    Raises:
+        InputError: what `read_bvh` refuses, and joints that are needed and not found.
+    """
+    motion = read_bvh(path)
+    found = named_joints(motion.names, joint_map, subject=f"motion {path}")
+    return bvh_params(motion, found, body)
+
+
+def read_joint_map(path: str | Path) -> dict[str, str]:
+    """Read a JSON file of another skeleton's names and ours: `{"LeftUpLeg": "left_hip", ...}`.
+
+    Raises:
+        InputError: damaged, or a joint that we do not have.
+    """
+    subject = f"joint map {path}"
+    values = as_object(read_json(path, subject="joint map"), subject=subject)
+    for theirs, ours in values.items():
+        if as_text(ours, subject=f"{subject}: {theirs}") not in OURS:
+            raise InputError(f"{subject}: {theirs}", expected=f"one of {', '.join(OURS)}", received=repr(ours)[:80])
+    return values
+
+
+def named_joints(
+    names: tuple[str, ...], joint_map: Mapping[str, str] | None, *, subject: str = "motion"
+) -> dict[str, int]:
+    """Return the file's joint of each of ours that it has.
+
+    Raises:
+        InputError: one of those needed is not among them.
+    """
+    if joint_map is not None:
+        unknown = [name for name in joint_map if name not in names]
+        if unknown:
+            raise InputError(
+                f"{subject}: joint map", expected=f"names of {', '.join(names)}"[:600], received=unknown[0]
+            )
+        found = {ours: names.index(theirs) for theirs, ours in joint_map.items()}
+    elif sum(name in names for name in OURS) >= len(NEEDED):
+        found = {name: names.index(name) for name in OURS if name in names}
+    else:
+        found = _known(names)
+    missing = [name for name in NEEDED if name not in found]
+    if missing:
+        raise InputError(
+            f"{subject}: joints",
+            expected=f"joints that stand for {', '.join(NEEDED)}",
+            received=f"none for {', '.join(missing)}, among {', '.join(names)}"[:600],
+            remedy='name them with --joint-map FILE, JSON as {"LeftUpLeg": "left_hip", ...}',
+        )
+    return found
+
+
+def _known(names: tuple[str, ...]) -> dict[str, int]:
+    """Joints by the names of others."""
+    plain = [re.sub(r"[\s_.\-]", "", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
+    found: dict[str, int] = {}
+
+    def take(ours: str, words: list[str]) -> None:
+        for word in words:
+            if word in plain and plain.index(word) not in found.values():
+                found[ours] = plain.index(word)
+                return
+
+    for ours, words in _MIDDLE.items():
+        take(ours, words.split())
+    for side, spoken in _SPOKEN.items():
+        # The shoulder first: what is called so is a collar where there is an arm beside it.
+        for part in ("shoulder", *(name for name in _SIDES if name != "shoulder")):
+            take(f"{side}_{part}", [word.replace("S", one) for one in spoken for word in _SIDES[part].split()])
+    return found
+
+
+def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> BodyParams:
+    """Return the parameters of a body that moves as the skeleton does.
+
+    A joint's turn in the world is the file's, times what takes our rest pose to theirs: for hips, knees, shoulders and
+    elbows the smallest turn between the directions of their bones, for all others that between both trunks. So arms
+    that hang at rest there hang here. Ways are scaled by the legs' lengths, which takes care of units too; the lowest
+    foot comes to where the feet are at rest, the first frame above the origin.
+    """
+    world = _in_world(motion)
+    rest = motion.rest
+    trunk = _trunk(rest, joints, body)
+    upright = _upright(rest, joints)
+    turned: dict[str, Float64[np.ndarray, "T 3 3"]] = {}
+    for name, joint in joints.items():
+        side, _, part = name.rpartition("_")
+        child = f"{side}_{_CHILD[part]}" if part in _CHILD else ""
+        away = trunk
+        if child in joints:
+            ours = body.places[body.names.index(child)] - body.places[body.names.index(name)]
+            away = _between(trunk @ ours, rest[joints[child]] - rest[joint]) @ trunk
+        elif part == "wrist":
+            away = _arm(rest, joints, body, trunk, side)
+        turned[name] = upright @ world[:, joint] @ away
+    pose = np.zeros((len(world), 22, 3))
+    whole: list[Float64[np.ndarray, "T 3 3"]] = []
+    for k, name in enumerate(OURS):
+        parent = whole[body.parents[k]] if k else np.broadcast_to(np.eye(3), (len(world), 3, 3))
+        own = turned.get(name, parent)
+        pose[:, k] = rotvec_from_matrix(np.swapaxes(parent, 1, 2) @ own)
+        whole.append(own)
+    everything = np.concatenate([pose, np.zeros((len(pose), 33, 3))], axis=1)
+    params = BodyParams.from_full_pose(everything, betas=np.zeros(0), expression=np.zeros(0), transl=np.zeros(3))
+    return _placed(replace(params, fps=motion.fps), motion, joints, body, upright)
+
+
+def _placed(
+    params: BodyParams,
+    motion: BvhMotion,
+    joints: Mapping[str, int],
+    body: Skeleton,
+    upright: Float64[np.ndarray, "3 3"],
+) -> BodyParams:
+    """The parameters on their way, feet held as `retarget` holds them."""
+    places = _places(motion) @ upright.T
+    scale = body.leg / _leg(motion.rest, joints)
+    root = places[:, joints["pelvis"]]
+    params = replace(params, transl=scale * (root - root[0]) - body.places[0] * [1.0, 0.0, 1.0])
+    feet = [name for name in FEET if name in joints]
+    theirs = scale * places[:, [joints[name] for name in feet]]
+    own = body.pose(params)[:, body.at(*feet)]
+    params = replace(params, transl=params.transl + held_feet(theirs, own, body.leg, params.fps or 1.0))
+    low = body.pose(params)[:, body.at(*feet), 1].min() - body.places[body.at(*feet), 1].min()
+    return replace(params, transl=params.transl - [0.0, low, 0.0])
+
+
+def _leg(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> float:
+    total = 0.0
+    for side in ("left", "right"):
+        hip, knee, ankle = (rest[joints[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
+        total += 0.5 * float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+    if not total > 0.0:
+        raise InputError("legs of the motion", expected="bones of some length", received="none")
+    return total
+
+
+def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
+    out = motion.rotations.copy()
+    for joint, parent in enumerate(motion.parents):
+        if parent >= 0:
+            out[:, joint] = out[:, parent] @ motion.rotations[:, joint]
+    return out
+
+
+def _places(motion: BvhMotion) -> Float64[np.ndarray, "T J 3"]:
+    world = _in_world(motion)
+    out = np.empty((len(motion.root), len(motion.names), 3))
+    for joint, parent in enumerate(motion.parents):
+        out[:, joint] = motion.root if parent < 0 else out[:, parent] + world[:, parent] @ motion.offsets[joint]
+    return out
+
+
+def _upright(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> Float64[np.ndarray, "3 3"]:
+    """The turn that brings the axis along which the skeleton stands at rest to +Y."""
+    up = rest[joints["pelvis"]] - 0.5 * (rest[joints["left_ankle"]] + rest[joints["right_ankle"]])
+    axis = int(np.argmax(np.abs(up)))
+    way = np.zeros(3)
+    way[axis] = np.sign(up[axis]) or 1.0
+    return _between(way, np.array([0.0, 1.0, 0.0]))
+
+
+def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Skeleton) -> Float64[np.ndarray, "3 3"]:
+    """The rotation of our trunk at rest onto theirs: hips, shoulders and neck, each set about its own middle."""
+    shared = [name for name in _FRAME if name in joints]
+    ours, theirs = body.places[body.at(*shared)], rest[[joints[name] for name in shared]]
+    ours, theirs = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
+    u, _, vt = np.linalg.svd(theirs.T @ ours)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def _arm(
+    rest: Float64[np.ndarray, "J 3"],
+    joints: Mapping[str, int],
+    body: Skeleton,
+    trunk: Float64[np.ndarray, "3 3"],
+    side: str,
+) -> Float64[np.ndarray, "3 3"]:
+    """A hand goes on as its forearm is."""
+    elbow, wrist = body.places[body.at(f"{side}_elbow", f"{side}_wrist")]
+    theirs = rest[joints[f"{side}_wrist"]] - rest[joints[f"{side}_elbow"]]
+    return _between(trunk @ (wrist - elbow), theirs) @ trunk
+
+
+def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The smallest rotation that takes one direction to another; none where one has no length."""
+    lengths = np.linalg.norm(a) * np.linalg.norm(b)
+    if not lengths > 0.0:
+        return np.eye(3)
+    axis, cosine = np.cross(a, b) / lengths, float(a @ b / lengths)
+    if cosine < -1.0 + 1e-9:  # half a turn, about any axis across
+        across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        across /= np.linalg.norm(across)
+        return 2.0 * np.outer(across, across) - np.eye(3)
+    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.eye(3) + K + K @ K / (1.0 + cosine)

@@ -1,0 +1,128 @@
+"""A motion of one body on another: turns as they are, ways in proportion to the legs, feet that stand where they stood.
+
+SMPL's bodies share their rest pose, so that the turns of joints are carried over as they are. What differs is how far a
+step reaches: the root's way is scaled by the legs' length, and where a foot stood on the source it is held on the
+target, by what the rest of the proportions would make it slide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from smplxpp.body.model import BodyModel
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.skinning.linear_blend import forward_kinematics
+
+_LEG = ("hip", "knee", "ankle")
+FEET = ("left_foot", "right_foot", "left_ankle", "right_ankle")
+"""Joints by which contact with the floor is told."""
+_SLOW, _LOW = 0.35, 0.06
+"""A foot stands where it moves by less than so many leg lengths a second, so many of them above its lowest."""
+_BRACE = 0.05
+_FPS = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """Joints at rest.
+
+    Attributes:
+        names: SMPL's. places: metres.
+    """
+
+    names: tuple[str, ...]
+    parents: Int64[np.ndarray, " J"]
+    places: Float64[np.ndarray, "J 3"]
+
+    @staticmethod
+    def of(body: BodyModel, betas: Float64[np.ndarray, " B"] | None = None) -> Skeleton:
+        """Return that of a body of a shape; None: its mean one.
+
+        Raises:
+            InputError: more betas than the body has.
+        """
+        shape = BodyParams.rest(betas=0 if betas is None else betas, expressions=0)
+        return Skeleton(tuple(body.joint_names), np.asarray(body.parents), np.asarray(body.rest_joints(shape))[0])
+
+    def at(self, *names: str) -> list[int]:
+        """Return the numbers of joints.
+
+        Raises:
+            InputError: one that it lacks.
+        """
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            raise InputError("joints of a skeleton", expected=", ".join(names), received=f"no {', '.join(missing)}")
+        return [self.names.index(name) for name in names]
+
+    @property
+    def leg(self) -> float:
+        """Length of a leg from hip to ankle, the mean of both.
+
+        Raises:
+            InputError: joints that are missing, or legs of no length.
+        """
+        lengths = []
+        for side in ("left", "right"):
+            hip, knee, ankle = self.places[self.at(*(f"{side}_{name}" for name in _LEG))]
+            lengths.append(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+        if not np.mean(lengths) > 0.0:
+            raise InputError("legs of a skeleton", expected="bones of some length", received="none")
+        return float(np.mean(lengths))
+
+    def pose(self, params: BodyParams) -> Float64[np.ndarray, "T J 3"]:
+        """Return where the joints are, metres; fingers and face as they are at rest."""
+        count = len(self.names)
+        rotations = np.tile(np.eye(3), (len(params), count, 1, 1))
+        turned = np.concatenate([params.global_orient, params.body_pose], axis=1).reshape(len(params), -1, 3)
+        rotations[:, : turned.shape[1]] = matrix_from_rotvec(turned)
+        rest = np.repeat(self.places[None], len(params), axis=0)
+        return forward_kinematics(rest, self.parents, rotations, transl=params.transl)[1]
+
+
+def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyParams:
+    """Return a motion of `source` as `target` makes it; the same body's comes back as it was.
+
+    Args:
+        params: T frames of the source; their shape is dropped.
+    """
+    scale = target.leg / source.leg
+    own = source.pose(params)
+    pelvis = own[:, 0]
+    floor = own[:, source.at(*FEET), 1].min()
+    start = pelvis[0] * [1.0, 0.0, 1.0] + [0.0, floor, 0.0]
+    places = start + scale * (pelvis - start)
+    moved = places - target.places[0]
+    out = replace(params.without_shape(), transl=moved)
+    feet, theirs = target.pose(out)[:, target.at(*FEET)], scale * own[:, source.at(*FEET)]
+    moved = moved + held_feet(theirs, feet, target.leg, params.fps or _FPS)
+    lowest = target.pose(replace(out, transl=moved))[:, target.at(*FEET), 1].min()
+    moved[:, 1] += floor - lowest
+    return replace(out, transl=moved)
+
+
+def standing(feet: Float64[np.ndarray, "T K 3"], leg: float, fps: float) -> Float64[np.ndarray, "T-1 K"]:
+    """Return how much each foot stands between a frame and the next, in [0, 1], by its speed and its height."""
+    speed = np.linalg.norm(np.diff(feet, axis=0), axis=2) * fps / (_SLOW * leg)
+    height = feet[..., 1] - feet[..., 1].min(axis=0)
+    low = np.maximum(height[:-1], height[1:]) / (_LOW * leg)
+    return np.exp(-(speed**4)) * np.exp(-(low**4))
+
+
+def held_feet(
+    source: Float64[np.ndarray, "T K 3"], target: Float64[np.ndarray, "T K 3"], leg: float, fps: float
+) -> Float64[np.ndarray, "T 3"]:
+    """Return by how much the target goes on beyond its way, so that feet that stand move as the source's do.
+
+    Args:
+        source: its feet, scaled to the target's size. leg: of the target, metres.
+    """
+    share = standing(source, leg, fps)[..., None]
+    too_far = np.diff(source, axis=0) - np.diff(target, axis=0)
+    step = (share * too_far).sum(axis=1) / (share.sum(axis=1) + _BRACE)
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)]) * [1.0, 0.0, 1.0]
