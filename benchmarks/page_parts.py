@@ -349,6 +349,13 @@ PARTS = (
         "timed.",
     ),
     Part(
+        "interpolation",
+        "Motions between their frames",
+        "The performances of the synthetic captures, curves that are known at every instant, 4 s each; every third of "
+        "60 frames a second is given, the others come from in between. `shortest turns` is what `--interpolate` does. "
+        "Vertices and joints of the open body, mm; the angle of a frame's worst joint.",
+    ),
+    Part(
         "relighting",
         "The student in another light",
         "The student of the embedded person, preset `demo`, tracked inputs, trained in the stage's soft light; "

@@ -99,7 +99,7 @@ def student_frames(
 
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
     some = spread(range(len(params)), _FRAMING_POSES)
-    points = np.concatenate([player.pose(params.frame(k)).means for k in some]).astype(np.float64)
+    points = np.concatenate([player.pose(params.frame(k)).means.astype(np.float64) for k in some])
     height = film.height + film.height % 2  # h264 with 4:2:0 colour takes even sizes
     width = None if film.width is None else film.width + film.width % 2
     if film.view == "turntable":

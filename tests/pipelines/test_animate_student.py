@@ -94,6 +94,19 @@ def test_loose_clothes_of_a_bundle_are_simulated(tmp_path):
     assert len(one) == len(other) == 3 and np.abs(one[-1].astype(int) - other[-1]).max() > 10
 
 
+def test_a_camera_that_stands_still_sees_all_of_a_walk(folder, tmp_path):
+    """A player's arrays are its own: poses taken one after the other were all the last, and the walk left the film."""
+    away = replace(dance(), transl=np.linspace(-1.5, 1.5, len(dance()))[:, None] * [1.0, 0.0, 0.0], fps=20.0)
+    away.save(tmp_path / "away.npz")
+    Animate(folder / "me.avatar", tmp_path / "away.npz", tmp_path / "out", height=64, json=True).run()
+    middles = []
+    for picture in pictures(tmp_path / "out"):
+        columns = np.flatnonzero((picture < 230).any(axis=(0, 2)))
+        assert 0 < columns.min() and columns.max() < picture.shape[1] - 1
+        middles.append(columns.mean())
+    assert np.diff(middles).min() > 5.0
+
+
 def test_another_light(folder, tmp_path):
     """A lamp to the person's left, which is on the picture's right: that side brightens, the other darkens."""
     lamp = np.exp(4.0 * (panorama_directions(16, 32) @ [1.0, 0.0, 0.0] - 1.0))[..., None] * np.ones(3)
