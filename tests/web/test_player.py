@@ -132,6 +132,9 @@ def test_one_file_opens_from_disk_and_asks_no_network(browser, avatar, tmp_path)
     browser.errors.clear()
     browser.go(page.as_uri())
     assert browser.evaluate("document.querySelector('h1').textContent") == NAME
+    # Nothing was asked for, and the CPU plays the GPU here: WebGL2 is faster on it.
+    assert browser.evaluate("navigator.gpu.requestAdapter().then(adapter => !!adapter)")
+    assert browser.evaluate("smplxppPlayer.player.renderer.name") == "WebGL2"
     image, alpha = drawn(avatar, 3, camera())
     assert decibels(browser.picture(asked(camera(), 3)) / 255.0, image, alpha > 0.5) > 38.0
     assert browser.evaluate("fetch('https://example.invalid').then(() => 'sent', () => 'refused')") == "refused"

@@ -39,7 +39,7 @@ export interface View {
   seconds?: number | null;
 }
 
-type Frame = Extract<Reply, { kind: "frame" }>;
+export type Frame = Extract<Reply, { kind: "frame" }>;
 
 export class Player {
   summary: Summary | null = null;
@@ -57,6 +57,8 @@ export class Player {
   readonly rates: Rates = { fps: 0, deform: 0, cloth: 0, sort: 0, draw: null };
   /** Loose clothes are simulated. */
   simulating = true;
+  /** A headset shows the avatar: the page's canvas rests. */
+  immersed = false;
   /** Called after each picture. */
   onpicture: () => void = () => {};
   onerror: (message: string) => void = () => {};
@@ -154,6 +156,20 @@ export class Player {
 
   private readonly step = (now: number): void => {
     this.tick = requestAnimationFrame(this.step);
+    if (this.immersed) return;
+    this.advance(now);
+    if (this.still || this.renderer.lost) {
+      this.changed = true;
+      return;
+    }
+    // Pictures that wait for a GPU that is behind would only be old ones.
+    if (this.renderer.busy) return;
+    const frame = this.next(() => this.camera());
+    if (frame) this.show(frame);
+  };
+
+  /** Lets time pass, to `now` in milliseconds. */
+  advance(now: number): void {
     const passed = Math.min(0.25, (now - this.before) / 1000);
     this.before = now;
     this.quiet += passed;
@@ -164,21 +180,18 @@ export class Player {
       else this.seek(next % this.duration);
       this.update();
     }
-    if (this.still || this.renderer.lost) {
-      this.changed = true;
-      return;
-    }
-    // Pictures that wait for a GPU that is behind would only be old ones.
-    if (this.renderer.busy) return;
+  }
+
+  /** What the worker has made ready, null: nothing new; the worker goes on, with what the camera sees, in the meantime. */
+  next(camera: () => Camera): Frame | null {
     const frame = this.ready;
     this.ready = null;
-    // The worker goes on while the page draws.
     if (!this.asked && !this.changed && this.elapsed < Infinity) this.elapsed = 0;
     if (!this.asked && this.changed) {
       this.changed = false;
       const seconds = !this.simulating ? null : this.elapsed < Infinity ? Math.min(this.elapsed, LONGEST_FOLLOWED) : Infinity;
       this.elapsed = this.simulating ? 0 : Infinity;
-      this.ask(this.request({ time: this.time, camera: this.camera() }, seconds), []).then((reply) => {
+      this.ask(this.request({ time: this.time, camera: camera() }, seconds), []).then((reply) => {
         if (reply.kind === "frame") {
           this.ready = reply;
           // Clothes go on when nothing else does.
@@ -187,8 +200,23 @@ export class Player {
         else if (reply.kind === "failed") this.onerror(reply.message);
       });
     }
-    if (frame) this.show(frame);
-  };
+    return frame;
+  }
+
+  /** Takes back the memory of a frame that is drawn, and counts it. */
+  done(frame: Frame): void {
+    if (frame.records.byteLength === 4 * RECORD * this.summary!.count && this.spare.length < 2) this.spare.push(frame.records);
+    const now = performance.now(), rates = this.rates;
+    const mean = (old: number, value: number) => (old ? old + (value - old) / MEMORY : value);
+    if (this.lastDrawn && now - this.lastDrawn < 2000) rates.fps = 1000 / mean(rates.fps && 1000 / rates.fps, now - this.lastDrawn);
+    this.lastDrawn = now;
+    rates.deform = mean(rates.deform, frame.deform);
+    rates.cloth = mean(rates.cloth, frame.cloth);
+    rates.sort = mean(rates.sort, frame.sort);
+    rates.draw = this.renderer.milliseconds;
+    ++this.pictures;
+    this.onpicture();
+  }
 
   /** The orbit's camera, which follows the person, for the pixels that the page has. */
   camera(): Camera {
@@ -204,8 +232,9 @@ export class Player {
   }
 
   private request({ time, camera }: View, seconds: number | null): Request {
+    const sorted = this.immersed || !this.renderer.sorts;
     return {
-      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted: !this.renderer.sorts, seconds,
+      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted, seconds,
       records: this.spare.pop() ?? null,
     };
   }
@@ -222,19 +251,8 @@ export class Player {
   }
 
   private show(frame: Frame, background = BACKGROUND): void {
-    const records = new Float32Array(frame.records);
-    const { camera, count, depths } = frame;
+    const { camera, count, depths } = frame, records = new Float32Array(frame.records);
     this.renderer.draw({ records, count, camera, background, depths, blur: this.summary!.blur });
-    if (records.length === RECORD * this.summary!.count && this.spare.length < 2) this.spare.push(frame.records);
-    const now = performance.now(), rates = this.rates;
-    const mean = (old: number, value: number) => (old ? old + (value - old) / MEMORY : value);
-    if (this.lastDrawn && now - this.lastDrawn < 2000) rates.fps = 1000 / mean(rates.fps && 1000 / rates.fps, now - this.lastDrawn);
-    this.lastDrawn = now;
-    rates.deform = mean(rates.deform, frame.deform);
-    rates.cloth = mean(rates.cloth, frame.cloth);
-    rates.sort = mean(rates.sort, frame.sort);
-    rates.draw = this.renderer.milliseconds;
-    ++this.pictures;
-    this.onpicture();
+    this.done(frame);
   }
 }

@@ -51,7 +51,7 @@ export class Deformer {
   private readonly eye: Block<Float32Array>;
   private readonly records: Block<Float32Array>;
 
-  constructor(readonly avatar: Avatar) {
+  constructor(readonly avatar: Avatar, private readonly clock = () => performance.now()) {
     const { native } = this, { mesh, skeleton, gaussians: g, field } = avatar;
     const J = skeleton.parents.length, V = mesh.vertices.length / 3, F = mesh.faces.length / 3, N = g.count;
     this.skeleton = {
@@ -125,8 +125,8 @@ export class Deformer {
   pose(pose: Pose, cloth: Displaced | null = null): void {
     const { native, field, blend, transforms, rest, posed, world } = this;
     const theta = Float32Array.from(pose.rotations.subarray(3, 3 + 3 * BODY_JOINTS));
-    const times = [performance.now()];
-    const lap = () => times.push(performance.now());
+    const times = [this.clock()];
+    const lap = () => times.push(this.clock());
     this.joints(pose);
     lap();
     field?.evaluate(theta);

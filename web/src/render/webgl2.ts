@@ -1,6 +1,7 @@
 /** Gaussians by WebGL2: they come sorted, nearest first, and are blended into a target of half floats. */
 
 import { RECORD } from "../avatar/deform.ts";
+import type { Camera } from "./camera.ts";
 import type { Picture, Renderer } from "./renderer.ts";
 import { RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE_VERTEX } from "./webgl2_shaders.ts";
 
@@ -18,6 +19,15 @@ interface Resources {
   width: number;
   height: number;
 }
+
+/** A camera, and the lower left corner of the pixels that its picture goes to. */
+export interface Window {
+  camera: Camera;
+  x: number;
+  y: number;
+}
+
+type Shown = Pick<Picture, "count" | "background" | "blur">;
 
 interface Timer {
   TIME_ELAPSED_EXT: number;
@@ -60,9 +70,20 @@ export class WebGL2Renderer implements Renderer {
 
   draw({ records, count, camera, background, blur }: Picture): void {
     if (this.lost) return;
+    const { gl, canvas } = this, { width, height } = camera;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    this.upload(records, count);
+    const timed = this.startTimer();
+    this.paint({ camera, x: 0, y: 0 }, null, { count, background, blur });
+    if (timed) gl.endQuery(this.timer!.TIME_ELAPSED_EXT);
+    gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  /** Keeps Gaussians, nearest first, for `paint`. */
+  upload(records: Float32Array, count: number): void {
     const { gl, resources: own } = this;
-    const { width, height, view } = camera;
-    this.fit(width, height);
     gl.bindVertexArray(own.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, own.buffer);
     if (own.capacity < count) {
@@ -70,8 +91,14 @@ export class WebGL2Renderer implements Renderer {
       gl.bufferData(gl.ARRAY_BUFFER, 4 * records.length, gl.STREAM_DRAW);
     }
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, records, 0, count * RECORD);
+    gl.bindVertexArray(null);
+  }
 
-    const timed = this.startTimer();
+  /** Draws what was uploaded last into a part of a framebuffer; null: the canvas. */
+  paint({ camera, x, y }: Window, framebuffer: WebGLFramebuffer | null, { count, background, blur }: Shown): void {
+    const { gl, resources: own } = this, { width, height, view } = camera;
+    this.fit(width, height);
+    gl.bindVertexArray(own.array);
     gl.bindFramebuffer(gl.FRAMEBUFFER, own.target);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 1);
@@ -89,17 +116,21 @@ export class WebGL2Renderer implements Renderer {
     gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(x, y, width, height);
     gl.disable(gl.BLEND);
     gl.useProgram(own.resolve);
     gl.bindTexture(gl.TEXTURE_2D, own.texture);
     gl.uniform3f(gl.getUniformLocation(own.resolve, "background"), ...background);
+    gl.uniform2i(gl.getUniformLocation(own.resolve, "corner"), x, y);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
-    if (timed) gl.endQuery(this.timer!.TIME_ELAPSED_EXT);
-    gl.deleteSync(this.fence);
-    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    gl.flush();
+  }
+
+  /** The context, once a headset may show what it draws. */
+  async compatible(): Promise<WebGL2RenderingContext> {
+    await (this.gl as WebGL2RenderingContext & { makeXRCompatible(): Promise<void> }).makeXRCompatible();
+    return this.gl;
   }
 
   async pixels(): Promise<Uint8Array> {
@@ -156,10 +187,9 @@ export class WebGL2Renderer implements Renderer {
     };
   }
 
-  /** Gives canvas and target the picture's size. */
+  /** Gives the target the picture's size. */
   private fit(width: number, height: number): void {
-    const { gl, canvas, resources: own } = this;
-    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    const { gl, resources: own } = this;
     if (own.width === width && own.height === height) return;
     [own.width, own.height] = [width, height];
     const fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");

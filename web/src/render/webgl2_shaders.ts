@@ -71,9 +71,10 @@ export const RESOLVE_FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D blended;
 uniform vec3 background;
+uniform ivec2 corner;
 out vec4 result;
 
 void main() {
-  vec4 value = texelFetch(blended, ivec2(gl_FragCoord.xy), 0);
+  vec4 value = texelFetch(blended, ivec2(gl_FragCoord.xy) - corner, 0);
   result = vec4(value.rgb + value.a * background, 1.0);
 }`;

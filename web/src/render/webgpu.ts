@@ -49,9 +49,9 @@ export class WebGPURenderer implements Renderer {
 
   private constructor(private readonly canvas: HTMLCanvasElement, private readonly context: GPUCanvasContext) {}
 
-  /** Makes one; null where the browser has no WebGPU. */
-  static async make(canvas: HTMLCanvasElement): Promise<WebGPURenderer | null> {
-    const device = await freshDevice();
+  /** Makes one; null where the browser has no WebGPU, or, unless `anyDevice`, none but one that the CPU plays. */
+  static async make(canvas: HTMLCanvasElement, anyDevice: boolean): Promise<WebGPURenderer | null> {
+    const device = await freshDevice(anyDevice);
     if (!device || !(await canShow(device))) return null;
     // A canvas has one kind of context for ever: asked for once a device is there.
     const context = canvas.getContext("webgpu");
@@ -213,9 +213,17 @@ export class WebGPURenderer implements Renderer {
   }
 }
 
-async function freshDevice(): Promise<GPUDevice | null> {
+async function freshDevice(anyDevice = true): Promise<GPUDevice | null> {
   const adapter = await globalThis.navigator?.gpu?.requestAdapter({ powerPreference: "high-performance" });
+  if (adapter && !anyDevice && isSoftware(adapter)) return null;
   return (await adapter?.requestDevice()) ?? null;
+}
+
+/** Whether the CPU plays this GPU: browsers say so in one of two places, or by the name of what plays it. */
+function isSoftware(adapter: GPUAdapter): boolean {
+  const { info } = adapter, { isFallbackAdapter } = adapter as { isFallbackAdapter?: boolean };
+  const names = `${info?.vendor} ${info?.architecture} ${info?.device} ${info?.description}`;
+  return Boolean(isFallbackAdapter ?? info?.isFallbackAdapter) || /swiftshader|llvmpipe|lavapipe|basic render/i.test(names);
 }
 
 /** Some browsers compute and cannot show it: their device is lost at the first picture. Tried where nothing is lost. */

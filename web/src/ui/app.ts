@@ -3,6 +3,7 @@
 import { BundleError } from "../bundle/errors.ts";
 import type { Player } from "../player.ts";
 import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
+import { enterStereo, offersStereo } from "../xr/stereo.ts";
 import { listen } from "./gestures.ts";
 import { makePanel } from "./panel.ts";
 
@@ -19,13 +20,14 @@ export class App {
   private readonly clock = element("span", { class: "time" });
   private readonly speed = element("button", { class: "speed", title: "Speed" }, "1×");
   private readonly menu = iconButton("Settings", "menu", ICONS.settings);
+  private readonly stereo = iconButton("View in the headset", "stereo", ICONS.stereo);
   private readonly bar: HTMLElement;
   private panel: HTMLElement | null = null;
   private lastRates = 0;
 
   constructor(private readonly player: Player, stage: HTMLCanvasElement) {
     this.bar = element("div", { class: "bar" }, this.playButton, this.scrub, this.clock, this.speed);
-    document.body.append(this.title, this.menu, this.rates, this.bar, this.welcome);
+    document.body.append(this.title, this.menu, this.stereo, this.rates, this.bar, this.welcome);
     this.showControls(false);
     listen(stage, player);
     this.listenToControls();
@@ -55,7 +57,7 @@ export class App {
   }
 
   /** Says what went wrong, and offers another file. */
-  fail(message: string): void {
+  fail(message: string, title = "This avatar cannot be shown"): void {
     const said = message.charAt(0).toUpperCase() + message.slice(1);
     const buttons = this.chooser("Open another file");
     if (this.player.summary) {
@@ -63,7 +65,7 @@ export class App {
       back.addEventListener("click", () => this.welcome.replaceChildren());
       buttons.prepend(back);
     }
-    const card = this.say(element("h2", {}, "This avatar cannot be shown"), element("p", {}, `${said}.`), buttons);
+    const card = this.say(element("h2", {}, title), element("p", {}, `${said}.`), buttons);
     card.classList.add("failed");
   }
 
@@ -88,6 +90,8 @@ export class App {
 
   private showControls(shown: boolean): void {
     for (const part of [this.bar, this.menu, this.rates]) part.hidden = !shown;
+    this.stereo.hidden = true;
+    if (shown) offersStereo().then((offered) => (this.stereo.hidden = !offered));
   }
 
   private listenToControls(): void {
@@ -102,6 +106,11 @@ export class App {
       if (event.key !== " " || event.target instanceof HTMLButtonElement || event.target instanceof HTMLInputElement) return;
       event.preventDefault();
       toggle();
+    });
+    this.stereo.addEventListener("click", () => {
+      this.stereo.disabled = true;
+      enterStereo(player).catch((error: Error) => this.fail(`the headset cannot be entered: ${error.message}`, "The headset stays dark"))
+        .finally(() => (this.stereo.disabled = false));
     });
     this.scrub.addEventListener("input", () => {
       player.seek(Number(this.scrub.value) * player.duration);
