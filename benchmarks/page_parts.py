@@ -365,8 +365,8 @@ PARTS = (
         "processor: native kernels (with AVX-512), the same C++ as WebAssembly in Node (vectors of 16 bytes), and the "
         "player's TypeScript before it. `sort` and `records`, what the GPU takes of each Gaussian, are the page's "
         "alone; `cloth, a step` of 1/30 s, natively with numpy's part of the driver. Pictures in Chromium, where the "
-        "CPU plays the GPU: milliseconds of the clock, the least of six, with eight other processes on the two cores, so that "
-        "only their ratio says something. No GPU and no phone was at hand.",
+        "CPU plays the GPU: milliseconds of the clock, the least of six, with eight other processes on the two cores, "
+        "so that only their ratio says something. No GPU and no phone was at hand.",
     ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
