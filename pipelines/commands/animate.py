@@ -58,6 +58,9 @@ class Animate:
     """What moves: the textured template, or the trained student, drawn by the runtime; a bundle is a student."""
     outside: Literal["keep", "clamp"] = "keep"
     """Poses of a student beyond what its training saw: said and shown as they are, or held back joint by joint."""
+    codes: Literal["null", "trained"] = "null"
+    """Codes of a student's field: the null code, as for any new motion, or those of its training, for a motion whose
+    rows are the frames of the training by their numbers (with --cloth skin, without --interpolate)."""
     interpolate: OptionalFloat = None
     """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""
     fps: OptionalFloat = None
@@ -124,21 +127,29 @@ class Animate:
         from avatar.runtime.skeleton import skeleton_body
 
         bundle = open_student(self.run_folder)
-        chosen, fps, whole = self._chosen(self.driving.load(self.params, skeleton_body(bundle)))
+        given = self.driving.load(self.params, skeleton_body(bundle))
+        chosen, fps, whole = self._chosen(given)
         motion = replace(whole, fps=fps * self.step)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
+        begin = range(len(given))[self.start : self.stop][0] - first
         shown = range(first, len(whole), self.step)
         if self.interpolate is not None:
             motion = resampled(motion, self.interpolate)
             shown = range(round(first / (fps * self.step) * self.interpolate), len(motion))
             fps = self.interpolate
         simulated = [] if self.cloth == "skin" else [row["part"] for row in bundle.garments_about.get("garments", [])]
+        if simulated and self.codes == "trained":
+            received = f"simulated: {', '.join(simulated)}"
+            raise InputError(
+                "option codes trained", expected="clothes as training had them (--cloth skin)", received=received
+            )
         film = StudentFilm(
             view=self.view,
             height=self.height,
             width=self.width,
             simulate=bool(simulated),
             clamp=self.outside == "clamp",
+            numbered_from=begin if self.codes == "trained" else None,
             relighting=self.lighting.relighting(),
         )
         cameras, frames = student_frames(bundle, motion, shown, film, self._said)
@@ -167,6 +178,12 @@ class Animate:
             raise InputError(f"output {self.out}", expected=".mp4, .gif or a folder for a student", received=".glb")
         if suffix == ".glb" and self.lighting.environment is not None:
             raise InputError("option environment", expected="a film or pictures", received=f"output {self.out}")
+        if self.codes == "trained" and (self.interpolate is not None or not self._of_student):
+            raise InputError(
+                "option codes trained",
+                expected="a student, without --interpolate",
+                received=f"the {self.model}, --interpolate {self.interpolate}",
+            )
         if self.interpolate is not None:
             require_positive("option interpolate", self.interpolate)
             if self.step != 1 or not self._of_student:

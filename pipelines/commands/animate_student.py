@@ -33,6 +33,8 @@ class StudentFilm:
     Attributes:
         view: name of a view, or "turntable". height, width: pixels; no width: as wide as the motion needs.
         simulate: the loose clothes. clamp: joints turn no farther than in training.
+        numbered_from: number of the motion's first frame, where its frames are the training's: those that have a code
+            take it; None: the null code.
         relighting: the light that the person is shown in; None: that of the capture.
     """
 
@@ -41,6 +43,7 @@ class StudentFilm:
     width: int | None
     simulate: bool
     clamp: bool
+    numbered_from: int | None = None
     relighting: Relighting | None = None
 
 
@@ -116,13 +119,15 @@ def _pictures(
     said: list[str],
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     picture = dict(zip(shown, cameras, strict=True))
+    coded = set() if film.numbered_from is None else set(player.bundle.about.frames)
     for k in range(len(motion)):
+        number = k + (film.numbered_from or 0)
         if film.simulate:
             player.step(motion.frame(k), 1.0 / (motion.fps or 1.0))
         if k not in picture:
             continue
         if not film.simulate:
-            player.pose(motion.frame(k))
+            player.pose(motion.frame(k), frame=number if number in coded else None)
         image, _ = player.draw(picture[k], background=_BACKGROUND, relighting=film.relighting)
         yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     said += player.said

@@ -107,6 +107,24 @@ def test_a_camera_that_stands_still_sees_all_of_a_walk(folder, tmp_path):
     assert np.diff(middles).min() > 5.0
 
 
+def test_frames_of_the_training_take_their_codes(folder, tmp_path):
+    _, null = film(folder, tmp_path / "a")
+    _, trained = film(folder, tmp_path / "b", codes="trained")
+    differs = [int(np.abs(a.astype(int) - b).max()) for a, b in zip(null, trained, strict=True)]
+    # The doll has codes of its first three frames; its null code is the first one's.
+    assert min(differs[1:3]) >= 2 and differs[0] == max(differs[3:]) == 0
+    _, some = film(folder, tmp_path / "c", codes="trained", start=2, stop=4)
+    _, plain = film(folder, tmp_path / "d", start=2, stop=4)
+    later = [int(np.abs(a.astype(int) - b).max()) for a, b in zip(some, plain, strict=True)]
+    assert later[0] >= 2 and later[1] == 0
+    for wrong in ({"interpolate": 40.0}, {"source": "run"}):
+        with pytest.raises(InputError, match="codes"):
+            film(folder, tmp_path / "e", codes="trained", **wrong)
+    write_dressed(tmp_path)
+    with pytest.raises(InputError, match="cloth skin"):
+        Animate(tmp_path / "me.avatar", folder / "motion.npz", tmp_path / "f", codes="trained", json=True).run()
+
+
 def test_another_light(folder, tmp_path):
     """A lamp to the person's left, which is on the picture's right: that side brightens, the other darkens."""
     lamp = np.exp(4.0 * (panorama_directions(16, 32) @ [1.0, 0.0, 0.0] - 1.0))[..., None] * np.ones(3)
