@@ -194,6 +194,13 @@ PARTS = (
         FOLLOWED + "Every training frame, every second and every third one, photographs as they are.",
     ),
     Part(
+        "followed_surface_patterns",
+        "The same, by the skirt's pattern",
+        FOLLOWED
+        + "Every second training frame, ten a second; the skirt repainted with the help of the truth. Points of "
+        "plain cloth, and of stripes along them, slide where photographs do not show it.",
+    ),
+    Part(
         "loose_cloth_woman_casual",
         "Loose clothes in motion that training did not show, a synthetic woman",
         "The long skirt of `woman_casual`, mm over all 12 held-out frames; exact "

@@ -13,6 +13,8 @@ const LONGEST_STEP = 0.26, RAMP = 0.7, HOLD = 0.2, RAMP_STEP = 1 / 30;
 const TELEPORT = 12;
 /** Metres of the root from what places are measured from, beyond which that follows it. */
 const FAR = 4;
+/** Metres from where what holds the cloth was at the last cold start, within which that start serves again. */
+const AGAIN = 0.06;
 /** Of a blend of rotations; below, its inverse blows up what the cloth did. */
 const LEAST_DETERMINANT = 0.2;
 /** Seconds between pictures beyond which a motion is not followed. */
@@ -39,6 +41,8 @@ export class ClothDriver {
   /** What places are measured from: near the person, so that float32 knows micrometres wherever that stands. */
   private origin = [0, 0, 0];
   private last: Pose | null = null;
+  /** Goes back to the end of the last cold start. */
+  private begun: (() => void) | null = null;
 
   constructor(private readonly deformer: Deformer, garments: readonly Garment[], private readonly start: Start = { ramp: RAMP, hold: HOLD }) {
     const { native, avatar: { mesh, gaussians } } = deformer, V = mesh.vertices.length / 3;
@@ -97,6 +101,7 @@ export class ClothDriver {
 
   /** Comes to a first pose from the reference pose, where the cloth hangs as it was scanned. */
   private begin(pose: Pose): void {
+    if (this.again(pose)) return;
     const start = facingAs(this.threads[0].garment.reference, pose);
     const steps = Math.round(this.start.ramp / RAMP_STEP), still = Math.round(this.start.hold / RAMP_STEP);
     this.origin = this.root(pose);
@@ -107,6 +112,20 @@ export class ClothDriver {
       this.advance(between(start, pose, t * t * (3 - 2 * t)), RAMP_STEP, true);
     }
     for (let k = 0; k < still + Math.min(steps, 1); ++k) this.advance(pose, RAMP_STEP, true);
+    const { origin } = this, back = this.threads.map((thread) => thread.kept());
+    this.begun = () => {
+      this.origin = origin;
+      for (const one of back) one();
+    };
+  }
+
+  /** Starts as the last time, where the pose is nearly that of then: a motion that is played in a loop does not halt. */
+  private again(pose: Pose): boolean {
+    if (!this.begun) return false;
+    this.begun();
+    this.joints(pose);
+    if (this.rows.some(({ particles }, k) => this.threads[k].wayTo(this.places(particles)) > AGAIN)) return false;
+    return this.advance(pose, RAMP_STEP, true);
   }
 
   /** Moves all garments on to a pose; false, and nothing moved, where what holds them went too fast. */

@@ -41,6 +41,14 @@ class Moments {
     this.known = 2;
   }
 
+  kept(): () => void {
+    const { known } = this, copies = this.blocks.map(({ view }) => view.slice());
+    return () => {
+      this.known = known;
+      copies.forEach((copy, k) => this.blocks[k].view.set(copy));
+    };
+  }
+
   shift(by: readonly number[]): void {
     for (const { view } of this.blocks) for (let i = 0; i < view.length; ++i) view[i] += by[i % 3];
   }
@@ -125,6 +133,16 @@ export class GarmentThread {
     this.normals.view.set(embedding.normals);
     this.native.run("cloth_push_out", BigInt(vertices.length), this.carried, this.normals, BigInt(collider.vertices.length),
       this.surfaces.blocks[2], this.colliderFaces, BigInt(collider.faces.length / 3), FINE_MARGIN, this.deepest);
+  }
+
+  /** Remembers the garment as it is; what it returns brings it back to that. */
+  kept(): () => void {
+    const back = [this.places.kept(), this.surfaces.kept()];
+    const copies = [this.position, this.velocity].map((block) => [block, block.view.slice()] as const);
+    return () => {
+      for (const one of back) one();
+      for (const [block, copy] of copies) block.view.set(copy);
+    };
   }
 
   /** Moves all that is remembered, metres. */
