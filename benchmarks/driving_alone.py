@@ -11,6 +11,7 @@ already (a label that is wrong, a body of another shape), the error says it.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import warnings
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.capture_truth import find_captures
-from benchmarks.machine import store_results
+from benchmarks.machine import RESULTS, store_results
 from pipelines.commands.build import Build
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.artefacts import load_params_of_run
@@ -54,19 +55,24 @@ class DrivingAlone:
     """Those that are measured; all by default."""
     keep: OptionalPath = None
     """Folder of the runs, which are not built again where they stand; a temporary one by default."""
+    builds: tuple[str, ...] = ()
+    """These of the three builds, as the table calls them; the others' rows stay as they are stored. All by default."""
     store: bool = True
     """Write benchmarks/results/driving_alone.json."""
 
     def run(self) -> None:
         """Print and store the figures."""
-        figures: dict[str, dict] = {}
+        stored = RESULTS / "driving_alone.json"
+        figures: dict[str, dict] = json.loads(stored.read_text())["figures"] if self.builds else {}
         with tempfile.TemporaryDirectory() as scratch:
             for folder in find_captures(self.captures):
                 if self.names and folder.name not in self.names:
                     continue
                 truth = _Truth.of(folder)
-                rows = {}
+                rows = figures.get(folder.name, {})
                 for words, build in _builds(folder, (self.keep or Path(scratch)) / folder.name).items():
+                    if self.builds and words not in self.builds:
+                        continue
                     build.run()
                     rows[words] = truth.errors(build.out)
                 figures[folder.name] = rows
