@@ -74,6 +74,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Animate",
         "show a template or a trained student moving: MP4, GIF, PNG frames or an animated GLB",
     ),
+    "talk": (
+        "pipelines.commands.talk",
+        "Talk",
+        "an avatar that says a text or a recording: a film with sound, or the motion",
+    ),
     "export": (
         "pipelines.commands.export",
         "Export",

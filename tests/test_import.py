@@ -31,7 +31,7 @@ STAGES = {
 # Rooms from low to high: an import goes down, never up and never to a room of the same floor.
 FLOORS: dict[str, tuple[set[str], ...]] = {
     "avatar": (
-        {"gaussians", "reconstruct", "runtime"},
+        {"gaussians", "reconstruct", "runtime", "speech"},
         {"formats"},
         {"rig"},
         {"data"},

@@ -36,6 +36,7 @@ class StudentFilm:
         numbered_from: number of the motion's first frame, where its frames are the training's: those that have a code
             take it; None: the null code.
         relighting: the light that the person is shown in; None: that of the capture.
+        below: metres below the highest point that the picture shows; None: the whole person.
     """
 
     view: str
@@ -45,6 +46,7 @@ class StudentFilm:
     clamp: bool
     numbered_from: int | None = None
     relighting: Relighting | None = None
+    below: float | None = None
 
 
 def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
@@ -103,6 +105,8 @@ def student_frames(
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
     some = spread(range(len(params)), _FRAMING_POSES)
     points = np.concatenate([player.pose(params.frame(k)).means.astype(np.float64) for k in some])
+    if film.below is not None:
+        points = points[points[:, 1] > points[:, 1].max() - film.below]
     height = film.height + film.height % 2  # h264 with 4:2:0 colour takes even sizes
     width = None if film.width is None else film.width + film.width % 2
     if film.view == "turntable":

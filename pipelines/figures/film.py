@@ -18,35 +18,59 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import encode_png
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
+from smplxpp.core.files.wave_file import Sound, wave_bytes
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)
 
 
-def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps: float, size: tuple[int, int]) -> None:
+def write_film(
+    path: Path,
+    frames: Iterable[UInt8[np.ndarray, "H W 3"]],
+    *,
+    fps: float,
+    size: tuple[int, int],
+    sound: Sound | None = None,
+) -> None:
     """Write frames as the kind of film that the suffix of `path` names.
 
     Args:
-        size: width and height in pixels, even for MP4.
+        size: width and height in pixels, even for MP4. sound: from the first frame on; an MP4 alone takes it.
 
     Raises:
+        InputError: sound for another kind of film.
         MissingExtraError: MP4 without imageio-ffmpeg.
         OSError: the film could not be written whole.
     """
+    if sound is not None and path.suffix.lower() != ".mp4":
+        raise InputError(f"output {path}", expected=".mp4 for a film with sound", received=path.suffix or "a folder")
+    if sound is not None:
+        _write_mp4(path, frames, fps, size, sound)
+        return
     writer = {".mp4": _write_mp4, ".gif": _write_gif, FRAME_FOLDER: _write_folder}[path.suffix.lower()]
     writer(path, frames, fps, size)
 
 
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple[int, int]) -> None:
+def _write_mp4(
+    path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple[int, int], sound: Sound | None = None
+) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
         raise MissingExtraError("imageio-ffmpeg", extra="video", purpose="writing MP4") from None
     program = imageio_ffmpeg.get_ffmpeg_exe()
-    with atomic_path(path) as temporary, tempfile.TemporaryFile() as said:
-        encoder = subprocess.Popen(_encoding(program, temporary, fps, size), stdin=subprocess.PIPE, stderr=said)
+    with (
+        atomic_path(path) as temporary,
+        tempfile.TemporaryFile() as said,
+        tempfile.NamedTemporaryFile(suffix=".wav") as heard,
+    ):
+        if sound is not None:
+            heard.write(wave_bytes(sound))
+            heard.flush()
+        audio = None if sound is None else Path(heard.name)
+        encoder = subprocess.Popen(_encoding(program, temporary, fps, size, audio), stdin=subprocess.PIPE, stderr=said)
         count = 0
         assert encoder.stdin is not None  # a pipe was asked for
         try:
@@ -69,12 +93,15 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple
             raise _encoder_error(encoder.returncode, words)
 
 
-def _encoding(program: str, path: Path, fps: float, size: tuple[int, int]) -> list[str]:
+def _encoding(program: str, path: Path, fps: float, size: tuple[int, int], sound: Path | None = None) -> list[str]:
     """Return the command that reads RGB frames and writes H.264 with 4:2:0 colour, which every player takes."""
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}"]
     raw += ["-r", str(Fraction(fps).limit_denominator())]
     codec = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "medium", "-movflags", "+faststart"]
-    return [program, "-nostdin", "-y", "-v", "error", *raw, "-i", "pipe:0", "-an", *codec, str(path)]
+    audio = (
+        ["-an"] if sound is None else ["-i", str(sound), "-map", "0:v", "-map", "1:a", "-acodec", "aac", "-b:a", "128k"]
+    )
+    return [program, "-nostdin", "-y", "-v", "error", *raw, "-i", "pipe:0", *audio, *codec, str(path)]
 
 
 def _encoder_error(status: int, words: str) -> OSError:

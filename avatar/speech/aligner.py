@@ -1,0 +1,103 @@
+"""Sound to phonemes in time by pocketsphinx: the words recognised or given, then their phones aligned."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
+from avatar.speech.text import EXTRA, checked_text, phones_of, words_of
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.files.wave_file import Sound
+
+_RATE = 16_000
+_FRAME = 0.01  # seconds
+_QUIET = 1e-3  # of full scale: nobody speaks
+_LONGEST = 1200.0  # seconds
+_LOUD = 0.1  # root mean square that the recogniser is given
+_SHORTEST = 0.1  # seconds
+
+
+def align(sound: Sound, text: str | None = None) -> Speech:
+    """Return the phonemes of a recording of English.
+
+    Args:
+        text: what is said in it; None: recognised.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+        InputError: silence, no words in it, a text that it does not say, more than 20 minutes.
+    """
+    seconds, level = sound.seconds, float(np.sqrt(np.mean(np.square(sound.samples)))) if len(sound.samples) else 0.0
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise InputError("sound", expected=f"{_SHORTEST:g} to {_LONGEST:g} seconds", received=f"{seconds:.2f}")
+    if level < _QUIET:
+        raise InputError("sound", expected="somebody who speaks", received="silence")
+    try:
+        import pocketsphinx
+    except ImportError:
+        raise MissingExtraError("pocketsphinx", extra=EXTRA, purpose="phonemes of a recording") from None
+    samples = sound.at_rate(_RATE)
+    data = Sound(samples.samples * np.float32(_LOUD / level), _RATE).integers().tobytes()
+    decoder = pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
+    words = _recognised(decoder, data) if text is None else words_of(checked_text(text))
+    for word in dict.fromkeys(words):
+        if decoder.lookup_word(word) is None:
+            decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_of(word)[0]), True)
+    found = _aligned(decoder, data, words)
+    if found is None:
+        raise InputError(
+            "sound",
+            expected="English speech that can be aligned" if text is None else "what the text says",
+            received="something else",
+            remedy="give what is said in it as --text" if text is None else "leave --text away: it is recognised then",
+        )
+    return Speech(tuple(_clipped(found, seconds)), seconds)
+
+
+def _recognised(decoder: Any, data: bytes) -> list[str]:
+    _heard(decoder, data)
+    words = [one.word.split("(")[0] for one in decoder.seg() or ()]
+    words = [word for word in words if word[0] not in "<["]
+    if not words:
+        raise InputError(
+            "sound",
+            expected="words of English",
+            received="none that the recogniser knows (music, noise or another language)",
+            remedy="give what is said in it as --text",
+        )
+    return words
+
+
+def _heard(decoder: Any, data: bytes) -> None:
+    decoder.start_utt()
+    decoder.process_raw(data, full_utt=True)
+    decoder.end_utt()
+
+
+def _aligned(decoder: Any, data: bytes, words: list[str]) -> list[Phoneme] | None:
+    """Two passes: the words' times, then those of the phones within; None where they do not fit the sound."""
+    try:
+        decoder.set_align_text(" ".join(words))
+        _heard(decoder, data)
+        decoder.set_alignment()
+        _heard(decoder, data)
+        alignment = decoder.get_alignment()
+    except RuntimeError:
+        return None
+    if alignment is None:
+        return None
+    out = []
+    for word in alignment:
+        for phone in word:
+            known = phone.name in VOWELS | CONSONANTS
+            start = phone.start * _FRAME
+            out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * _FRAME))
+    return out
+
+
+def _clipped(phonemes: list[Phoneme], seconds: float) -> list[Phoneme]:
+    """Phonemes within the sound: the last frame may end behind it."""
+    held = [Phoneme(one.name, one.start, min(one.end, seconds)) for one in phonemes]
+    return [one for one in held if one.end > one.start]

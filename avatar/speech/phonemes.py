@@ -1,0 +1,109 @@
+"""Phonemes in time: what every engine gives, and what the mouth is moved by. Names are ARPAbet's, without stress."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from smplxpp.core.errors import InputError
+
+SILENCE = "SIL"
+VOWELS = frozenset(("AA", "AE", "AH", "AO", "AW", "AY", "EH", "ER", "EY", "IH", "IY", "OW", "OY", "UH", "UW"))
+CONSONANTS = frozenset(
+    (
+        *("B", "CH", "D", "DH", "F", "G", "HH", "JH", "K", "L", "M", "N"),
+        *("NG", "P", "R", "S", "SH", "T", "TH", "V", "W", "Y", "Z", "ZH"),
+    )
+)
+BILABIALS = frozenset(("P", "B", "M"))
+"""The lips close for them."""
+LABIODENTALS = frozenset(("F", "V"))
+"""The lower lip meets the upper teeth for them."""
+
+# IPA as espeak-ng and Piper write English, and the nearest sounds of other languages; longer symbols first.
+_IPA = {
+    **{"aɪ": "AY", "aʊ": "AW", "eɪ": "EY", "oʊ": "OW", "əʊ": "OW", "ɔɪ": "OY", "tʃ": "CH", "dʒ": "JH"},
+    **{"ɑ": "AA", "a": "AA", "ɐ": "AH", "ɒ": "AO", "æ": "AE", "ʌ": "AH", "ə": "AH", "ɔ": "AO", "ɛ": "EH", "e": "EY"},
+    **{"ɜ": "ER", "ɝ": "ER", "ɚ": "ER", "ɪ": "IH", "i": "IY", "ᵻ": "IH", "ɨ": "IH", "o": "OW", "ʊ": "UH", "u": "UW"},
+    **{"y": "UW", "ø": "UH", "œ": "ER", "b": "B", "d": "D", "ð": "DH", "f": "F", "ɡ": "G", "g": "G", "h": "HH"},
+    **{"x": "HH", "ç": "HH", "k": "K", "c": "K", "l": "L", "ɫ": "L", "m": "M", "n": "N", "ɲ": "N", "ŋ": "NG", "p": "P"},
+    **{"ɹ": "R", "r": "R", "ʁ": "R", "s": "S", "ʃ": "SH", "t": "T", "ɾ": "D", "θ": "TH", "v": "V", "β": "V"},
+    **{"w": "W", "j": "Y", "z": "Z", "ʒ": "ZH"},
+}
+_TO_IPA = {
+    **{"AA": "ɑː", "AE": "æ", "AH": "ʌ", "AO": "ɔː", "AW": "aʊ", "AY": "aɪ", "EH": "ɛ", "ER": "ɜː", "EY": "eɪ"},
+    **{"IH": "ɪ", "IY": "iː", "OW": "oʊ", "OY": "ɔɪ", "UH": "ʊ", "UW": "uː", "B": "b", "CH": "tʃ", "D": "d"},
+    **{"DH": "ð", "F": "f", "G": "ɡ", "HH": "h", "JH": "dʒ", "K": "k", "L": "l", "M": "m", "N": "n", "NG": "ŋ"},
+    **{"P": "p", "R": "ɹ", "S": "s", "SH": "ʃ", "T": "t", "TH": "θ", "V": "v", "W": "w", "Y": "j", "Z": "z"},
+    "ZH": "ʒ",
+}
+_UNSTRESSED = {"AH": "ə", "ER": "ɚ", "IY": "i"}  # as espeak-ng writes these vowels without stress
+
+
+@dataclass(frozen=True)
+class Phoneme:
+    """One sound.
+
+    Attributes:
+        name: ARPAbet without stress, or `SILENCE`. start, end: seconds.
+    """
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Speech:
+    """What is said, in time.
+
+    Attributes:
+        phonemes: in order; where there is none it is silent.
+        seconds: how long the sound is.
+
+    Raises:
+        InputError: phonemes that are not known, run backwards, overlap or leave the sound.
+    """
+
+    phonemes: tuple[Phoneme, ...]
+    seconds: float
+
+    def __post_init__(self) -> None:
+        last = 0.0
+        for k, one in enumerate(self.phonemes):
+            if one.name not in VOWELS | CONSONANTS | {SILENCE}:
+                raise InputError(f"phoneme {k}", expected="ARPAbet without stress, or SIL", received=repr(one.name))
+            if not last - 1e-6 <= one.start < one.end <= self.seconds + 1e-6:
+                raise InputError(
+                    f"phoneme {k} ({one.name})",
+                    expected=f"times in order within {last:.3f} to {self.seconds:.3f} s",
+                    received=f"{one.start:.3f} to {one.end:.3f}",
+                )
+            last = one.end
+
+    @property
+    def spoken(self) -> tuple[Phoneme, ...]:
+        """The phonemes that are no silence."""
+        return tuple(one for one in self.phonemes if one.name != SILENCE)
+
+
+def arpabet_from_ipa(text: str, at: int) -> tuple[str, int]:
+    """Return the sound that stands at a place of an IPA text, and how many characters it takes.
+
+    A mark (length, stress, tie) or a sound that is not known is "" of one character.
+    """
+    for length in (2, 1):
+        name = _IPA.get(text[at : at + length])
+        if name is not None:
+            return name, length
+    return "", 1
+
+
+def ipa_from_arpabet(phones: Sequence[str]) -> str:
+    """Write a word's ARPAbet phones, with or without stress digits, in IPA as espeak-ng does."""
+    out = ""
+    for phone in phones:
+        name, stress = phone.rstrip("012"), phone[-1:]
+        mark = {"1": "ˈ", "2": "ˌ"}.get(stress, "")
+        out += mark + (_UNSTRESSED.get(name, _TO_IPA[name]) if stress == "0" else _TO_IPA[name])
+    return out

