@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from avatar.speech.phonemes import BILABIALS, LABIODENTALS, SILENCE, Phoneme, Speech
 
 ARTICULATORS = ("jaw", "press", "tuck", "round", "spread", "bare")
-"""The jaw hangs, lips are pressed together, the lower lip is under the teeth, lips round, spread, teeth bare: 0 to 1."""
+"""Jaw hanging, lips pressed together, lower lip under the teeth, lips rounded, spread, teeth bared: 0 to 1."""
 _JAW, _PRESS, _TUCK = (ARTICULATORS.index(name) for name in ("jaw", "press", "tuck"))
 
 # Articulator -> (target, dominance). What is not named is left to the neighbours.
