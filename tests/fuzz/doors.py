@@ -23,6 +23,7 @@ from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.hdr_file import read_radiance
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
+from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
@@ -37,6 +38,7 @@ from tests.capture.scene import make_scene
 from tests.capture.test_readers import CAMERA_NAMES
 from tests.capture.writers import WRITERS
 from tests.core.files.radiance import write_radiance
+from tests.core.files.test_wave_file import coded, file_of
 from tests.fuzz.examine import Door
 from tests.fuzz.run_doors import run_doors
 
@@ -317,6 +319,20 @@ def _light_doors() -> list[Door]:
     ]
 
 
+def _sound_doors() -> list[Door]:
+    """Recordings in 16-bit integers, and in floats of two channels."""
+    samples = 0.5 * np.sin(np.arange(400) * 0.2).astype(np.float32)
+    stereo = file_of(coded(np.repeat(samples, 2), 3, 32), 3, 32, channels=2)
+    return [
+        Door(
+            f"sound {kind}",
+            lambda folder, data=data: (folder / "x.wav").write_bytes(data),
+            lambda folder: read_wave(folder / "x.wav").at_rate(8000),
+        )
+        for kind, data in (("integers", wave_bytes(Sound(samples, 16_000))), ("floats", stereo))
+    ]
+
+
 def _image_doors() -> list[Door]:
     noise = np.random.default_rng(3).integers(0, 255, (24, 20, 4)).astype(np.uint8)
 
@@ -391,6 +407,7 @@ def doors() -> dict[str, Door]:
         + _hand_doors()
         + _image_doors()
         + _light_doors()
+        + _sound_doors()
         + _motion_doors()
         + _detector_doors()
         + _basic_doors()
