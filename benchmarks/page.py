@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import RESULTS
-from benchmarks.page_parts import DISTILLATION, PARTS, part_of
+from benchmarks.page_parts import PARTS, part_of
+from benchmarks.page_words import DISTILLATION
 from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.files.atomic import atomic_write_text
 

@@ -8,54 +8,22 @@ from typing import Any
 
 from benchmarks.page_tables import reconstruction_lines, registration_lines, tables_of
 from benchmarks.page_trainings import ablation_lines, build_lines, training_lines
+from benchmarks.page_words import (
+    DETECTION,
+    EVERY_FOURTH,
+    EVERY_FRAME,
+    FOLLOWED,
+    MASKS,
+    MOTION_CODES,
+    PERSON,
+    RECIPE,
+    RECONSTRUCTION,
+    REGISTRATION,
+    TALKING,
+    TRACKED_INPUTS,
+    WOMAN,
+)
 from smplxpp.capture.protocols import TRACKED
-
-WOMAN = (
-    "Synthetic capture `woman_casual`: 14 cameras of 384x640 and 60 frames; 12 cameras and 48 frames are trained on, "
-    "2 cameras and 12 frames are held out. All inputs are exact: parameters, cameras, labels and normal maps are the "
-    "true ones. The preset `cpu` is a lean one: student and teacher learn from photographs and from a tracked surface."
-)
-EVERY_FRAME = (
-    " Measured on every held-out frame of every held-out camera: 96 images carry the novel views, 24 the novel poses. "
-    "The capture does not say what its inputs are, so that the stored words on them are `not known`. "
-)
-EVERY_FOURTH = (
-    " Measured on every fourth frame: 24 images carry the novel views (12 frames of 2 cameras), 6 the novel poses "
-    "(3 frames of 2 cameras); surfaces are those of 12 training frames and of 3 held-out ones. No spread was stored. "
-)
-TALKING = (
-    "Synthetic capture of `smplxpp synth --motion talking --frames 400`: 8 cameras of 384x640 and 480x480, one of them "
-    "held out, 320 frames at 10 a second for training and the last 80 held out, half-loose shirt over tight trousers; "
-    "exact inputs. Every fourth training frame was trained on and followed, 80 in all. "
-)
-MOTION_CODES = (
-    "Vertexwise distances of the template's parts in mm, P2S where it is written, of the held-out frames; in lists one "
-    "number for each block of training frames that was left out. Predictors learn the followed surface, rows that say "
-    "so the true one. Seconds of CPU, measuring included. One seed; fields learned in 300 steps at 2e-3 on the talking "
-    "person, where half of them died at 5e-3 (nothing but zeros), and in 400 steps at 5e-3 on the woman."
-)
-FOLLOWED = (
-    "The long skirt of `woman_casual` followed by the tracking of `cpu` from her exact poses, with simulated cloth to "
-    "foresee it. Vertexwise: mm to where the same points truly are, mean and 95th percentile. `psnr`: the reference "
-    "fit's Gaussians in held-out cameras. The machine was busy: seconds a frame are of the wall, and upper bounds. "
-)
-PERSON = (
-    "The embedded person (`data/fixtures/person`): 8 cameras of 256x320 and 240x240, 16 frames; one camera and 3 "
-    "frames are held out. All inputs are exact, as above. Preset `demo`, 22k Gaussians, lean as `cpu` is. No "
-    "perceptual distance was measured; the surface of a single held-out frame is known."
-)
-TRACKED_INPUTS = (
-    "**Nothing here is exact**: body parameters as a tracker gives them, estimated labels, normals estimated or none, "
-    "as the words below say."
-)
-DISTILLATION = (
-    "The paper's own distillation, in which the student learns from the teacher's images, with L_non to the teacher "
-    "and with L_sem, is behind the figures of `paper-small` alone; the preset `paper` was never trained by us."
-)
-RECIPE = (
-    "No surface is followed and no cloth simulated. The machine was shared: minutes are upper bounds. The perceptual "
-    "distance is ST-LPIPS, which is not LPIPS."
-)
 
 
 @dataclass(frozen=True)
@@ -74,54 +42,31 @@ class Part:
     lines: Callable[[Any], list[str]] = tables_of
 
 
-_REGISTRATION = (
-    "A synthetic capture as trackers give it (`smplxpp capture degrade`): keypoints with 3 px of noise (an image 640 "
-    "high), 5 % outliers and 10 % missing, parameters 1.5 degrees a joint and 8 mm off, label maps with 5 % of wrong "
-    "pixels, scans of training frames where the capture has them. Errors of the naked body against the exact "
-    "parameters; `one scan, symmetric` attracts all of the scan and the body to each other. "
-)
-_DETECTION = (
-    "Keypoints by MediaPipe 0.10.21 in the photographs of the training cameras (synthetic people on black), within the "
-    "boxes of the true masks; points with a confidence of 0.5. Errors include what MediaPipe and the body call by one "
-    "name and mean differently (hips, ears, toes: one to three centimetres). `registered`: the body fitted to these "
-    "keypoints, with the true masks and without, from nothing else: no scan, no label map, no fit to start from. "
-)
-_MASKS = (
-    "Intersection over union with the true mask. The people are put before made rooms with noise, a shadow on the "
-    "floor and an exposure 4 % below the plates'; three plates a camera, or one. No real photographs. "
-)
-_RECONSTRUCTION = (
-    "Photographs, cameras and masks of frame 0 alone; the truth is looked at in measuring. P2S in mm from the "
-    "reconstruction to the true outer surface, air under the skirt included; completeness in mm from what two of the "
-    "cameras see of the truth. Estimated masks: every other one grown, the rest shrunk by 2 pixels, one of the "
-    "background, one shifted by 12 % of the image. Seconds were taken on a machine with six times as much work as it "
-    "has cores; CPU seconds are the measure. "
-)
 PARTS = (
     Part(
         "reconstruction_woman_casual",
         "Reconstruction of a woman in a wide skirt",
-        _RECONSTRUCTION + "14 cameras of 384x640 and 384x384, 12 of them trained on.",
+        RECONSTRUCTION + "14 cameras of 384x640 and 384x384, 12 of them trained on.",
         reconstruction_lines,
     ),
     Part(
         "reconstruction_synth24",
         "Reconstruction of the embedded person from 24 views of 1024 pixels",
-        _RECONSTRUCTION + "`smplxpp synth --cameras 24 --size 1024 --frames 2`; 20 cameras are trained on.",
+        RECONSTRUCTION + "`smplxpp synth --cameras 24 --size 1024 --frames 2`; 20 cameras are trained on.",
         reconstruction_lines,
     ),
     Part(
         "reconstruction_person",
         "Reconstruction of the embedded person from her fixture",
-        _RECONSTRUCTION + "8 cameras of 256x320 and 240x240, five of them around the body and two of its face trained "
+        RECONSTRUCTION + "8 cameras of 256x320 and 240x240, five of them around the body and two of its face trained "
         "on: with two wrong masks, which are named, three are left around the body, and what they give is no person.",
         reconstruction_lines,
     ),
-    Part("registration_woman_casual", "Registration of a woman in a wide skirt", _REGISTRATION, registration_lines),
-    Part("registration_man_casual", "Registration of a man", _REGISTRATION + "One frame.", registration_lines),
-    Part("registration_person", "Registration of the embedded person", _REGISTRATION, registration_lines),
-    Part("detection_woman_casual", "Detected keypoints of a woman in a wide skirt", _DETECTION),
-    Part("detection_person", "Detected keypoints of the embedded person", _DETECTION),
+    Part("registration_woman_casual", "Registration of a woman in a wide skirt", REGISTRATION, registration_lines),
+    Part("registration_man_casual", "Registration of a man", REGISTRATION + "One frame.", registration_lines),
+    Part("registration_person", "Registration of the embedded person", REGISTRATION, registration_lines),
+    Part("detection_woman_casual", "Detected keypoints of a woman in a wide skirt", DETECTION),
+    Part("detection_person", "Detected keypoints of the embedded person", DETECTION),
     Part(
         "detection_scans",
         "Landmarks of bare scans",
@@ -129,8 +74,8 @@ PARTS = (
         "procedural people; drawn from twelve sides, detected by MediaPipe, triangulated. Medians of a person's points "
         "in mm, against the true body's; how far the facing is off, in degrees. Seconds on a busy machine.",
     ),
-    Part("detection_masks_woman_casual", "Masks of a woman in a wide skirt", _MASKS),
-    Part("detection_masks_person", "Masks of the embedded person", _MASKS),
+    Part("detection_masks_woman_casual", "Masks of a woman in a wide skirt", MASKS),
+    Part("detection_masks_person", "Masks of the embedded person", MASKS),
     Part(
         "ablation_woman_casual_every_frame",
         "Full against trained skinning on a synthetic woman",
