@@ -12,24 +12,18 @@ import numpy as np
 from PIL import Image
 
 from pipelines.captures.detect_keypoints import standing_rows
-from smplxpp.body import load_body, load_params
-from smplxpp.body.bvh_params import load_bvh, read_joint_map
-from smplxpp.body.retarget import Skeleton
+from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.images import read_alpha, read_color, read_normals
 from smplxpp.capture.images import read_labels as read_label_image
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
-from smplxpp.core.files.hdr_file import read_radiance
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
-from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
-from smplxpp.core.light import Irradiance
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
-from smplxpp.export.bvh import write_bvh
 from smplxpp.register.landmark_file import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels
@@ -37,9 +31,8 @@ from smplxpp.segment.labels import find_label_set
 from tests.capture.scene import make_scene
 from tests.capture.test_readers import CAMERA_NAMES
 from tests.capture.writers import WRITERS
-from tests.core.files.radiance import write_radiance
-from tests.core.files.test_wave_file import coded, file_of
 from tests.fuzz.examine import Door
+from tests.fuzz.motion_light_sound import light_doors, motion_doors, sound_doors
 from tests.fuzz.run_doors import run_doors
 
 _FRAMES = 3
@@ -289,50 +282,6 @@ def _hand_doors() -> list[Door]:
     ]
 
 
-def _motion_doors() -> list[Door]:
-    """A skeleton of another program with its motion, and names for its joints."""
-    body = load_body()
-    names = {"Hips": "pelvis", "LeftUpLeg": "left_hip"}
-    return [
-        Door(
-            "motion bvh",
-            lambda folder: write_bvh(folder / "m.bvh", body, BodyParams.rest(betas=0, expressions=0)),
-            lambda folder: load_bvh(folder / "m.bvh", Skeleton.of(body)),
-        ),
-        Door("joint map", lambda f: _write_json(f / "m.json", names), lambda f: read_joint_map(f / "m.json")),
-    ]
-
-
-def _light_doors() -> list[Door]:
-    """Panoramas, with flat rows and with packed ones."""
-
-    def write(path: Path, packed: bool) -> None:
-        write_radiance(path, np.random.default_rng(1).uniform(0.0, 5.0, (9, 18, 3)), packed=packed)
-
-    return [
-        Door(
-            f"panorama {kind}",
-            lambda folder, kind=kind: write(folder / "x.hdr", kind == "packed"),
-            lambda folder: Irradiance.of_environment(read_radiance(folder / "x.hdr")),
-        )
-        for kind in ("flat", "packed")
-    ]
-
-
-def _sound_doors() -> list[Door]:
-    """Recordings in 16-bit integers, and in floats of two channels."""
-    samples = 0.5 * np.sin(np.arange(400) * 0.2).astype(np.float32)
-    stereo = file_of(coded(np.repeat(samples, 2), 3, 32), 3, 32, channels=2)
-    return [
-        Door(
-            f"sound {kind}",
-            lambda folder, data=data: (folder / "x.wav").write_bytes(data),
-            lambda folder: read_wave(folder / "x.wav").at_rate(8000),
-        )
-        for kind, data in (("integers", wave_bytes(Sound(samples, 16_000))), ("floats", stereo))
-    ]
-
-
 def _image_doors() -> list[Door]:
     noise = np.random.default_rng(3).integers(0, 255, (24, 20, 4)).astype(np.uint8)
 
@@ -406,9 +355,9 @@ def doors() -> dict[str, Door]:
         + _label_doors()
         + _hand_doors()
         + _image_doors()
-        + _light_doors()
-        + _sound_doors()
-        + _motion_doors()
+        + motion_doors()
+        + light_doors()
+        + sound_doors()
         + _detector_doors()
         + _basic_doors()
     )

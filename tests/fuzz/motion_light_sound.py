@@ -1,0 +1,66 @@
+"""The doors of an avatar in use: motions of other programs, panoramas, recordings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.body import load_body
+from smplxpp.body.bvh_params import load_bvh, read_joint_map
+from smplxpp.body.retarget import Skeleton
+from smplxpp.core.files.hdr_file import read_radiance
+from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.light import Irradiance
+from smplxpp.core.params import BodyParams
+from smplxpp.export.bvh import write_bvh
+from tests.core.files.radiance import write_radiance
+from tests.core.files.test_wave_file import coded, file_of
+from tests.fuzz.examine import Door
+
+
+def motion_doors() -> list[Door]:
+    """A skeleton of another program with its motion, and names for its joints."""
+    body = load_body()
+    names = {"Hips": "pelvis", "LeftUpLeg": "left_hip"}
+    return [
+        Door(
+            "motion bvh",
+            lambda folder: write_bvh(folder / "m.bvh", body, BodyParams.rest(betas=0, expressions=0)),
+            lambda folder: load_bvh(folder / "m.bvh", Skeleton.of(body)),
+        ),
+        Door(
+            "joint map", lambda f: (f / "m.json").write_text(json.dumps(names)), lambda f: read_joint_map(f / "m.json")
+        ),
+    ]
+
+
+def light_doors() -> list[Door]:
+    """Panoramas, with flat rows and with packed ones."""
+
+    def write(path: Path, packed: bool) -> None:
+        write_radiance(path, np.random.default_rng(1).uniform(0.0, 5.0, (9, 18, 3)), packed=packed)
+
+    return [
+        Door(
+            f"panorama {kind}",
+            lambda folder, kind=kind: write(folder / "x.hdr", kind == "packed"),
+            lambda folder: Irradiance.of_environment(read_radiance(folder / "x.hdr")),
+        )
+        for kind in ("flat", "packed")
+    ]
+
+
+def sound_doors() -> list[Door]:
+    """Recordings in 16-bit integers, and in floats of two channels."""
+    samples = 0.5 * np.sin(np.arange(400) * 0.2).astype(np.float32)
+    stereo = file_of(coded(np.repeat(samples, 2), 3, 32), 3, 32, channels=2)
+    return [
+        Door(
+            f"sound {kind}",
+            lambda folder, data=data: (folder / "x.wav").write_bytes(data),
+            lambda folder: read_wave(folder / "x.wav").at_rate(8000),
+        )
+        for kind, data in (("integers", wave_bytes(Sound(samples, 16_000))), ("floats", stereo))
+    ]
