@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ def unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians) -> Bool[T
     """Mark the Gaussians inside the mouth whose triangle nobody ahead of the head sees in any frame looked at."""
     rig = sequence.rig
     inside = inside_of_mouth(rig.template)
-    shown = inside & False
+    shown = np.zeros_like(inside)
     if inside.any():
         for frame in spread_inside(sequence.train_frames, LOOKED_AT):
             shown |= shown_mouth(rig.template, inside, rig.places(sequence.motion(frame).without_cloth()))
@@ -32,8 +33,8 @@ def unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians) -> Bool[T
 def hold_unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians, shapes: BlendShapes | None) -> None:
     """Let no gradient reach what `unseen_mouth` marks: attributes and blend shapes of these Gaussians.
 
-    Behind closed lips gradients are a thousandth of what they are in front, and Adam takes full steps along them:
-    teeth would drift to the colours of lips and into places where an open mouth shows them.
+    Behind closed lips gradients are tiny, and Adam takes full steps along them: teeth would drift to the colours of
+    lips and into places where an open mouth shows them.
     """
     learns = ~unseen_mouth(sequence, gaussians)
     if bool(learns.all()):
