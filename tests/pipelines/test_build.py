@@ -389,20 +389,3 @@ def test_captures_build_within_their_gates(captures, tmp_path, capsys, name, opt
     summary = json.loads(capsys.readouterr().out)
     assert summary["failed"] == 0, [c for c in summary["checks"] if c["status"] == "fail"]
     assert (tmp_path / "report.html").is_file()
-
-
-def test_the_frame_of_the_capture_is_kept_apart_from_the_row_of_a_file(tmp_path):
-    """Parameters of a frame alone are row 0 of their file; a training has to know which frame's photographs are its."""
-    capture = tmp_path / "capture"
-    (capture / "scans").mkdir(parents=True)
-    (capture / "params").mkdir()
-    for frame in (0, 8):
-        (capture / "scans" / f"scan_{frame:06d}.ply").touch()
-        (capture / "scans" / f"scan_{frame:06d}_labels.npz").touch()
-        (capture / "params" / f"{frame:06d}.npz").touch()
-    inputs = Build(out=tmp_path / "run", capture=capture, frame=8).inputs()
-    assert (inputs.frame, inputs.params_row, inputs.params.name) == (8, 0, "000008.npz")
-    save_build(tmp_path, inputs, BuildConfig())
-    assert load_build(tmp_path)[0].frame == 8
-    stacked = Build(out=tmp_path / "run", scan=inputs.scan, params=inputs.params, frame=8).inputs()
-    assert (stacked.frame, stacked.params_row) == (8, 8)

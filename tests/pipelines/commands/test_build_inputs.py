@@ -9,6 +9,7 @@ import pytest
 from pipelines.commands.build import Build
 from pipelines.commands.build_inputs import chosen_inputs, chosen_reconstruction, chosen_registration
 from pipelines.runs.layout import LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES, reconstructed_scan
+from pipelines.stages.build_config import BuildConfig, load_build, save_build
 from pipelines.stages.reconstruct_config import ReconstructInputs, save_reconstruct
 from smplxpp.core.errors import InputError
 
@@ -92,3 +93,20 @@ def test_options_of_a_capture_beside_a_scan(tmp_path):
     with pytest.raises(InputError, match="either --capture or --scan"):
         chosen_inputs(Build(out=tmp_path / "run"))
     assert not (tmp_path / "run").exists()
+
+
+def test_the_frame_of_the_capture_is_kept_apart_from_the_row_of_a_file(tmp_path):
+    """Parameters of a frame alone are row 0 of their file; a training has to know which frame's photographs are its."""
+    capture = tmp_path / "capture"
+    (capture / "scans").mkdir(parents=True)
+    (capture / "params").mkdir()
+    for frame in (0, 8):
+        (capture / "scans" / f"scan_{frame:06d}.ply").touch()
+        (capture / "scans" / f"scan_{frame:06d}_labels.npz").touch()
+        (capture / "params" / f"{frame:06d}.npz").touch()
+    inputs = Build(out=tmp_path / "run", capture=capture, frame=8).inputs()
+    assert (inputs.frame, inputs.params_row, inputs.params.name) == (8, 0, "000008.npz")
+    save_build(tmp_path, inputs, BuildConfig())
+    assert load_build(tmp_path)[0].frame == 8
+    stacked = Build(out=tmp_path / "run", scan=inputs.scan, params=inputs.params, frame=8).inputs()
+    assert (stacked.frame, stacked.params_row) == (8, 8)
