@@ -16,7 +16,7 @@ from avatar.export.bundle_numbers import Tensors, blended, halves, rounded, sign
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.networks.local_pose import BODY_JOINTS
 from avatar.models.student import Student
-from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, save_bundle
+from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, motion_tensors, save_bundle
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.garment_file import garments_to_arrays
 from smplxpp.core.params import BodyParams
@@ -105,10 +105,7 @@ def write_bundle(
     if extras.garments:
         pieces[GARMENTS] = _garments(extras.garments, cut)
     if extras.motion is not None:
-        stored = {
-            name: np.asarray(value, np.float32) for name, value in extras.motion.without_shape().as_dict().items()
-        }
-        pieces[MOTION] = (stored, {})
+        pieces[MOTION] = (motion_tensors(extras.motion), {})
     codes = student.codes
     about = AboutAvatar(
         name=extras.name,

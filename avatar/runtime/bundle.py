@@ -17,6 +17,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
 from smplxpp.core.files.package_file import read_package, write_package
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
+from smplxpp.core.params import BodyParams
 
 FORMAT, VERSION = "smplxpp-avatar", 1
 SUFFIX = ".avatar"
@@ -87,18 +88,36 @@ def save_bundle(
         Bytes of each piece in the file, and of all of it as "total".
     """
     data = {f"{name}.safetensors": pack_tensors(tensors, said) for name, (tensors, said) in pieces.items()}
-    manifest = {
-        "format": FORMAT,
-        "version": VERSION,
-        "model": asdict(about),
-        "pieces": {
-            file.split(".")[0]: {"file": file, "bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
-            for file, value in data.items()
-        },
-    }
-    text = json.dumps(manifest, indent=1).encode()
-    packed = write_package(path, {_MANIFEST: text, **data})
+    packed = write_package(path, {_MANIFEST: _manifest(asdict(about), data), **data})
     return {**{file.split(".")[0]: size for file, size in packed.items()}, "total": Path(path).stat().st_size}
+
+
+def save_with_motion(path: str | Path, bundle: str | Path, motion: BodyParams) -> None:
+    """Write a bundle's file anew with another motion to play, whole or not at all; all other pieces keep their bytes.
+
+    Raises:
+        InputError: what `load_bundle` refuses.
+    """
+    load_bundle(bundle)
+    data = read_package(bundle, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
+    manifest = parse_json(data[_MANIFEST], subject=f"avatar {bundle}: manifest")
+    pieces = {f"{name}.safetensors": data[entry["file"]] for name, entry in manifest["pieces"].items()}
+    pieces[f"{MOTION}.safetensors"] = pack_tensors(motion_tensors(motion), {})
+    write_package(path, {_MANIFEST: _manifest(manifest["model"], pieces), **pieces})
+
+
+def motion_tensors(motion: BodyParams) -> dict[str, np.ndarray]:
+    """The piece `motion` of a bundle: body parameters without the shape, which the bundle has."""
+    return {name: np.asarray(value, np.float32) for name, value in motion.without_shape().as_dict().items()}
+
+
+def _manifest(model: Mapping[str, Any], data: Mapping[str, bytes]) -> bytes:
+    pieces = {
+        file.split(".")[0]: {"file": file, "bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
+        for file, value in data.items()
+    }
+    manifest = {"format": FORMAT, "version": VERSION, "model": model, "pieces": pieces}
+    return json.dumps(manifest, indent=1).encode()
 
 
 def load_bundle(path: str | Path) -> AvatarBundle:

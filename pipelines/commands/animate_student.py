@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,12 +61,20 @@ def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
     """
     from avatar.runtime import load_bundle
 
+    with student_file(source, exact=exact) as path:
+        return load_bundle(path)
+
+
+@contextmanager
+def student_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
+    """The file of a bundle: the source itself, or one made of a run's student, for as long as it is needed."""
     if source.suffix.lower() == SUFFIX:
-        return load_bundle(source)
+        yield source
+        return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"student{SUFFIX}"
         export_bundle(source, path, name=None, licence="", params=None, exact=exact)
-        return load_bundle(path)
+        yield path
 
 
 def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:

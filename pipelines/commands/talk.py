@@ -1,7 +1,8 @@
-"""`smplxpp talk`: an avatar that says a text or what a recording says, as a film with sound or as a motion."""
+"""`smplxpp talk`: an avatar that says a text or what a recording says: a film with sound, a page, a motion."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,9 +12,10 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import StudentFilm, open_student, student_frames
+from pipelines.commands.animate_student import StudentFilm, open_student, student_file, student_frames
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.talking_page import check_page_path, write_talking_page
 from pipelines.commands.templates import load_run_template
 from pipelines.figures.film import write_film
 from pipelines.runs.artefacts import load_params_of_run
@@ -39,8 +41,10 @@ class Talk:
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
     """Folder that `smplxpp train` wrote, or a bundle NAME.avatar; a motion needs no student."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH", help_behavior_hint="(optional)")] = None
     """Result: .mp4, a film with sound; .npz, body parameters for `animate`, `web` and `export`."""
+    web: OptionalPath = None
+    """Write a page that plays it with its sound: NAME.html, one file that opens from disk, or a folder for any host."""
     text: OptionalText = None
     """What is said. With --audio: what the recording says, so that it need not be recognised."""
     audio: OptionalPath = None
@@ -69,21 +73,29 @@ class Talk:
         suffix = self._check()
         from avatar.speech import TalkConfig, talking_motion
 
-        bundle = None
-        if suffix == FILM or self.source.suffix.lower() == BUNDLE:
-            bundle = open_student(self.source)
-        face, seen = self._person(bundle)
-        config = TalkConfig(fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively)
-        sound, speech, said = self._speech()
-        motion = talking_motion(speech, face, _usual(seen), config)
-        if self.sound_out is not None:
-            atomic_write_bytes(self.sound_out, wave_bytes(sound))
-        if suffix == MOTION or bundle is None:
-            motion.save(self.out)
-        else:
-            self._film(bundle, motion, sound, said)
+        with ExitStack() as stack:
+            file = None
+            if suffix == FILM or self.web is not None or self.source.suffix.lower() == BUNDLE:
+                file = stack.enter_context(student_file(self.source))
+            bundle = None if file is None else open_student(file)
+            face, seen = self._person(bundle)
+            config = TalkConfig(fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively)
+            sound, speech, said = self._speech()
+            motion = talking_motion(speech, face, _usual(seen), config)
+            if self.sound_out is not None:
+                atomic_write_bytes(self.sound_out, wave_bytes(sound))
+            if suffix == MOTION:
+                assert self.out is not None
+                motion.save(self.out)
+            elif suffix == FILM:
+                assert self.out is not None and bundle is not None
+                self._film(self.out, bundle, motion, sound, said)
+            if self.web is not None:
+                assert file is not None and bundle is not None
+                write_talking_page(self.web, file, motion, sound, name=bundle.about.name)
         answer = {
-            "out": str(self.out),
+            "out": None if self.out is None else str(self.out),
+            "web": None if self.web is None else str(self.web),
             "frames": len(motion),
             "fps": self.fps,
             "seconds": speech.seconds,
@@ -93,15 +105,20 @@ class Talk:
         if not self.json:
             console = Console()
             spoken = f"{len(speech.spoken)} sounds in {speech.seconds:.1f} s"
-            console.print(f"{self.out}: {len(motion)} frames at {self.fps:g} a second, {spoken}", markup=False)
+            where = ", ".join(str(path) for path in (self.out, self.web) if path is not None)
+            console.print(f"{where}: {len(motion)} frames at {self.fps:g} a second, {spoken}", markup=False)
             for sentence in said:
                 Console(stderr=True).print(sentence, markup=False)
         return answer
 
     def _check(self) -> str:
-        suffix = self.out.suffix.lower()
-        if suffix not in (FILM, MOTION):
+        suffix = "" if self.out is None else self.out.suffix.lower()
+        if self.out is not None and suffix not in (FILM, MOTION):
             raise InputError(f"output {self.out}", expected=".mp4 or .npz", received=suffix or "no suffix")
+        if self.out is None and self.web is None:
+            raise InputError("what to write", expected="--out, --web or both", received="neither")
+        if self.web is not None:
+            check_page_path(self.web)
         if self.text is None and self.audio is None:
             raise InputError("what to say", expected="--text, --audio or both", received="neither")
         if self.voice is not None and self.audio is not None:
@@ -143,7 +160,7 @@ class Talk:
         said = [f"no dictionary has {guessed}: pronounced by spelling; espeak-ng knows more"] if guessed else []
         return spoken.sound, spoken.speech, said
 
-    def _film(self, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
+    def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"
         film = StudentFilm(
             view="front" if portrait else self.view,
@@ -155,7 +172,7 @@ class Talk:
         )
         cameras, frames = student_frames(bundle, motion, range(len(motion)), film, said)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
-        write_film(self.out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
+        write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
 
 
 def _motion_of(bundle: AvatarBundle) -> BodyParams | None:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.talking_page import PAGES
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
@@ -20,7 +21,6 @@ from smplxpp.core.validation import require_between
 
 _LARGEST_PORT = 65535
 _MOST_BYTES = 1 << 30
-_PAGES = (".html", ".htm")
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Web:
             )
         if self.out is not None and self.out.exists() and not self.out.is_dir():
             raise InputError(f"output {self.out}", expected="a folder, or nothing yet", received="a file")
-        if self.single_file is not None and self.single_file.suffix.lower() not in _PAGES:
+        if self.single_file is not None and self.single_file.suffix.lower() not in PAGES:
             raise InputError(
                 f"output {self.single_file}",
                 expected="a name that ends with .html",

@@ -11,7 +11,7 @@ from smplxpp.core.files.paths import read_text
 
 PLAYER = Path(__file__).parent / "assets" / "player.js"
 """Built of `web/` by `npm run build`; a test holds it against its sources."""
-INDEX, SCRIPT, AVATAR = "index.html", "player.js", "me.avatar"
+INDEX, SCRIPT, AVATAR, SOUND = "index.html", "player.js", "me.avatar", "sound.wav"
 # The page needs its script, a worker made of it and the WebAssembly in that, styles made by it, and avatars; it loads
 # nothing else from anywhere.
 _POLICY = (
@@ -36,44 +36,49 @@ _PAGE = """<!doctype html>
 """
 
 
-def page_files(bundle: bytes, *, name: str) -> dict[str, bytes]:
+def page_files(bundle: bytes, *, name: str, sound: bytes | None = None) -> dict[str, bytes]:
     """Return the files of a folder that plays a bundle, by name.
 
     Args:
-        name: of the avatar, for the page's title.
+        name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
     """
     page = _PAGE.format(
         policy=_POLICY.format(script="'self' blob:", connect="connect-src *"),
         title=html.escape(name),
-        attributes=f' data-avatar="{AVATAR}"',
+        attributes=f' data-avatar="{AVATAR}"' + ("" if sound is None else f' data-sound="{SOUND}"'),
         body=f'<script src="{SCRIPT}"></script>',
     )
-    return {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
+    files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
+    return files if sound is None else {**files, SOUND: sound}
 
 
-def write_page_folder(folder: str | Path, bundle: bytes, *, name: str) -> list[Path]:
+def write_page_folder(folder: str | Path, bundle: bytes, *, name: str, sound: bytes | None = None) -> list[Path]:
     """Write `page_files` into a folder, each whole or not at all; other files in it stay.
 
     Returns:
         The files.
     """
     paths = []
-    for file, content in page_files(bundle, name=name).items():
+    for file, content in page_files(bundle, name=name, sound=sound).items():
         paths.append(Path(folder) / file)
         atomic_write_bytes(paths[-1], content)
     return paths
 
 
-def single_page(bundle: bytes, *, name: str) -> bytes:
-    """Return one page with player and bundle in it, which opens from disk and asks no network for anything."""
+def single_page(bundle: bytes, *, name: str, sound: bytes | None = None) -> bytes:
+    """Return one page with player, bundle and sound in it, which opens from disk and asks no network for anything."""
     # Neither may end the element that it stands in.
     script = _script().replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    data = base64.b64encode(bundle).decode()
+    inlined = {"avatar": bundle} if sound is None else {"avatar": bundle, "sound": sound}
+    data = [
+        f'<script type="text/plain" id="{kind}-data">{base64.b64encode(content).decode()}</script>\n'
+        for kind, content in inlined.items()
+    ]
     page = _PAGE.format(
         policy=_POLICY.format(script="'unsafe-inline' blob:", connect="connect-src 'none'"),
         title=html.escape(name),
         attributes="",
-        body=f'<script type="text/plain" id="avatar-data">{data}</script>\n<script>{script}</script>',
+        body=f"{''.join(data)}<script>{script}</script>",
     )
     return page.encode()
 

@@ -13,7 +13,7 @@ from smplxpp.core.errors import InputError
 
 HOST = "127.0.0.1"
 _TRIES = 32
-_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
+_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".wav": "audio/wav"}
 _HEADERS = {
     # A page isolated from others may use threads and exact clocks.
     "Cross-Origin-Opener-Policy": "same-origin",

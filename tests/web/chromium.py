@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,10 @@ class Page:
     """One page of a headless Chromium of its own; what its console says is kept.
 
     Args:
-        folder: for the browser's profile. size: of the window, pixels.
+        folder: for the browser's profile. size: of the window, pixels. flags: more of the program's own.
     """
 
-    def __init__(self, folder: Path, size: tuple[int, int] = (960, 640)) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] = (960, 640), flags: Sequence[str] = ()) -> None:
         program = find_chromium()
         assert program is not None
         self.errors: list[str] = []
@@ -56,6 +57,7 @@ class Page:
                 *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--mute-audio"),
                 *("--remote-debugging-pipe", f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"),
                 *_SWIFTSHADER,
+                *flags,
                 "about:blank",
             ],
             pass_fds=ends,
@@ -122,6 +124,23 @@ class Page:
         result = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
+
+    def click(self, selector: str) -> None:
+        """Press the mouse on the middle of an element, as a person does: browsers play no sound before that."""
+        find = (
+            f"(({{left, top, width, height}}) => [left + width / 2, top + height / 2])"
+            f"(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"
+        )
+        x, y = self.evaluate(find)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def until(self, condition: str, what: str = "") -> None:
+        """Wait until an expression is true in the page."""
+        end = time.monotonic() + LIMIT
+        while not self.evaluate(f"!!({condition})"):
+            assert time.monotonic() < end, what or condition
+            time.sleep(0.05)
 
     def picture(self, view: dict[str, Any]) -> np.ndarray:
         """Return what the player draws of a view, (H, W, 3) bytes."""

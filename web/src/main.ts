@@ -6,8 +6,8 @@ import { makeRenderer } from "./render/choose.ts";
 import { App } from "./ui/app.ts";
 import { element } from "./ui/elements.ts";
 
-/** Where a page has its bundle: in it, in base64, or beside it, named by an attribute. */
-const INLINED = "avatar-data", BESIDE = "data-avatar";
+/** Where a page has its bundle and its sound: in it, in base64, or beside it, named by an attribute. */
+const INLINED = "-data", BESIDE = "data-";
 
 declare global {
   interface Window {
@@ -23,8 +23,9 @@ async function start(): Promise<void> {
   const wanted = new URLSearchParams(location.search).get("renderer");
   const player = new Player(await makeRenderer(stage, wanted), stage);
   const app = new App(player, stage);
-  const data = find();
-  const ready = data ? app.open(data) : Promise.resolve(app.invite());
+  const named = new URLSearchParams(location.search).get("avatar");
+  const data = named ? download(named) : find("avatar");
+  const ready = data ? app.open(data, named ? null : find("sound")) : Promise.resolve(app.invite());
   window.smplxppPlayer = {
     player, ready,
     open: (bytes) => app.open(bytes),
@@ -32,14 +33,14 @@ async function start(): Promise<void> {
   };
 }
 
-function find(): Promise<ArrayBuffer> | ArrayBuffer | null {
-  const inlined = document.getElementById(INLINED);
+function find(kind: "avatar" | "sound"): Promise<ArrayBuffer> | ArrayBuffer | null {
+  const inlined = document.getElementById(kind + INLINED);
   if (inlined) {
     const bytes = bytesOf(inlined.textContent ?? "");
     inlined.remove();
     return bytes;
   }
-  const named = new URLSearchParams(location.search).get("avatar") ?? document.body.getAttribute(BESIDE);
+  const named = document.body.getAttribute(BESIDE + kind);
   return named ? download(named) : null;
 }
 

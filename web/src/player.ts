@@ -39,6 +39,12 @@ export interface View {
   seconds?: number | null;
 }
 
+/** What leads the motion's time in the place of the page's own clock. */
+export interface Clock {
+  /** The motion's time now, seconds, told of the time that the page is at; null: the page's own clock leads. */
+  at(playing: boolean, time: number, speed: number): number | null;
+}
+
 export type Frame = Extract<Reply, { kind: "frame" }>;
 
 export class Player {
@@ -59,6 +65,8 @@ export class Player {
   simulating = true;
   /** A headset shows the avatar: the page's canvas rests. */
   immersed = false;
+  /** Of a sound that the motion goes with: it plays once, not in a loop. */
+  clock: Clock | null = null;
   /** Called after each picture. */
   onpicture: () => void = () => {};
   onerror: (message: string) => void = () => {};
@@ -173,11 +181,13 @@ export class Player {
     const passed = Math.min(0.25, (now - this.before) / 1000);
     this.before = now;
     this.quiet += passed;
-    this.elapsed += passed * (this.playing ? this.speed : 1);
+    const led = this.duration > 0 ? (this.clock?.at(this.playing, this.time, this.speed) ?? null) : null;
+    const next = led ?? this.time + passed * this.speed;
+    this.elapsed += this.playing && led !== null ? led - this.time : passed * (this.playing ? this.speed : 1);
     if (this.playing && this.duration > 0) {
-      const next = this.time + passed * this.speed;
       if (next < this.duration) this.time = next;
-      else this.seek(next % this.duration);
+      else this.seek(this.clock ? 0 : next % this.duration);
+      if (this.clock && next >= this.duration) this.playing = false;
       this.update();
     }
   }

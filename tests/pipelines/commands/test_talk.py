@@ -25,11 +25,14 @@ from smplxpp.core.files.wave_file import Sound
         ("a.npz", {"text": "hello", "sound_out": Path("a.mp3")}, "wav"),
         ("a.npz", {"text": "hello"}, "run nowhere"),
         ("a.mp4", {"text": "hello", "height": 2}, "height"),
+        (None, {"text": "hello"}, "--web"),
+        (None, {"text": "hello", "web": Path("page.txt")}, "html"),
+        (None, {"text": "hello", "web": Path("page.html")}, "run nowhere"),
     ],
 )
 def test_what_cannot_be_is_refused_at_once(tmp_path, out, options, word):
     with pytest.raises(InputError, match=word):
-        Talk(Path("nowhere"), tmp_path / out, **options).run()
+        Talk(Path("nowhere"), out and tmp_path / out, **options).run()
     assert not list(tmp_path.iterdir())
 
 

@@ -3,6 +3,7 @@
 import { BundleError } from "../bundle/errors.ts";
 import type { Player } from "../player.ts";
 import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
+import { Soundtrack } from "../sound/soundtrack.ts";
 import { enterStereo, offersStereo } from "../xr/stereo.ts";
 import { listen } from "./gestures.ts";
 import { makePanel } from "./panel.ts";
@@ -22,12 +23,14 @@ export class App {
   private readonly menu = iconButton("Settings", "menu", ICONS.settings);
   private readonly stereo = iconButton("View in the headset", "stereo", ICONS.stereo);
   private readonly bar: HTMLElement;
+  private readonly speak = element("button", { class: "button speak", hidden: true }, "Play with sound");
   private panel: HTMLElement | null = null;
+  private soundtrack: Soundtrack | null = null;
   private lastRates = 0;
 
   constructor(private readonly player: Player, stage: HTMLCanvasElement) {
     this.bar = element("div", { class: "bar" }, this.playButton, this.scrub, this.clock, this.speed);
-    document.body.append(this.title, this.menu, this.stereo, this.rates, this.bar, this.welcome);
+    document.body.append(this.title, this.menu, this.stereo, this.rates, this.bar, this.speak, this.welcome);
     this.showControls(false);
     listen(stage, player);
     this.listenToControls();
@@ -37,11 +40,12 @@ export class App {
     player.onerror = (message) => this.fail(message);
   }
 
-  /** Opens a bundle's bytes and shows it; what is wrong with it is said on the page. */
-  async open(data: Promise<ArrayBuffer> | ArrayBuffer): Promise<void> {
+  /** Opens a bundle's bytes, and the sound of its motion, and shows it; what is wrong with it is said on the page. */
+  async open(data: Promise<ArrayBuffer> | ArrayBuffer, sound: Promise<ArrayBuffer> | ArrayBuffer | null = null): Promise<void> {
     this.say(element("div", { class: "spinner" }), element("h2", {}, "Opening the avatar"));
     try {
       const about = await this.player.open(await data);
+      await this.takeSound(sound);
       this.welcome.replaceChildren();
       document.title = about.name;
       this.title.replaceChildren(element("h1", {}, about.name), element("p", {}, "SMPLX++ avatar"));
@@ -54,6 +58,16 @@ export class App {
     } catch (error) {
       this.fail(error instanceof BundleError || error instanceof Error ? error.message : String(error));
     }
+  }
+
+  /** Plays the motion with this sound from now on; without one, by itself. */
+  private async takeSound(data: Promise<ArrayBuffer> | ArrayBuffer | null): Promise<void> {
+    const { player } = this;
+    player.clock?.at(false, 0, 1);
+    this.soundtrack = data && new Soundtrack(await data, (message) => this.fail(message, "There is no sound"));
+    player.clock = this.soundtrack;
+    player.playing = !this.soundtrack;
+    this.speak.hidden = !this.soundtrack;
   }
 
   /** Says what went wrong, and offers another file. */
@@ -98,9 +112,12 @@ export class App {
     const { player } = this;
     const toggle = () => {
       player.playing = !player.playing;
-      setIcon(this.playButton, player.playing ? ICONS.pause : ICONS.play);
-      this.playButton.title = player.playing ? "Pause" : "Play";
+      if (player.playing) this.soundtrack?.unlock();
+      this.speak.hidden = true;
+      player.update();
+      this.showPlaying();
     };
+    this.speak.addEventListener("click", toggle);
     this.playButton.addEventListener("click", toggle);
     window.addEventListener("keydown", (event) => {
       if (event.key !== " " || event.target instanceof HTMLButtonElement || event.target instanceof HTMLInputElement) return;
@@ -142,7 +159,16 @@ export class App {
     });
   }
 
+  private showPlaying(): void {
+    const said = this.player.playing ? "Pause" : "Play";
+    if (this.playButton.title === said) return;
+    setIcon(this.playButton, this.player.playing ? ICONS.pause : ICONS.play);
+    this.playButton.title = said;
+    this.playButton.ariaLabel = said;
+  }
+
   private refresh(): void {
+    this.showPlaying();
     const { player } = this, whole = player.duration;
     if (whole) {
       this.scrub.value = String(player.time / whole);

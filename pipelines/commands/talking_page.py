@@ -1,0 +1,46 @@
+"""A page that plays a motion with its sound: one file or a folder."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.params import BodyParams
+
+PAGES = (".html", ".htm")
+"""Suffixes of a page in one file."""
+
+
+def check_page_path(path: Path) -> None:
+    """Refuse what is neither one page nor a folder.
+
+    Raises:
+        InputError: another suffix, or a file where a folder is to be.
+    """
+    if path.suffix.lower() not in (*PAGES, ""):
+        raise InputError(f"output {path}", expected="NAME.html or a folder", received=path.suffix)
+    if not path.suffix and path.exists() and not path.is_dir():
+        raise InputError(f"output {path}", expected="a folder, or nothing yet", received="a file")
+
+
+def write_talking_page(path: Path, bundle: Path, motion: BodyParams, sound: Sound, *, name: str) -> None:
+    """Write the page, each file of it whole or not at all.
+
+    Args:
+        bundle: file of the avatar; what it plays is the motion. sound: from the motion's first frame on.
+    """
+    from avatar.runtime.bundle import SUFFIX, save_with_motion
+    from pipelines.web.page import single_page, write_page_folder
+
+    with tempfile.TemporaryDirectory() as folder:
+        talking = Path(folder) / f"me{SUFFIX}"
+        save_with_motion(talking, bundle, motion)
+        data = read_bytes(talking, subject="avatar")
+    if path.suffix:
+        atomic_write_bytes(path, single_page(data, name=name, sound=wave_bytes(sound)))
+    else:
+        write_page_folder(path, data, name=name, sound=wave_bytes(sound))

@@ -1,0 +1,160 @@
+"""A page whose motion has a sound: both together by the sound's own clock, measured on what is heard."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar.runtime.bundle import load_bundle, save_with_motion
+from pipelines.web.page import page_files, single_page
+from pipelines.web.server import PageServer
+from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.params import BodyParams
+from tests.dolls.dancing import dance
+from tests.web.avatars import NAME, write_avatar
+from tests.web.chromium import Page, find_chromium
+
+CLICKS = (0.7, 1.9)
+SECONDS, RATE = 3.0, 22050
+TOGETHER = 0.04
+PLAY, CLOCK = "button.speak", "smplxppPlayer.player.clock"
+# What the clock answers at which of the audio's times, and at which of these a click is heard.
+LISTEN = f"""window.answers = []; window.heard = [];
+const clock = {CLOCK}, own = clock.at.bind(clock);
+clock.at = (playing, time, speed) => {{
+  const answer = own(playing, time, speed);
+  if (playing && clock.context) answers.push([clock.context.currentTime, clock.context.outputLatency || 0, answer]);
+  return answer;
+}};
+window.listen = () => {{
+  const analyser = clock.context.createAnalyser(), samples = new Float32Array(4096);
+  analyser.fftSize = samples.length;
+  clock.output.connect(analyser);
+  setInterval(() => {{
+    const now = clock.context.currentTime;
+    analyser.getFloatTimeDomainData(samples);
+    const first = samples.findIndex(value => Math.abs(value) > 0.2);
+    const at = now - (samples.length - first) / clock.context.sampleRate;
+    if (first > 0 && !heard.some(known => Math.abs(known - at) < 0.1)) heard.push(at);
+  }}, 15);
+}}; 0"""
+
+
+def clicks() -> Sound:
+    samples = np.zeros(int(SECONDS * RATE), np.float32)
+    for at in CLICKS:
+        samples[int(at * RATE) : int(at * RATE) + 400] = 0.9
+    return Sound(samples, RATE)
+
+
+@pytest.fixture(scope="module")
+def talking(tmp_path_factory) -> Path:
+    """The doll with a motion of its own as long as the sound."""
+    folder = tmp_path_factory.mktemp("talking")
+    write_avatar(folder / "doll.avatar")
+    motion = dance()
+    slow = replace(motion, fps=(len(motion) - 1) / SECONDS)
+    save_with_motion(folder / "talking.avatar", folder / "doll.avatar", slow)
+    return folder / "talking.avatar"
+
+
+def test_a_bundle_takes_another_motion_and_keeps_the_rest(talking):
+    new, old = load_bundle(talking), load_bundle(talking.with_name("doll.avatar"))
+    assert new.about == old.about and new.tensors.keys() == old.tensors.keys()
+    for name, value in old.tensors.items():
+        np.testing.assert_array_equal(new.tensors[name], value)
+    motion = BodyParams.from_mapping(new.motion, source="bundle")
+    assert len(motion) == len(dance()) and motion.fps == pytest.approx((len(motion) - 1) / SECONDS)
+
+
+def test_pages_carry_the_sound(talking):
+    sound = wave_bytes(clicks())
+    files = page_files(b"bundle", name=NAME, sound=sound)
+    assert files["sound.wav"] == sound and b'data-sound="sound.wav"' in files["index.html"]
+    page = single_page(b"bundle", name=NAME, sound=sound).decode()
+    assert page.count("</script>") == 3 and "connect-src 'none'" in page
+    assert b"data-sound" not in page_files(b"bundle", name=NAME)["index.html"]
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Page]:
+    if find_chromium() is None:
+        pytest.skip("no Chromium here (apt-get install chromium)")
+    with Page(tmp_path_factory.mktemp("browser"), size=(320, 240)) as page:
+        yield page
+
+
+@pytest.fixture(params=["folder", "one file"])
+def page(request, browser, talking, tmp_path) -> Iterator[Page]:
+    sound, bundle = wave_bytes(clicks()), talking.read_bytes()
+    browser.errors.clear()
+    if request.param == "folder":
+        with PageServer(page_files(bundle, name=NAME, sound=sound)) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            browser.go(server.address)
+            yield browser
+            server.shutdown()
+    else:
+        (tmp_path / "player.html").write_bytes(single_page(bundle, name=NAME, sound=sound))
+        browser.go((tmp_path / "player.html").as_uri())
+        yield browser
+    assert browser.errors == []
+
+
+def test_sound_and_motion_are_together(page):
+    """It waits for a click, plays once, and the pose is at the time of the click that is heard."""
+    assert page.evaluate("smplxppPlayer.player.playing") is False
+    assert page.evaluate(f"getComputedStyle(document.querySelector('{PLAY}')).display") != "none"
+    page.evaluate(LISTEN)
+    page.click(PLAY)
+    page.until(f"{CLOCK}.context?.state === 'running'", "no sound after a click")
+    page.evaluate("listen()")
+    page.until("!smplxppPlayer.player.playing", "it never ends")
+    heard, answers = page.evaluate("heard"), np.array(page.evaluate("answers"), float)
+    assert len(heard) == len(CLICKS) and page.evaluate("smplxppPlayer.player.time") == 0.0
+    now, latency, pose = answers.T
+    going = (pose > 0.05) & (pose < SECONDS)
+    assert going.sum() > 3
+    for at, click in zip(heard, CLICKS, strict=True):
+        sound = now[going] - latency[going] - at + click
+        assert np.abs(sound - pose[going]).max() < TOGETHER
+
+
+def test_a_seek_and_a_speed_take_the_sound_along(browser, talking, tmp_path):
+    (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), name=NAME, sound=wave_bytes(clicks())))
+    browser.errors.clear()
+    browser.go((tmp_path / "player.html").as_uri())
+    browser.evaluate(LISTEN)
+    browser.click(PLAY)
+    browser.until("smplxppPlayer.player.time > 0.1")
+    browser.evaluate("listen()")
+    browser.click(".bar .play")
+    browser.until("!smplxppPlayer.player.playing")
+    paused = browser.evaluate("smplxppPlayer.player.time")
+    browser.evaluate("answers.length = heard.length = 0; new Promise(done => setTimeout(done, 400))")
+    assert browser.evaluate("smplxppPlayer.player.time") == paused and browser.evaluate("heard.length") == 0
+    browser.evaluate("smplxppPlayer.player.speed = 0.5; smplxppPlayer.player.seek(1.6); 0")
+    browser.click(".bar .play")
+    browser.until("!smplxppPlayer.player.playing")
+    heard, answers = browser.evaluate("heard"), np.array(browser.evaluate("answers"), float)
+    assert len(heard) == 1, heard  # the first click lies before
+    now, latency, pose = answers[answers[:, 2] < SECONDS].T
+    sound = CLICKS[1] + 0.5 * (now - latency - heard[0])
+    assert np.abs(sound - pose)[pose > 1.65].max() < TOGETHER
+    assert browser.errors == []
+
+
+def test_a_damaged_sound_is_said_and_the_motion_plays(browser, talking, tmp_path):
+    (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), name=NAME, sound=b"no sound"))
+    browser.errors.clear()
+    browser.go((tmp_path / "player.html").as_uri())
+    browser.click(PLAY)
+    browser.until("document.querySelector('.card.failed')", "nothing is said")
+    assert "sound" in browser.evaluate("document.querySelector('.card.failed').innerText")
+    browser.until("smplxppPlayer.player.time > 0.2", "it does not play")
+    assert browser.errors == []
