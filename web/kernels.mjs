@@ -14,7 +14,7 @@ const native = fileURLToPath(new URL("../smplxpp/native/", import.meta.url));
 const KINDS = [
   { flags: ["-ffp-contract=off"], sources: ["cloth/xpbd.cpp", "web/memory.cpp"] },
   { flags: ["-ffast-math"], sources: ["runtime/surface.cpp", "runtime/gaussians.cpp", "web/splats.cpp"] },
-  { flags: ["-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"], sources: ["runtime/pose.cpp", "runtime/field.cpp"] },
+  { flags: ["-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"], sources: ["runtime/pose.cpp", "runtime/field.cpp", "web/normals.cpp"] },
 ];
 const TARGET = [
   "-target", "wasm32-wasi", "-std=c++17", "-O3", "-msimd128", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden",

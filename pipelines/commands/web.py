@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import tempfile
 import webbrowser
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
+from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.validation import require_between
+
+if TYPE_CHECKING:
+    from pipelines.web.page import PageLight
 
 _LARGEST_PORT = 65535
 _MOST_BYTES = 1 << 30
@@ -45,27 +49,32 @@ class Web:
     """Name of a run's avatar; by default that of the run's folder."""
     licence: str = ""
     """Licence of a run's avatar, as the page is to say it."""
+    lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
+    """The light that the page begins with."""
     json: bool = False
     """Print what was written as JSON."""
 
     def run(self) -> dict[str, Any]:
         """Write what was asked for, each file whole or not at all; then serve."""
         self._check()
+        light = self._light()
         bundle, name = self._bundle()
         from pipelines.web.page import page_files, single_page, write_page_folder
 
         console = Console(stderr=self.json)
         written: dict[str, int] = {}
         if self.out is not None:
-            written |= {str(path): path.stat().st_size for path in write_page_folder(self.out, bundle, name=name)}
+            written |= {
+                str(path): path.stat().st_size for path in write_page_folder(self.out, bundle, name=name, light=light)
+            }
         if self.single_file is not None:
-            page = single_page(bundle, name=name)
+            page = single_page(bundle, name=name, light=light)
             atomic_write_bytes(self.single_file, page)
             written[str(self.single_file)] = len(page)
         for path, size in written.items():
             console.print(f"{path}: {size / 1e6:.2f} MB", markup=False, soft_wrap=True)
         if self.serve:
-            self._serve(page_files(bundle, name=name), console)
+            self._serve(page_files(bundle, name=name, light=light), console)
         return {"written": written, "bundle_bytes": len(bundle)}
 
     def _check(self) -> None:
@@ -85,6 +94,16 @@ class Web:
                 expected="a name that ends with .html",
                 received=self.single_file.suffix or "no suffix",
             )
+
+    def _light(self) -> PageLight | None:
+        """The light that the page begins with; turned there, not here."""
+        from pipelines.web.page import PageLight
+
+        asked = self.lighting
+        relighting = (asked if asked.environment is None else replace(asked, environment_turn=0.0)).relighting()
+        if relighting is None or asked.environment is None:
+            return None
+        return PageLight(asked.environment.stem, relighting, asked.environment_turn)
 
     def _bundle(self) -> tuple[bytes, str]:
         """The bytes of the bundle, one that can be opened, and the avatar's name."""

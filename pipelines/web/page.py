@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import base64
 import html
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_text
+from smplxpp.core.light import Relighting
 
 PLAYER = Path(__file__).parent / "assets" / "player.js"
 """Built of `web/` by `npm run build`; a test holds it against its sources."""
@@ -36,36 +39,62 @@ _PAGE = """<!doctype html>
 """
 
 
-def page_files(bundle: bytes, *, name: str, sound: bytes | None = None) -> dict[str, bytes]:
+@dataclass(frozen=True)
+class PageLight:
+    """Another light that a page begins with.
+
+    Attributes:
+        name: said on the page. relighting: the light, not turned, in the place of the capture's.
+        turn: degrees about +Y by which it is turned; the page changes it.
+    """
+
+    name: str
+    relighting: Relighting
+    turn: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """What the page reads: the harmonics of both lights, by colour."""
+        lights = {"light": self.relighting.light, "captured": self.relighting.captured}
+        numbers = {key: light.coefficients.ravel().tolist() for key, light in lights.items()}
+        return json.dumps({"name": self.name, "turn": self.turn, **numbers})
+
+
+def page_files(
+    bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None
+) -> dict[str, bytes]:
     """Return the files of a folder that plays a bundle, by name.
 
     Args:
         name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
+        light: that the avatar is shown in; None: the capture's.
     """
     page = _PAGE.format(
         policy=_POLICY.format(script="'self' blob:", connect="connect-src *"),
         title=html.escape(name),
-        attributes=f' data-avatar="{AVATAR}"' + ("" if sound is None else f' data-sound="{SOUND}"'),
+        attributes=f' data-avatar="{AVATAR}"' + ("" if sound is None else f' data-sound="{SOUND}"') + _lit(light),
         body=f'<script src="{SCRIPT}"></script>',
     )
     files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
     return files if sound is None else {**files, SOUND: sound}
 
 
-def write_page_folder(folder: str | Path, bundle: bytes, *, name: str, sound: bytes | None = None) -> list[Path]:
+def write_page_folder(
+    folder: str | Path, bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None
+) -> list[Path]:
     """Write `page_files` into a folder, each whole or not at all; other files in it stay.
 
     Returns:
         The files.
     """
     paths = []
-    for file, content in page_files(bundle, name=name, sound=sound).items():
+    for file, content in page_files(bundle, name=name, sound=sound, light=light).items():
         paths.append(Path(folder) / file)
         atomic_write_bytes(paths[-1], content)
     return paths
 
 
-def single_page(bundle: bytes, *, name: str, sound: bytes | None = None) -> bytes:
+def single_page(bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None) -> bytes:
     """Return one page with player, bundle and sound in it, which opens from disk and asks no network for anything."""
     # Neither may end the element that it stands in.
     script = _script().replace("</script", "<\\/script").replace("<!--", "<\\!--")
@@ -77,10 +106,14 @@ def single_page(bundle: bytes, *, name: str, sound: bytes | None = None) -> byte
     page = _PAGE.format(
         policy=_POLICY.format(script="'unsafe-inline' blob:", connect="connect-src 'none'"),
         title=html.escape(name),
-        attributes="",
+        attributes=_lit(light),
         body=f"{''.join(data)}<script>{script}</script>",
     )
     return page.encode()
+
+
+def _lit(light: PageLight | None) -> str:
+    return "" if light is None else f' data-light="{html.escape(light.text)}"'
 
 
 def _script() -> str:

@@ -3,11 +3,15 @@
 import style from "./style.css";
 import { Player, type View } from "./player.ts";
 import { makeRenderer } from "./render/choose.ts";
+import type { Light } from "./light/irradiance.ts";
 import { App } from "./ui/app.ts";
 import { element } from "./ui/elements.ts";
+import { shine } from "./ui/light.ts";
 
 /** Where a page has its bundle and its sound: in it, in base64, or beside it, named by an attribute. */
 const INLINED = "-data", BESIDE = "data-";
+/** The light that a page comes with, as JSON, in an attribute. */
+const LIGHT = "data-light";
 
 declare global {
   interface Window {
@@ -23,6 +27,11 @@ async function start(): Promise<void> {
   const wanted = new URLSearchParams(location.search).get("renderer");
   const player = new Player(await makeRenderer(stage, wanted), stage);
   const app = new App(player, stage);
+  const light = document.body.getAttribute(LIGHT);
+  if (light) {
+    const { turn, ...rest } = JSON.parse(light) as Light & { turn: number };
+    shine(player, rest, turn);
+  }
   const named = new URLSearchParams(location.search).get("avatar");
   const data = named ? download(named) : find("avatar");
   const ready = data ? app.open(data, named ? null : find("sound")) : Promise.resolve(app.invite());

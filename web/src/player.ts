@@ -4,6 +4,7 @@ import type { Pose } from "./avatar/avatar.ts";
 import { RECORD } from "./avatar/deform.ts";
 import { duration, poseAt, restPose, turned } from "./avatar/motion.ts";
 import { LONGEST_FOLLOWED } from "./cloth/driver.ts";
+import { matrices, type Light } from "./light/irradiance.ts";
 import { orbitCamera, type Camera, type Orbit } from "./render/camera.ts";
 import type { Renderer } from "./render/renderer.ts";
 import type { Reply, Request, Summary } from "./worker/protocol.ts";
@@ -63,12 +64,19 @@ export class Player {
   readonly rates: Rates = { fps: 0, deform: 0, cloth: 0, sort: 0, draw: null };
   /** Loose clothes are simulated. */
   simulating = true;
+  /** Another light than the capture's, and whether the avatar is shown in it; null: there is none. */
+  light: Light | null = null;
+  lit = true;
+  /** Radians about the vertical by which it is turned. */
+  lightTurn = 0;
   /** A headset shows the avatar: the page's canvas rests. */
   immersed = false;
   /** Of a sound that the motion goes with: it plays once, not in a loop. */
   clock: Clock | null = null;
   /** Called after each picture. */
   onpicture: () => void = () => {};
+  /** Called after another light was set. */
+  onlight: () => void = () => {};
   onerror: (message: string) => void = () => {};
 
   private readonly worker: Worker;
@@ -241,10 +249,15 @@ export class Player {
     return { ...camera, cy: camera.cy - 0.5 * COVERED * ratio };
   }
 
+  /** What a frame is to be lit by; null: it is shown as it was captured. */
+  lightOf(frame: Frame): Float32Array | null {
+    return frame.lit && this.light ? matrices(this.light, this.lightTurn) : null;
+  }
+
   private request({ time, camera }: View, seconds: number | null): Request {
     const sorted = this.immersed || !this.renderer.sorts;
     return {
-      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted, seconds,
+      kind: "frame", pose: this.pose(time), camera, hidden: [...this.hidden], sorted, seconds, lit: this.lit && this.light !== null,
       records: this.spare.pop() ?? null,
     };
   }
@@ -262,7 +275,7 @@ export class Player {
 
   private show(frame: Frame, background = BACKGROUND): void {
     const { camera, count, depths } = frame, records = new Float32Array(frame.records);
-    this.renderer.draw({ records, count, camera, background, depths, blur: this.summary!.blur });
+    this.renderer.draw({ records, count, camera, background, depths, blur: this.summary!.blur, light: this.lightOf(frame) });
     this.done(frame);
   }
 }

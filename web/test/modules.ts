@@ -9,3 +9,5 @@ export { Native } from "../src/native/memory.ts";
 export { ClothDriver } from "../src/cloth/driver.ts";
 export { pinned, shareOf } from "../src/cloth/garment.ts";
 export { buildModel } from "../src/cloth/model.ts";
+export { harmonicsOf, matrices, WHITE } from "../src/light/irradiance.ts";
+export { isRadiance, readRadiance } from "../src/light/radiance.ts";

@@ -2,6 +2,7 @@
 // (web/kernels.mjs); the rasteriser of smplxpp/native/gaussians does the same in its own way.
 #include <algorithm>
 #include <cfloat>
+#include <cmath>
 #include <cstring>
 #include <vector>
 
@@ -35,8 +36,25 @@ void covariance(const float* q, const float* s, float* out) {
     out[3] = dot(row[1], row[1]), out[4] = dot(row[1], row[2]), out[5] = dot(row[2], row[2]);
 }
 
+// Cosine beyond which a surface that turns away shows its inner side (avatar/runtime/relighting.py).
+constexpr float AWAY = 0.35f;
+constexpr float HALF = 2047.0f;  // of twelve bits
+
+// A unit normal as one whole number that a float holds exactly: the octahedron unfolded onto a square of 4095 x 4095, as
+// Cigolle et al. 2014 describe it. Where there is none: 0.
+float folded(Vec n) {
+    const float sum = std::abs(n.x) + std::abs(n.y) + std::abs(n.z);
+    if (!(sum > 0.0f)) return 0.0f;
+    float u = n.x / sum, v = n.y / sum;
+    if (n.z < 0.0f) {
+        const float over = (1.0f - std::abs(v)) * (u < 0.0f ? -1.0f : 1.0f);
+        v = (1.0f - std::abs(u)) * (v < 0.0f ? -1.0f : 1.0f), u = over;
+    }
+    return 4096.0f * (std::round(HALF * u) + HALF + 1.0f) + std::round(HALF * v) + HALF + 1.0f;
+}
+
 template <int K>
-void write(const Splats& in, Vec eye, float* out) {
+void write(const Splats& in, Vec eye, const float* normals, float* out) {
     [[maybe_unused]] float basis[15];
     for (int64_t i = 0; i < in.count; ++i, out += RECORD) {
         const Vec mean = load(in.means + 3 * i);
@@ -51,24 +69,29 @@ void write(const Splats& in, Vec eye, float* out) {
         covariance(in.quats + 4 * i, in.scales + 3 * i, out + 4);
         store(out + 10, {std::max(color.x, 0.0f), std::max(color.y, 0.0f), std::max(color.z, 0.0f)});
         out[13] = 0.0f;
+        if (normals) {
+            const Vec normal = load(normals + 3 * i), away = mean - eye;
+            out[13] = folded(dot(normal, away) > AWAY * length(away) ? -1.0f * normal : normal);
+        }
     }
 }
 
 }  // namespace
 
-// Centre, opacity, covariance and colour of `rows` Gaussians in an order, as an eye (3, metres) sees them: records
-// (rows, 14).
-SMPLXPP_EXPORT int32_t smplxpp_web_records(const Splats* in, const float* eye, const uint32_t* order, int64_t rows, float* records) {
+// Centre, opacity, covariance, colour and normal of `rows` Gaussians in an order, as an eye (3, metres) sees them: records
+// (rows, 14). normals (N, 3) or null: nobody asks for them.
+SMPLXPP_EXPORT int32_t smplxpp_web_records(const Splats* in, const float* eye, const float* normals, const uint32_t* order, int64_t rows,
+                                           float* records) {
     return smplxpp::guarded([&] {
         smplxpp::check_indices(order, rows, in->count);
         // All of them as they lie in memory, then into the order: one jump in memory for each instead of eight.
         std::vector<float> all(RECORD * in->count);
         const Vec from = load(eye);
         switch (in->harmonics) {
-            case 0: write<0>(*in, from, all.data()); break;
-            case 3: write<3>(*in, from, all.data()); break;
-            case 8: write<8>(*in, from, all.data()); break;
-            case 15: write<15>(*in, from, all.data()); break;
+            case 0: write<0>(*in, from, normals, all.data()); break;
+            case 3: write<3>(*in, from, normals, all.data()); break;
+            case 8: write<8>(*in, from, normals, all.data()); break;
+            case 15: write<15>(*in, from, normals, all.data()); break;
             default: smplxpp::throw_out_of_range("harmonics");
         }
         for (int64_t r = 0; r < rows; ++r) std::memcpy(records + RECORD * r, all.data() + RECORD * order[r], RECORD * sizeof(float));

@@ -5,7 +5,9 @@ import type { Avatar, Pose, RestShapes } from "./avatar.ts";
 import { BlendAdder } from "./blend.ts";
 import { FieldEvaluator } from "./field.ts";
 
-/** Numbers of a Gaussian for the renderers: centre 3, opacity, covariance 6 (xx xy xz yy yz zz), colour 3, unused. */
+/**
+ * Numbers of a Gaussian for the renderers: centre 3, opacity, covariance 6 (xx xy xz yy yz zz), colour 3, and
+ * the normal that the eye sees, where it was asked for (folded by `web/splats.cpp`). */
 export const RECORD = 14;
 const BODY_JOINTS = 21;
 /** What a pose takes time for, as `avatar.runtime.player` counts it. */
@@ -50,6 +52,8 @@ export class Deformer {
   };
   private readonly eye: Block<Float32Array>;
   private readonly records: Block<Float32Array>;
+  /** What normals are made of and written to; null: they were never asked for. */
+  private shading: Record<"first" | "faces" | "barycentric" | "corners" | "normals", Block<Float32Array | Int32Array>> | null = null;
 
   constructor(readonly avatar: Avatar, private readonly clock = () => performance.now()) {
     const { native } = this, { mesh, skeleton, gaussians: g, field } = avatar;
@@ -159,11 +163,27 @@ export class Deformer {
     return { count: own.count.view[0], depths: [least, most] };
   }
 
-  /** Returns `RECORD` numbers of each of the first `count` of the last order as an eye (metres) sees them; good until the next pose. */
-  recordsFor(eye: ArrayLike<number>, count: number): Float32Array {
+  /**
+   * Returns `RECORD` numbers of each of the first `count` of the last order as an eye (metres) sees them; good until the
+   * next pose.
+   *
+   * @param lit with normals.
+   */
+  recordsFor(eye: ArrayLike<number>, count: number, lit = false): Float32Array {
     this.eye.view.set(eye);
-    this.native.run("web_records", this.splats, this.eye, this.sorting.order, BigInt(count), this.records);
+    this.native.run("web_records", this.splats, this.eye, lit ? this.normals() : null, this.sorting.order, BigInt(count), this.records);
     return this.records.view.subarray(0, RECORD * count);
+  }
+
+  /** (N, 3) unit normals of the last pose's surface where the Gaussians hang on it. */
+  private normals(): Block<Float32Array | Int32Array> {
+    const { native, avatar: { mesh, gaussians: g } } = this, V = mesh.vertices.length / 3, F = mesh.faces.length / 3;
+    const own = (this.shading ??= {
+      faces: native.keep(mesh.faces), first: native.keep(g.first), barycentric: native.keep(g.barycentric),
+      corners: native.floats(3 * V), normals: native.floats(3 * g.count),
+    });
+    native.run("web_normals", BigInt(V), BigInt(F), this.posed, own.faces, own.first, own.barycentric, own.corners, own.normals);
+    return own.normals;
   }
 
   private shape({ rows, basis, size }: Basis, coefficients: Block<Float32Array>): void {

@@ -13,6 +13,8 @@ export interface Picture {
   blur: number;
   /** The least and the largest depth, metres. */
   depths: readonly [number, number];
+  /** Another light than the capture's (`light/irradiance.ts`, `matrices`); null: that one. The records have normals then. */
+  light: Float32Array | null;
 }
 
 export interface Renderer {

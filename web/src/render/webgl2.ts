@@ -1,23 +1,34 @@
 /** Gaussians by WebGL2: they come sorted, nearest first, and are blended into a target of half floats. */
 
 import { RECORD } from "../avatar/deform.ts";
+import { MATRICES } from "../light/irradiance.ts";
 import type { Camera } from "./camera.ts";
 import type { Picture, Renderer } from "./renderer.ts";
-import { RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE_VERTEX } from "./webgl2_shaders.ts";
+import { lit, RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE_VERTEX } from "./webgl2_shaders.ts";
 
 /** Attributes of a record: how many numbers each. */
 const ATTRIBUTES = [4, 4, 2, 4];
 
-interface Resources {
+/** Colours, and normals beside them where the picture is in another light. */
+interface Programs {
   splats: WebGLProgram;
   resolve: WebGLProgram;
+}
+
+interface Resources {
+  plain: Programs;
+  /** Made when it is asked for. */
+  lit: Programs | null;
   array: WebGLVertexArrayObject;
   buffer: WebGLBuffer;
   capacity: number;
   target: WebGLFramebuffer;
   texture: WebGLTexture;
+  normals: WebGLTexture | null;
   width: number;
   height: number;
+  /** Targets are of half floats: normals, which are negative too, need them. */
+  fine: boolean;
 }
 
 /** A camera, and the lower left corner of the pixels that its picture goes to. */
@@ -27,7 +38,7 @@ export interface Window {
   y: number;
 }
 
-type Shown = Pick<Picture, "count" | "background" | "blur">;
+type Shown = Pick<Picture, "count" | "background" | "blur" | "light">;
 
 interface Timer {
   TIME_ELAPSED_EXT: number;
@@ -68,13 +79,13 @@ export class WebGL2Renderer implements Renderer {
     return fence !== null && !this.lost && gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED;
   }
 
-  draw({ records, count, camera, background, blur }: Picture): void {
+  draw({ records, count, camera, background, blur, light }: Picture): void {
     if (this.lost) return;
     const { gl, canvas } = this, { width, height } = camera;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     this.upload(records, count);
     const timed = this.startTimer();
-    this.paint({ camera, x: 0, y: 0 }, null, { count, background, blur });
+    this.paint({ camera, x: 0, y: 0 }, null, { count, background, blur, light });
     if (timed) gl.endQuery(this.timer!.TIME_ELAPSED_EXT);
     gl.deleteSync(this.fence);
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -95,16 +106,18 @@ export class WebGL2Renderer implements Renderer {
   }
 
   /** Draws what was uploaded last into a part of a framebuffer; null: the canvas. */
-  paint({ camera, x, y }: Window, framebuffer: WebGLFramebuffer | null, { count, background, blur }: Shown): void {
+  paint({ camera, x, y }: Window, framebuffer: WebGLFramebuffer | null, { count, background, blur, light }: Shown): void {
     const { gl, resources: own } = this, { width, height, view } = camera;
-    this.fit(width, height);
+    const isLit = light !== null && own.fine;
+    this.fit(width, height, isLit);
+    const { splats, resolve } = isLit ? (own.lit ??= this.programs(lit)) : own.plain;
     gl.bindVertexArray(own.array);
     gl.bindFramebuffer(gl.FRAMEBUFFER, own.target);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.useProgram(own.splats);
-    const at = (name: string) => gl.getUniformLocation(own.splats, name);
+    gl.useProgram(splats);
+    const at = (name: string) => gl.getUniformLocation(splats, name);
     // Rows of the view are columns here.
     const rotation = [0, 1, 2].flatMap((c) => [view[c], view[4 + c], view[8 + c]]);
     gl.uniformMatrix3fv(at("rotation"), false, rotation);
@@ -119,10 +132,19 @@ export class WebGL2Renderer implements Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.viewport(x, y, width, height);
     gl.disable(gl.BLEND);
-    gl.useProgram(own.resolve);
+    gl.useProgram(resolve);
     gl.bindTexture(gl.TEXTURE_2D, own.texture);
-    gl.uniform3f(gl.getUniformLocation(own.resolve, "background"), ...background);
-    gl.uniform2i(gl.getUniformLocation(own.resolve, "corner"), x, y);
+    const to = (name: string) => gl.getUniformLocation(resolve, name);
+    gl.uniform3f(to("background"), ...background);
+    gl.uniform2i(to("corner"), x, y);
+    if (isLit) {
+      gl.activeTexture(gl.TEXTURE1);
+      gl.bindTexture(gl.TEXTURE_2D, own.normals);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.uniform1i(to("normals"), 1);
+      gl.uniformMatrix4fv(to("light"), false, light.subarray(0, MATRICES / 2));
+      gl.uniformMatrix4fv(to("captured"), false, light.subarray(MATRICES / 2));
+    }
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
   }
@@ -180,26 +202,43 @@ export class WebGL2Renderer implements Renderer {
     });
     gl.bindVertexArray(null);
     return {
-      splats: this.program(SPLAT_VERTEX, SPLAT_FRAGMENT),
-      resolve: this.program(WHOLE_VERTEX, RESOLVE_FRAGMENT),
+      plain: this.programs((shader) => shader), lit: null,
       array, buffer, capacity: 0,
-      target: gl.createFramebuffer(), texture: gl.createTexture(), width: 0, height: 0,
+      target: gl.createFramebuffer(), texture: gl.createTexture(), normals: null, width: 0, height: 0,
+      fine: Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")),
     };
   }
 
-  /** Gives the target the picture's size. */
-  private fit(width: number, height: number): void {
+  private programs(kind: (shader: string) => string): Programs {
+    return {
+      splats: this.program(kind(SPLAT_VERTEX), kind(SPLAT_FRAGMENT)), resolve: this.program(WHOLE_VERTEX, kind(RESOLVE_FRAGMENT)),
+    };
+  }
+
+  /** Gives the target the picture's size, and normals where it is lit. */
+  private fit(width: number, height: number, lit: boolean): void {
     const { gl, resources: own } = this;
-    if (own.width === width && own.height === height) return;
+    if (own.width === width && own.height === height && lit === (own.normals !== null)) return;
     [own.width, own.height] = [width, height];
-    const fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
-    gl.bindTexture(gl.TEXTURE_2D, own.texture);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, own.target);
+    this.attach(own.texture, gl.COLOR_ATTACHMENT0);
+    if (!lit) gl.deleteTexture(own.normals);
+    own.normals = lit ? (own.normals ?? gl.createTexture()) : null;
+    // A texture that is gone must not stay attached.
+    if (own.normals) this.attach(own.normals, gl.COLOR_ATTACHMENT1);
+    else gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, null, 0);
+    gl.drawBuffers(lit ? [gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1] : [gl.COLOR_ATTACHMENT0]);
+  }
+
+  /** Gives a texture the target's size, and the target that texture. */
+  private attach(texture: WebGLTexture, at: number): void {
+    const { gl, resources: { width, height, fine } } = this;
+    gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, fine ? gl.RGBA16F : gl.RGBA8, width, height, 0, gl.RGBA,
       fine ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE, null);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, own.target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, own.texture, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, at, gl.TEXTURE_2D, texture, 0);
   }
 
   private program(vertex: string, fragment: string): WebGLProgram {

@@ -1,5 +1,10 @@
 /** Projection and blending as `docs/rendering.md` says, in GLSL. */
 
+/** A shader of pictures in another light: with `LIT` normals are blended beside colours. */
+export function lit(shader: string): string {
+  return shader.replace("\n", "\n#define LIT\n");
+}
+
 /** One Gaussian an instance, four corners: the ellipse where alpha reaches 1/255, along its own axes. */
 export const SPLAT_VERTEX = `#version 300 es
 precision highp float;
@@ -15,6 +20,18 @@ uniform float blur;
 out vec2 at;
 flat out vec4 paint;
 flat out float reach;
+#ifdef LIT
+flat out vec3 facing;
+
+// What web/splats.cpp has folded.
+vec3 unfolded(float code) {
+  if (code == 0.0) return vec3(0.0);
+  float high = floor(code / 4096.0);
+  vec2 at = (vec2(high, code - 4096.0 * high) - 2048.0) / 2047.0;
+  float z = 1.0 - abs(at.x) - abs(at.y), over = max(-z, 0.0);
+  return normalize(vec3(at.x - (at.x < 0.0 ? -over : over), at.y - (at.y < 0.0 ? -over : over), z));
+}
+#endif
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
@@ -43,6 +60,9 @@ void main() {
   vec2 pixel = center + corner.x * longer * along + corner.y * shorter * vec2(-along.y, along.x);
   at = corner;
   paint = vec4(color.rgb, place.w);
+#ifdef LIT
+  facing = unfolded(color.w);
+#endif
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }`;
 
@@ -52,13 +72,20 @@ precision highp float;
 in vec2 at;
 flat in vec4 paint;
 flat in float reach;
-out vec4 result;
+layout(location = 0) out vec4 result;
+#ifdef LIT
+flat in vec3 facing;
+layout(location = 1) out vec4 normal;
+#endif
 
 void main() {
   float square = dot(at, at);
   if (square > 1.0) discard;
   float alpha = min(0.999, paint.a * exp(-reach * square));
   result = vec4(paint.rgb * alpha, alpha);
+#ifdef LIT
+  normal = vec4(facing * alpha, alpha);
+#endif
 }`;
 
 /** Two triangles over everything. */
@@ -73,8 +100,34 @@ uniform sampler2D blended;
 uniform vec3 background;
 uniform ivec2 corner;
 out vec4 result;
+#ifdef LIT
+uniform sampler2D normals;
+uniform mat4 light[3];
+uniform mat4 captured[3];
+
+vec3 irradiance(mat4 colors[3], vec4 n) {
+  return max(vec3(dot(n, colors[0] * n), dot(n, colors[1] * n), dot(n, colors[2] * n)), 0.0);
+}
+
+// As smplxpp.core.light.Relighting does: in linear light, what is beyond white cut off.
+vec3 relit(vec3 color, vec3 normal) {
+  vec3 srgb = clamp(color, 0.0, 1.0);
+  vec3 linear = mix(srgb / 12.92, pow((srgb + 0.055) / 1.055, vec3(2.4)), step(0.04045, srgb));
+  float size = length(normal);
+  if (size > 1e-6) {
+    vec4 n = vec4(normal / size, 1.0);
+    linear *= irradiance(light, n) / max(irradiance(captured, n), 0.02);
+  }
+  linear = min(linear, 1.0);
+  return mix(12.92 * linear, 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, linear));
+}
+#endif
 
 void main() {
   vec4 value = texelFetch(blended, ivec2(gl_FragCoord.xy) - corner, 0);
+#ifdef LIT
+  float share = 1.0 - value.a;
+  if (share > 1e-3) value.rgb = share * relit(value.rgb / share, texelFetch(normals, ivec2(gl_FragCoord.xy) - corner, 0).xyz);
+#endif
   result = vec4(value.rgb + value.a * background, 1.0);
 }`;

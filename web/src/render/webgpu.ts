@@ -1,9 +1,10 @@
 /** Gaussians by WebGPU: projected, sorted by radix and drawn on the GPU, in any order that they come. */
 
 import { RECORD } from "../avatar/deform.ts";
+import { MATRICES } from "../light/irradiance.ts";
 import type { Picture, Renderer } from "./renderer.ts";
 import {
-  COUNT, DIGITS, DRAW, KEY_BITS, PASSES, PROJECT, RESOLVE, SCAN, SCATTER, SCENE_BYTES, TILE_KEYS,
+  COUNT, DIGITS, draw, KEY_BITS, PASSES, PROJECT, resolve, SCAN, SCATTER, SCENE_BYTES, TILE_KEYS,
 } from "./webgpu_shaders.ts";
 
 const BLENDED: GPUTextureFormat = "rgba16float", READ: GPUTextureFormat = "rgba8unorm";
@@ -15,12 +16,22 @@ const SPLAT_BYTES = 32, PROJECT_THREADS = 64, ROW_ALIGNMENT = 256;
 interface Buffers {
   count: number;
   records: GPUBuffer;
-  counts: GPUBuffer;
+  /** What splats are drawn of. */
+  drawn: GPUBuffer[];
   project: GPUBindGroup;
   count_: GPUBindGroup[];
   scan: GPUBindGroup;
   scatter: GPUBindGroup[];
-  draw: GPUBindGroup;
+  plain: GPUBindGroup;
+  /** Made when it is asked for. */
+  lit: GPUBindGroup | null;
+}
+
+/** What draws and shows; with another light normals are drawn, too. */
+interface Painting {
+  draw: GPURenderPipeline;
+  resolve: GPURenderPipeline;
+  resolveToRead: GPURenderPipeline;
 }
 
 interface Pipelines {
@@ -28,9 +39,9 @@ interface Pipelines {
   count: GPUComputePipeline;
   scan: GPUComputePipeline;
   scatter: GPUComputePipeline;
-  draw: GPURenderPipeline;
-  resolve: GPURenderPipeline;
-  resolveToRead: GPURenderPipeline;
+  plain: Painting;
+  /** Made when it is asked for. */
+  lit: Painting | null;
 }
 
 export class WebGPURenderer implements Renderer {
@@ -43,9 +54,12 @@ export class WebGPURenderer implements Renderer {
   private pipelines!: Pipelines;
   private scene!: GPUBuffer;
   private background!: GPUBuffer;
+  private lights!: GPUBuffer;
   private shifts: GPUBuffer[] = [];
   private buffers: Buffers | null = null;
   private target: GPUTexture | null = null;
+  /** Of the last picture; null: it was in the capture's light. */
+  private normals: GPUTexture | null = null;
 
   private constructor(private readonly canvas: HTMLCanvasElement, private readonly context: GPUCanvasContext) {}
 
@@ -65,10 +79,11 @@ export class WebGPURenderer implements Renderer {
     return this.pending >= MOST_PENDING;
   }
 
-  draw({ records, count, camera, background, blur, depths }: Picture): void {
+  draw({ records, count, camera, background, blur, depths, light }: Picture): void {
     if (this.lost) return;
     const { device, pipelines } = this, { width, height, view } = camera;
-    this.fit(width, height);
+    this.fit(width, height, light !== null);
+    if (light) device.queue.writeBuffer(this.lights, 0, light as Float32Array<ArrayBuffer>);
     const own = this.sized(records.length / RECORD), tiles = Math.max(1, Math.ceil(count / TILE_KEYS));
     const scene = new ArrayBuffer(SCENE_BYTES);
     new Float32Array(scene).set([...view, camera.fx, camera.fy, camera.cx, camera.cy, width, height, blur]);
@@ -93,15 +108,17 @@ export class WebGPURenderer implements Renderer {
       run(pipelines.scatter, own.scatter[pass], tiles);
     }
     compute.end();
-    const blended = this.target!.createView();
+    const targets = light ? [this.target!, this.normals!] : [this.target!], painting = this.painting();
     const splats = encoder.beginRenderPass({
-      colorAttachments: [{ view: blended, loadOp: "clear", storeOp: "store", clearValue: [0, 0, 0, 1] }],
+      colorAttachments: targets.map((target) => ({
+        view: target.createView(), loadOp: "clear", storeOp: "store", clearValue: [0, 0, 0, 1],
+      })),
     });
-    splats.setPipeline(pipelines.draw);
-    splats.setBindGroup(0, own.draw);
+    splats.setPipeline(painting.draw);
+    splats.setBindGroup(0, light ? (own.lit ??= this.group(painting.draw, [...own.drawn, own.records])) : own.plain);
     if (count) splats.draw(4, count);
     splats.end();
-    this.resolve(encoder, pipelines.resolve, this.context.getCurrentTexture().createView());
+    this.resolve(encoder, painting.resolve, this.context.getCurrentTexture().createView());
     const submitted = performance.now();
     device.queue.submit([encoder.finish()]);
     ++this.pending;
@@ -119,7 +136,7 @@ export class WebGPURenderer implements Renderer {
     const texture = device.createTexture({ size: [width, height], format: READ, usage });
     const buffer = device.createBuffer({ size: row * height, usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ });
     const encoder = device.createCommandEncoder();
-    this.resolve(encoder, this.pipelines.resolveToRead, texture.createView());
+    this.resolve(encoder, this.painting().resolveToRead, texture.createView());
     encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow: row }, [width, height]);
     device.queue.submit([encoder.finish()]);
     await buffer.mapAsync(GPUMapMode.READ);
@@ -143,6 +160,9 @@ export class WebGPURenderer implements Renderer {
       entries: [
         { binding: 0, resource: this.target!.createView() },
         { binding: 1, resource: { buffer: this.background } },
+        ...(this.normals
+          ? [{ binding: 2, resource: this.normals.createView() }, { binding: 3, resource: { buffer: this.lights } }]
+          : []),
       ],
     }));
     pass.draw(3);
@@ -157,13 +177,14 @@ export class WebGPURenderer implements Renderer {
     const uniform = (size: number) => device.createBuffer({ size, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
     this.scene = uniform(SCENE_BYTES);
     this.background = uniform(16);
+    this.lights = uniform(4 * MATRICES);
     this.shifts = Array.from({ length: PASSES }, (_, pass) => {
       const buffer = uniform(16);
       device.queue.writeBuffer(buffer, 0, new Uint32Array([(pass * KEY_BITS) / PASSES]));
       return buffer;
     });
     this.buffers = null;
-    this.target = null;
+    this.target = this.normals = null;
     this.pipelines = await makePipelines(device, format);
     this.lost = false;
   }
@@ -175,13 +196,34 @@ export class WebGPURenderer implements Renderer {
     if (device) await this.start(device);
   }
 
-  private fit(width: number, height: number): void {
+  /** What the last picture is drawn by. */
+  private painting(): Painting {
+    const { device, pipelines } = this;
+    if (!this.normals) return pipelines.plain;
+    if (!pipelines.lit) {
+      const made = paintings(device, navigator.gpu.getPreferredCanvasFormat(), true).map((it) => device.createRenderPipeline(it));
+      pipelines.lit = asPainting(made);
+    }
+    return pipelines.lit;
+  }
+
+  private group(pipeline: GPUComputePipeline | GPURenderPipeline, buffers: GPUBuffer[]): GPUBindGroup {
+    const entries = buffers.map((buffer, binding) => ({ binding, resource: { buffer } }));
+    return this.device.createBindGroup({ layout: pipeline.getBindGroupLayout(0), entries });
+  }
+
+  /** Gives the targets the picture's size; normals have one where it is lit. */
+  private fit(width: number, height: number, lit: boolean): void {
     const { canvas } = this;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    if (this.target?.width === width && this.target.height === height) return;
-    this.target?.destroy();
+    const fits = this.target?.width === width && this.target.height === height;
+    if (fits && lit === (this.normals !== null)) return;
     const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.TEXTURE_BINDING;
-    this.target = this.device.createTexture({ size: [width, height], format: BLENDED, usage });
+    const make = () => this.device.createTexture({ size: [width, height], format: BLENDED, usage });
+    this.target?.destroy();
+    this.normals?.destroy();
+    this.target = make();
+    this.normals = lit ? make() : null;
   }
 
   /** Buffers for so many Gaussians. */
@@ -193,21 +235,18 @@ export class WebGPURenderer implements Renderer {
     const records = storage(4 * RECORD * count), splats = storage(SPLAT_BYTES * count);
     const keys = [storage(4 * count), storage(4 * count)], order = [storage(4 * count), storage(4 * count)];
     const counts = storage(4 * DIGITS * Math.max(1, Math.ceil(count / TILE_KEYS)));
-    const group = (pipeline: GPUComputePipeline | GPURenderPipeline, ...buffers: GPUBuffer[]) =>
-      device.createBindGroup({
-        layout: pipeline.getBindGroupLayout(0),
-        entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })),
-      });
+    const group = (pipeline: GPUComputePipeline | GPURenderPipeline, ...buffers: GPUBuffer[]) => this.group(pipeline, buffers);
+    const drawn = [scene, splats, order[0]];
     const passes = this.shifts.map((shift, pass) => ({ shift, from: pass % 2, to: 1 - (pass % 2) }));
     // An even number of passes ends where it began.
     this.buffers = {
-      count, records, counts,
+      count, records, drawn, lit: null,
       project: group(pipelines.project, scene, records, splats, keys[0], order[0]),
       count_: passes.map(({ shift, from }) => group(pipelines.count, scene, shift, keys[from], counts)),
       scan: group(pipelines.scan, scene, counts),
       scatter: passes.map(({ shift, from, to }) =>
         group(pipelines.scatter, scene, shift, counts, keys[from], order[from], keys[to], order[to])),
-      draw: group(pipelines.draw, scene, splats, order[0]),
+      plain: group(pipelines.plain.draw, ...drawn),
     };
     return this.buffers;
   }
@@ -245,23 +284,36 @@ async function canShow(device: GPUDevice): Promise<boolean> {
 async function makePipelines(device: GPUDevice, format: GPUTextureFormat): Promise<Pipelines> {
   const compute = (code: string, entryPoint: string) =>
     device.createComputePipelineAsync({ layout: "auto", compute: { module: device.createShaderModule({ code }), entryPoint } });
-  const render = (code: string, entries: [string, string], target: GPUColorTargetState, topology: GPUPrimitiveTopology) => {
+  const [[project, count, scan, scatter], painting] = await Promise.all([
+    Promise.all([compute(PROJECT, "project"), compute(COUNT, "count"), compute(SCAN, "scan"), compute(SCATTER, "scatter")]),
+    Promise.all(paintings(device, format, false).map((it) => device.createRenderPipelineAsync(it))),
+  ]);
+  return { project, count, scan, scatter, plain: asPainting(painting), lit: null };
+}
+
+function asPainting([draw, resolve, resolveToRead]: GPURenderPipeline[]): Painting {
+  return { draw, resolve, resolveToRead };
+}
+
+/** What draws splats, shows them on the canvas, and shows them to be read. */
+function paintings(device: GPUDevice, format: GPUTextureFormat, lit: boolean): GPURenderPipelineDescriptor[] {
+  const painting = (
+    code: string, entries: [string, string], targets: GPUColorTargetState[], topology: GPUPrimitiveTopology,
+  ): GPURenderPipelineDescriptor => {
     const module = device.createShaderModule({ code });
-    return device.createRenderPipelineAsync({
+    return {
       layout: "auto", primitive: { topology },
-      vertex: { module, entryPoint: entries[0] },
-      fragment: { module, entryPoint: entries[1], targets: [target] },
-    });
+      vertex: { module, entryPoint: entries[0] }, fragment: { module, entryPoint: entries[1], targets },
+    };
   };
   const under: GPUBlendState = {
     color: { srcFactor: "dst-alpha", dstFactor: "one", operation: "add" },
     alpha: { srcFactor: "zero", dstFactor: "one-minus-src-alpha", operation: "add" },
   };
-  const [project, count, scan, scatter, draw, resolve, resolveToRead] = await Promise.all([
-    compute(PROJECT, "project"), compute(COUNT, "count"), compute(SCAN, "scan"), compute(SCATTER, "scatter"),
-    render(DRAW, ["corner", "blend"], { format: BLENDED, blend: under }, "triangle-strip"),
-    render(RESOLVE, ["whole", "resolve"], { format }, "triangle-list"),
-    render(RESOLVE, ["whole", "resolve"], { format: READ }, "triangle-list"),
-  ]);
-  return { project, count, scan, scatter, draw, resolve, resolveToRead };
+  const blended = new Array(lit ? 2 : 1).fill({ format: BLENDED, blend: under });
+  return [
+    painting(draw(lit), ["corner", "blend"], blended, "triangle-strip"),
+    painting(resolve(lit), ["whole", "resolve"], [{ format }], "triangle-list"),
+    painting(resolve(lit), ["whole", "resolve"], [{ format: READ }], "triangle-list"),
+  ];
 }

@@ -182,16 +182,21 @@ fn scatter(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_index) 
 }
 `;
 
-/** One splat an instance, nearest first; the target's alpha is what still shines through. */
-export const DRAW = /* wgsl */ `${SCENE}
+/**
+ * One splat an instance, nearest first; the target's alpha is what still shines through.
+ *
+ * @param lit normals are blended beside colours, for pictures in another light.
+ */
+export const draw = (lit: boolean) => /* wgsl */ `${SCENE}
 @group(0) @binding(0) var<uniform> scene: Scene;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;
-
+${lit ? UNFOLD : ""}
 struct Corner {
   @builtin(position) position: vec4f,
   @location(0) at: vec2f,
   @location(1) @interpolate(flat) paint: vec4f,
+  ${lit ? "@location(2) @interpolate(flat) facing: vec3f," : ""}
 }
 
 @vertex
@@ -201,22 +206,42 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   let pixel = splat.center + at.x * splat.longer + at.y * splat.shorter;
   let paint = vec4f(unpack2x16float(splat.color.x), unpack2x16float(splat.color.y));
   let position = vec4f(2.0 * pixel.x / scene.size.x - 1.0, 1.0 - 2.0 * pixel.y / scene.size.y, 0.0, 1.0);
-  return Corner(position, at, paint);
+  return Corner(position, at, paint${lit ? ", unfolded(records[14u * order[instance] + 13u])" : ""});
+}
+
+struct Blended {
+  @location(0) color: vec4f,
+  ${lit ? "@location(1) normal: vec4f," : ""}
 }
 
 @fragment
-fn blend(in: Corner) -> @location(0) vec4f {
+fn blend(in: Corner) -> Blended {
   let square = dot(in.at, in.at);
   if (square > 1.0) { discard; }
   let alpha = min(0.999, in.paint.a * exp(-log(255.0 * in.paint.a) * square));
-  return vec4f(in.paint.rgb * alpha, alpha);
+  return Blended(vec4f(in.paint.rgb * alpha, alpha)${lit ? ", vec4f(in.facing * alpha, alpha)" : ""});
 }
 `;
 
-export const RESOLVE = /* wgsl */ `
+/** What `web/splats.cpp` has folded. */
+const UNFOLD = /* wgsl */ `
+@group(0) @binding(3) var<storage, read> records: array<f32>;
+
+fn unfolded(code: f32) -> vec3f {
+  if (code == 0.0) { return vec3f(0.0); }
+  let high = floor(code / 4096.0);
+  let at = (vec2f(high, code - 4096.0 * high) - 2048.0) / 2047.0;
+  let z = 1.0 - abs(at.x) - abs(at.y);
+  let over = max(-z, 0.0);
+  return normalize(vec3f(at - select(vec2f(over), vec2f(-over), at < vec2f(0.0)), z));
+}
+`;
+
+/** The picture on its background; `isLit`: in another light. */
+export const resolve = (isLit: boolean) => /* wgsl */ `
 @group(0) @binding(0) var blended: texture_2d<f32>;
 @group(0) @binding(1) var<uniform> background: vec4f;
-
+${isLit ? RELIGHT : ""}
 @vertex
 fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
   return vec4f(4.0 * f32(vertex & 1u) - 1.0, 4.0 * f32(vertex >> 1u) - 1.0, 0.0, 1.0);
@@ -225,6 +250,36 @@ fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
 @fragment
 fn resolve(@builtin(position) at: vec4f) -> @location(0) vec4f {
   let value = textureLoad(blended, vec2i(at.xy), 0);
-  return vec4f(value.rgb + value.a * background.rgb, 1.0);
+  ${isLit ? "let rgb = shown(value, textureLoad(normals, vec2i(at.xy), 0).xyz);" : "let rgb = value.rgb;"}
+  return vec4f(rgb + value.a * background.rgb, 1.0);
+}
+`;
+
+/** As `smplxpp.core.light.Relighting` does: in linear light, what is beyond white cut off. */
+const RELIGHT = /* wgsl */ `
+struct Lights { light: array<mat4x4f, 3>, captured: array<mat4x4f, 3> }
+@group(0) @binding(2) var normals: texture_2d<f32>;
+@group(0) @binding(3) var<uniform> lights: Lights;
+
+fn irradiance(colors: array<mat4x4f, 3>, n: vec4f) -> vec3f {
+  return max(vec3f(dot(n, colors[0] * n), dot(n, colors[1] * n), dot(n, colors[2] * n)), vec3f(0.0));
+}
+
+fn relit(color: vec3f, normal: vec3f) -> vec3f {
+  let srgb = clamp(color, vec3f(0.0), vec3f(1.0));
+  var linear = select(pow((srgb + 0.055) / 1.055, vec3f(2.4)), srgb / 12.92, srgb <= vec3f(0.04045));
+  let size = length(normal);
+  if (size > 1e-6) {
+    let n = vec4f(normal / size, 1.0);
+    linear *= irradiance(lights.light, n) / max(irradiance(lights.captured, n), vec3f(0.02));
+  }
+  linear = min(linear, vec3f(1.0));
+  return select(1.055 * pow(linear, vec3f(1.0 / 2.4)) - 0.055, 12.92 * linear, linear <= vec3f(0.0031308));
+}
+
+fn shown(value: vec4f, normal: vec3f) -> vec3f {
+  let share = 1.0 - value.a;
+  if (share <= 1e-3) { return value.rgb; }
+  return share * relit(value.rgb / share, normal);
 }
 `;

@@ -5,7 +5,9 @@ import type { Player } from "../player.ts";
 import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
 import { Soundtrack } from "../sound/soundtrack.ts";
 import { enterStereo, offersStereo } from "../xr/stereo.ts";
+import { isRadiance } from "../light/radiance.ts";
 import { listen } from "./gestures.ts";
+import { lightOf, shine } from "./light.ts";
 import { makePanel } from "./panel.ts";
 
 const SPEEDS = [1, 0.5, 0.25, 2];
@@ -50,7 +52,7 @@ export class App {
       document.title = about.name;
       this.title.replaceChildren(element("h1", {}, about.name), element("p", {}, "SMPLX++ avatar"));
       this.panel?.remove();
-      this.panel = makePanel(this.player);
+      this.panel = makePanel(this.player, (message, title) => this.fail(message, title));
       this.title.after(this.panel);
       setIcon(this.menu, ICONS.settings);
       this.showControls(true);
@@ -155,7 +157,7 @@ export class App {
       event.preventDefault();
       document.body.classList.remove("dropping");
       const file = event.dataTransfer?.files[0];
-      if (file) this.open(file.arrayBuffer());
+      if (file) this.take(file);
     });
   }
 
@@ -165,6 +167,17 @@ export class App {
     setIcon(this.playButton, this.player.playing ? ICONS.pause : ICONS.play);
     this.playButton.title = said;
     this.playButton.ariaLabel = said;
+  }
+
+  /** Opens a file that was dropped: an avatar, or a panorama as light. */
+  private async take(file: File): Promise<void> {
+    const data = await file.arrayBuffer();
+    if (!isRadiance(new Uint8Array(data)) && !/\.(hdr|exr)$/i.test(file.name)) return this.open(data);
+    try {
+      shine(this.player, lightOf(data, file.name));
+    } catch (error) {
+      this.fail((error as Error).message, "This light cannot be shown");
+    }
   }
 
   private refresh(): void {

@@ -57,6 +57,13 @@ export function slider(
   return element("label", { class: "row" }, element("span", { title: label }, label), output, input);
 }
 
+/** A labelled switch. */
+export function toggle(name: string, set: (on: boolean) => void, on = true): HTMLElement {
+  const box = element("input", { type: "checkbox", checked: on });
+  box.addEventListener("change", () => set(box.checked));
+  return element("label", { class: "switch" }, name, box);
+}
+
 /** Colours a slider's track up to its thumb. */
 export function paintShare(input: HTMLInputElement): void {
   const [least, most] = [Number(input.min), Number(input.max)];

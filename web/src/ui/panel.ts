@@ -1,18 +1,20 @@
 /** What can be set: parts, face, pose; and what the avatar is. */
 
 import type { Player } from "../player.ts";
-import { element, slider } from "./elements.ts";
+import { element, slider, toggle } from "./elements.ts";
+import { lightPage } from "./light.ts";
 
 const TURN = { least: -90, most: 90, start: 0, step: 1 };
 const AXES = ["Bend", "Twist", "Tilt"];
 
-/** Makes the panel of the avatar that is open. */
-export function makePanel(player: Player): HTMLElement {
+/** Makes the panel of the avatar that is open. @param fail says what is wrong with a file. */
+export function makePanel(player: Player, fail: (message: string, title: string) => void): HTMLElement {
   const about = player.summary!;
   const pages: [string, HTMLElement][] = [];
   if (about.partNames.length > 1) pages.push(["Parts", parts(player)]);
   if (about.expressionNames.length) pages.push(["Face", face(player)]);
-  pages.push(["Pose", pose(player)], ["About", details(player)]);
+  const light = lightPage(player, (message) => fail(message, "This light cannot be shown"));
+  pages.push(["Pose", pose(player)], ["Light", page(light)], ["About", details(player)]);
 
   const tabs = element("div", { class: "tabs", role: "tablist" });
   const show = (chosen: number) => {
@@ -54,12 +56,6 @@ function parts(player: Player): HTMLElement {
     }, player.simulating));
   }
   return page(...rows);
-}
-
-function toggle(name: string, set: (on: boolean) => void, on = true): HTMLElement {
-  const box = element("input", { type: "checkbox", checked: on });
-  box.addEventListener("change", () => set(box.checked));
-  return element("label", { class: "switch" }, name, box);
 }
 
 function face(player: Player): HTMLElement {

@@ -13,6 +13,8 @@ export type Request =
       hidden: number[];
       /** In the order of depth; else as they come, for a renderer that sorts. */
       sorted: boolean;
+      /** With normals, for another light. */
+      lit: boolean;
       /** Of loose clothes' time since the last frame; Infinity: they start anew, null: they are not simulated. */
       seconds: number | null;
       /** Memory to fill, given back by the page. */
@@ -43,6 +45,7 @@ export type Reply =
   | { kind: "opened"; summary: Summary }
   | {
       kind: "frame"; records: ArrayBuffer; count: number; camera: Camera; depths: [number, number];
+      lit: boolean;
       /** Milliseconds. */
       deform: number; cloth: number; sort: number;
       /** Of the fastest particle of the clothes, metres a second. */

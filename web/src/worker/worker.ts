@@ -73,8 +73,8 @@ function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferab
   const sorted = performance.now();
   const size = 4 * RECORD * deformer.avatar.gaussians.count;
   const records = request.records?.byteLength === size ? request.records : new ArrayBuffer(size);
-  new Float32Array(records).set(deformer.recordsFor(eye(camera), count));
+  new Float32Array(records).set(deformer.recordsFor(eye(camera), count, request.lit));
   const packed = performance.now();
   const times = { cloth: moved - started, deform: posed - moved + (packed - sorted), sort: sorted - posed };
-  return [{ kind: "frame", records, count, camera, depths, speed: simulated ? simulated.speed : 0, ...times }, [records]];
+  return [{ kind: "frame", records, count, camera, depths, lit: request.lit, speed: simulated ? simulated.speed : 0, ...times }, [records]];
 }

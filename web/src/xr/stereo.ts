@@ -34,7 +34,7 @@ export async function enterStereo(player: Player): Promise<void> {
     const { middle, reach } = player.summary!;
     // From the page's world to the headset's.
     const shift = [-middle[0], floor - (middle[1] - reach), -AWAY - middle[2]];
-    let count = 0;
+    let count = 0, light: Float32Array | null = null;
     player.immersed = true;
     player.update();
     const draw = (now: number, frame: XRFrame): void => {
@@ -48,9 +48,10 @@ export async function enterStereo(player: Player): Promise<void> {
       if (fresh) {
         renderer.upload(new Float32Array(fresh.records), fresh.count);
         count = fresh.count;
+        light = player.lightOf(fresh);
         player.done(fresh);
       }
-      const shown = { count, background: BACKGROUND, blur: player.summary!.blur };
+      const shown = { count, background: BACKGROUND, blur: player.summary!.blur, light };
       for (const window of pose.views.flatMap((view) => windowOf(view, layer, shift))) renderer.paint(window, layer.framebuffer, shown);
     };
     session.requestAnimationFrame(draw);
