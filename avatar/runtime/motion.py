@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
 from avatar.runtime.bundle import AvatarBundle
+from smplxpp.body.pose_range import PoseRange
 from smplxpp.cloth.poses import pose_between
 from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_positive
 
-MARGIN = np.radians(10.0)
-"""Angle beyond what training saw of a joint that still counts as within it."""
 _SECOND = 1e-9
 
 
@@ -42,46 +39,7 @@ def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None
     return replace(BodyParams.concatenate([replace(one, fps=None) for one in frames]), fps=fps)
 
 
-@dataclass(frozen=True, eq=False)
-class PoseRange:
-    """How far the joints of theta turned in training.
-
-    Attributes:
-        middle: each joint's mean rotation. reach: the largest angle from it, with `MARGIN`, radians.
-    """
-
-    middle: Float64[np.ndarray, "21 3 3"]
-    reach: Float64[np.ndarray, " 21"]
-
-    @staticmethod
-    def of(bundle: AvatarBundle) -> PoseRange | None:
-        """Return the range of the poses that a bundle knows; None where it knows none."""
-        known = bundle.tensors.get("poses.known")
-        if known is None:
-            return None
-        rotations = matrix_from_rotvec(known.astype(np.float64).reshape(-1, 21, 3))
-        # The nearest rotation to the mean of the matrices.
-        u, _, vt = np.linalg.svd(rotations.mean(axis=0))
-        u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-        middle = u @ vt
-        reach = np.linalg.norm(rotvec_from_matrix(np.swapaxes(middle, 1, 2) @ rotations), axis=2).max(axis=0)
-        return PoseRange(middle, reach + MARGIN)
-
-    def outside(self, params: BodyParams) -> Bool[np.ndarray, "T 21"]:
-        """Return which joints turn farther than in training, frame by frame."""
-        return np.linalg.norm(self._from_middle(params), axis=2) > self.reach
-
-    def clamped(self, params: BodyParams) -> BodyParams:
-        """Return a motion whose joints turn no farther than in training; those that do not are left as they are."""
-        away = self._from_middle(params)
-        angle = np.linalg.norm(away, axis=2)
-        too_far: Int64[np.ndarray, "n 2"] = np.argwhere(angle > self.reach)
-        theta = np.array(params.body_pose).reshape(-1, 21, 3)
-        for frame, joint in too_far:
-            held = away[frame, joint] * (self.reach[joint] / angle[frame, joint])
-            theta[frame, joint] = rotvec_from_matrix(self.middle[joint] @ matrix_from_rotvec(held))
-        return replace(params, body_pose=theta.reshape(len(params), -1))
-
-    def _from_middle(self, params: BodyParams) -> Float64[np.ndarray, "T 21 3"]:
-        rotations = matrix_from_rotvec(np.asarray(params.body_pose).reshape(-1, 21, 3))
-        return rotvec_from_matrix(np.swapaxes(self.middle, 1, 2) @ rotations)
+def pose_range(bundle: AvatarBundle) -> PoseRange | None:
+    """Return the range of the poses that a bundle knows; None where it knows none."""
+    known = bundle.tensors.get("poses.known")
+    return None if known is None else PoseRange.of(known)

@@ -90,11 +90,21 @@ def _aligned(decoder: Any, data: bytes, words: list[str]) -> list[Phoneme] | Non
         return None
     out = []
     for word in alignment:
-        for phone in word:
+        phones = [phone for phone in word if phone.duration > 0]
+        vowels = [phone.name for phone in phones if phone.name in VOWELS]
+        stresses = iter(_stresses(word.name.split("(")[0], len(vowels)))
+        for phone in phones:
             known = phone.name in VOWELS | CONSONANTS
             start = phone.start * _FRAME
-            out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * _FRAME))
+            stress = next(stresses) if phone.name in VOWELS else 0
+            out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * _FRAME, stress))
     return out
+
+
+def _stresses(word: str, count: int) -> list[int]:
+    """The stress of a word's so many vowels, by the dictionary; none where it has another number of them."""
+    known = [int(one[-1]) for one in phones_of(word)[0] if one[-1].isdigit()]
+    return known if len(known) == count else [0] * count
 
 
 def _clipped(phonemes: list[Phoneme], seconds: float) -> list[Phoneme]:

@@ -10,6 +10,7 @@ _CLOSING, _CLOSED, _OPENING = 0.07, 0.04, 0.15  # seconds of a blink
 _GLANCE_EVERY, _GLANCE = 1.6, np.radians([1.2, 2.5, 0.0])  # seconds; spread about x and y, radians
 _SACCADE = 0.04  # seconds from one glance to the next
 _NOD = np.radians([1.6, 2.0, 0.8])  # of the head about x, y and z, radians
+_NOD_EVERY, _NODDING, _NOD_DEPTH = (1.5, 5.0), 0.5, np.radians(5.0)  # seconds, seconds, radians
 _WAVES = ((0.13, 0.6), (0.31, 0.3), (0.73, 0.15))  # Hz and share of the head's motion
 
 
@@ -45,4 +46,16 @@ def head_motion(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> F
         phase = rng.uniform(0.0, 2.0 * np.pi, 3)
         speed = 2.0 * np.pi * rate * rng.uniform(0.85, 1.15, 3)
         out += share * _NOD * (np.sin(times[:, None] * speed + phase) - np.sin(phase))
+    return out
+
+
+def nods(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> Float64[np.ndarray, " T"]:
+    """How far a listener's head is lowered, radians: once or twice every few seconds."""
+    out = np.zeros(len(times))
+    at = float(rng.uniform(*_NOD_EVERY))
+    while len(times) and at < times[-1]:
+        for k in range(int(rng.integers(1, 3))):
+            u = np.clip((times - at - k * _NODDING) / _NODDING, 0.0, 1.0)
+            out += _NOD_DEPTH * 0.6**k * np.sin(np.pi * u) ** 2
+        at += 2.0 * _NODDING + float(rng.uniform(*_NOD_EVERY))
     return out

@@ -46,11 +46,13 @@ class Phoneme:
 
     Attributes:
         name: ARPAbet without stress, or `SILENCE`. start, end: seconds.
+        stress: of a vowel: 1 the word's main one, 2 a lesser one, 0 none, or nobody said.
     """
 
     name: str
     start: float
     end: float
+    stress: int = 0
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,14 @@ _ONES = (
 ).split()
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
 
+_SELDOM, _SELDOM_LAST = ("AH", "ER", "IH"), ("IY", "OW")
+# Words that carry no stress in a sentence.
+_WEAK = frozenset(
+    "a an the and or but nor as at by for from in into of on to with than that if is are was were be been am do does "
+    "did has have had he him his i it its me my she her them they their us we our you your can could shall should will "
+    "would may might must there some".split()
+)
+
 # Spelling to sound for words that no dictionary has; longer spellings first.
 _LETTERS = {
     **{"tion": "SH AH0 N", "igh": "AY1", "tch": "CH", "ch": "CH", "sh": "SH", "th": "TH", "ph": "F", "ck": "K"},
@@ -104,6 +112,8 @@ def phones_of(word: str) -> tuple[list[str], bool]:
         MissingExtraError: pocketsphinx, whose dictionary is read, is not installed.
     """
     known = cmu_dictionary().get(word)
+    if known is not None and word in _WEAK:
+        return [one + "0" if one[0] in "AEIOU" else one for one in known.split()], False
     if known is not None:
         return _stressed(known), False
     if word.endswith("'s") and word[:-2] in cmu_dictionary():
@@ -137,15 +147,15 @@ def cmu_dictionary() -> dict[str, str]:
 
 
 def _stressed(phones: str) -> list[str]:
-    """Give a word its likely stress, which the dictionary leaves out: on its first full vowel."""
-    out, seen = [], False
-    for one in phones.split():
-        if one[0] in "AEIOU":
-            reduced = one in ("AH", "ER") and (seen or phones.count(" ") < 2)
-            out.append(one + ("0" if reduced or seen else "1"))
-            seen = seen or not reduced
-        else:
-            out.append(one)
+    """Give a word its likely stress, which the dictionary leaves out: on its first full vowel, or its first.
+
+    AH, ER and IH are seldom full, nor are IY and OW at the end.
+    """
+    out = phones.split()
+    vowels = [k for k, one in enumerate(out) if one[0] in "AEIOU"]
+    full = [k for k in vowels if out[k] not in _SELDOM and not (k == len(out) - 1 and out[k] in _SELDOM_LAST)]
+    for k in vowels:
+        out[k] += "1" if k == (full or vowels)[0] else "0"
     return out
 
 

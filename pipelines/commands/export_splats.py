@@ -59,9 +59,9 @@ def writers(
 
 def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
     """Say how many of the poses training did not see."""
-    from avatar.runtime.motion import PoseRange
+    from avatar.runtime.motion import pose_range
 
-    limits = PoseRange.of(bundle)
+    limits = pose_range(bundle)
     outside = np.zeros(len(shown), bool) if limits is None else limits.outside(shown).any(axis=1)
     if not outside.any():
         return []

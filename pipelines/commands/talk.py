@@ -28,10 +28,11 @@ from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
-    from avatar.speech import Face, Speech
+    from avatar.speech import Face, Speech, Stance
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
+_HANGING = 0.7  # seconds
 _SMALLEST = 16  # pixels of a picture
 
 
@@ -56,15 +57,19 @@ class Talk:
     fps: float = 30.0
     """Frames a second."""
     seed: int = 0
-    """Of blinks, glances and the head's motion."""
+    """Of everything that is drawn: blinks, glances, gestures, breath."""
     strength: float = 1.0
     """How far the mouth moves; 1 as designed."""
     lively: float = 1.0
-    """How far head and eyes move; 0: not at all."""
+    """How far head, eyes and the standing body move; 0: not at all."""
+    gestures: float = 1.0
+    """How far arms and hands go; 0: they hang."""
     view: Literal["portrait", "front", "side", "three-quarter"] = "portrait"
     """What the film shows: head and shoulders, or the whole person."""
     height: int = 720
     """Height of the picture in pixels."""
+    cloth: Literal["simulate", "skin"] = "simulate"
+    """Loose clothes of a film: simulated, or moved by the student alone."""
     json: bool = False
     """Print what was written as JSON."""
 
@@ -78,10 +83,12 @@ class Talk:
             if suffix == FILM or self.web is not None or self.source.suffix.lower() == BUNDLE:
                 file = stack.enter_context(student_file(self.source))
             bundle = None if file is None else open_student(file)
-            face, seen = self._person(bundle)
-            config = TalkConfig(fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively)
+            face, stance = person_of_run(self.source) if bundle is None else person_of_bundle(bundle)
+            config = TalkConfig(
+                fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively, gestures=self.gestures
+            )
             sound, speech, said = self._speech()
-            motion = talking_motion(speech, face, _usual(seen), config)
+            motion = talking_motion(speech, face, stance, config)
             if self.sound_out is not None:
                 atomic_write_bytes(self.sound_out, wave_bytes(sound))
             if suffix == MOTION:
@@ -133,19 +140,6 @@ class Talk:
             checked_text(self.text)
         return suffix
 
-    def _person(self, bundle: AvatarBundle | None) -> tuple[Face, BodyParams]:
-        """The face that speaks, and frames that its body is known to stand in."""
-        from avatar.speech import Face
-
-        if bundle is not None:
-            seen = _motion_of(bundle)
-            about = bundle.about
-            return Face.of(about.expression_names, about.joint_names, seen), _whole(seen, len(about.expression_names))
-        template = load_run_template(self.source)
-        body = template.body
-        seen = load_params_of_run(self.source) if (self.source / PARAMS).is_file() else None
-        return Face.of(body.expression_names, body.joint_names, seen), _whole(seen, body.num_expressions)
-
     def _speech(self) -> tuple[Sound, Speech, list[str]]:
         """What is heard, and its phonemes."""
         if self.audio is not None:
@@ -162,35 +156,18 @@ class Talk:
 
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"
+        simulate = bool(bundle.garments) and self.cloth == "simulate"
+        # Cloth starts at rest in the first pose: it hangs before the film begins.
+        lead = round(_HANGING * self.fps) if simulate else 0
+        motion = BodyParams.concatenate([motion.select([0] * lead), motion]) if lead else motion
         film = StudentFilm(
             view="front" if portrait else self.view,
             height=self.height,
             width=None,
-            simulate=False,  # who stands still does not swing a skirt
+            simulate=simulate,
             clamp=False,
             below=_PORTRAIT if portrait else None,
         )
-        cameras, frames = student_frames(bundle, motion, range(len(motion)), film, said)
+        cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, said)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
         write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
-
-
-def _motion_of(bundle: AvatarBundle) -> BodyParams | None:
-    if not bundle.motion:
-        return None
-    arrays = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
-    return BodyParams.from_mapping(arrays, source="motion of the bundle")
-
-
-def _whole(seen: BodyParams | None, expressions: int) -> BodyParams:
-    """Frames with all expressions of the body; one at rest where there are none."""
-    if seen is None:
-        return BodyParams.rest(betas=0, expressions=expressions)
-    missing = expressions - seen.expression.shape[1]
-    return replace(seen.without_shape(), expression=np.pad(seen.expression, ((0, 0), (0, missing))))
-
-
-def _usual(seen: BodyParams) -> BodyParams:
-    """The frame whose body is nearest to the mean of all."""
-    away = np.linalg.norm(seen.body_pose - seen.body_pose.mean(axis=0), axis=1)
-    return seen.frame(int(np.argmin(away)))

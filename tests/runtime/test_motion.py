@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from avatar.runtime import load_bundle
-from avatar.runtime.motion import MARGIN, PoseRange, resampled
+from avatar.runtime.motion import pose_range, resampled
+from smplxpp.body.pose_range import MARGIN
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
@@ -74,7 +75,7 @@ def test_rates_that_are_none_are_refused():
 def test_poses_are_held_within_what_training_saw(tmp_path):
     write(tmp_path / "a.avatar", student("whole"))
     known = dance().select(range(4))
-    limits = PoseRange.of(load_bundle(tmp_path / "a.avatar"))
+    limits = pose_range(load_bundle(tmp_path / "a.avatar"))
     assert not limits.outside(known).any()
     np.testing.assert_array_equal(limits.clamped(known).body_pose, known.body_pose)
     far = replace(known, body_pose=known.body_pose + 1.0)
@@ -84,4 +85,4 @@ def test_poses_are_held_within_what_training_saw(tmp_path):
     np.testing.assert_allclose(angle, np.broadcast_to(limits.reach, angle.shape), atol=1e-6)
     assert (limits.reach >= MARGIN).all()
     write(tmp_path / "b.avatar", student("student"))
-    assert PoseRange.of(load_bundle(tmp_path / "b.avatar")) is None
+    assert pose_range(load_bundle(tmp_path / "b.avatar")) is None

@@ -1,0 +1,63 @@
+"""Who talks: the face and the stance of a run's or a bundle's person, of what training saw of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.commands.templates import load_run_template
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import PARAMS
+from smplxpp.body.retarget import Skeleton
+from smplxpp.core.params import BodyParams
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
+    from avatar.speech import Face, Stance
+
+
+def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, Stance]:
+    """Return the face of a bundle's person and how the body stands, of what training saw."""
+    from avatar.runtime.skeleton import skeleton_body
+    from avatar.speech import Face, Stance
+
+    seen = _motion_of(bundle)
+    about = bundle.about
+    face = Face.of(about.expression_names, about.joint_names, seen)
+    stance = Stance.of(
+        Skeleton.of(skeleton_body(bundle)),
+        _whole(seen, len(about.expression_names)),
+        known=bundle.tensors.get("poses.known"),
+        surface=bundle.tensors["surface.vertices"].astype(np.float64),
+    )
+    return face, stance
+
+
+def person_of_run(run: Path) -> tuple[Face, Stance]:
+    """Return the face of a run's template and how its body stands, of the reference frame alone."""
+    from avatar.speech import Face, Stance
+
+    template = load_run_template(run)
+    body = template.body
+    seen = load_params_of_run(run) if (run / PARAMS).is_file() else None
+    face = Face.of(body.expression_names, body.joint_names, seen)
+    frames = _whole(seen, body.num_expressions)
+    return face, Stance.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
+
+
+def _motion_of(bundle: AvatarBundle) -> BodyParams | None:
+    if not bundle.motion:
+        return None
+    arrays = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
+    return BodyParams.from_mapping(arrays, source="motion of the bundle")
+
+
+def _whole(seen: BodyParams | None, expressions: int) -> BodyParams:
+    """Frames with all expressions of the body; one at rest where there are none."""
+    if seen is None:
+        return BodyParams.rest(betas=0, expressions=expressions)
+    missing = expressions - seen.expression.shape[1]
+    return replace(seen.without_shape(), expression=np.pad(seen.expression, ((0, 0), (0, missing))))
