@@ -68,7 +68,8 @@ def beats(speech: Speech, rng: np.random.Generator) -> list[Beat]:
 
 def _phrase_starts(phonemes: Sequence[Phoneme]) -> list[float]:
     """When phrases begin: behind silences."""
-    out, quiet_since = [], -np.inf
+    out: list[float] = []
+    quiet_since = -np.inf
     for one in phonemes:
         if one.name == SILENCE:
             continue

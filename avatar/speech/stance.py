@@ -22,6 +22,7 @@ _SIDES = ("left", "right")
 _LEGS = [SMPLX_JOINTS.index(f"{side}_{name}") - 1 for side in _SIDES for name in ("hip", "knee", "ankle", "foot")]
 _SOFT = 0.001  # metres by which knees stay short of straight
 _LEVEL = 0.02  # metres between both feet's heights over the floor, of one who stands
+_STRAIGHT = np.radians(5.0)  # beyond the straightest legs that were seen
 _POINTS = ("wrist", "index3", "middle3", "pinky3")  # where a hand is
 _HALF_DEPTH = 0.75  # of the half width of hips, where there is no surface to tell
 _SLICE = 0.04  # metres of height
@@ -187,14 +188,16 @@ def _shortest(source: Float64[np.ndarray, "T 3"], target: Float64[np.ndarray, "T
 
 
 def _standing(skeleton: Skeleton, seen: BodyParams) -> BodyParams:
-    """The frame nearest to the mean of those with both feet at the same height on straight legs."""
+    """The frame nearest to the mean of those with both feet at the same height on the straightest legs."""
     joints = skeleton.pose(seen)
     feet = joints[:, skeleton.at(*FEET[:2]), 1]
     apart = feet.max(axis=1) - feet.min(axis=1)
     tall = joints[:, 0, 1] - feet.min(axis=1)
     good = (apart < max(_LEVEL, apart.min() + 1e-6)) & (tall > 0.9 * tall.max())
     good = good if good.any() else apart <= apart.min() + 1e-6
-    frames = np.flatnonzero(good)
+    knees = seen.body_pose.reshape(len(seen), -1, 3)[:, [_LEGS[1], _LEGS[5]]]
+    bent = np.linalg.norm(knees, axis=2).max(axis=1)
+    frames = np.flatnonzero(good & (bent <= bent[good].min() + _STRAIGHT))
     away = np.linalg.norm(seen.body_pose[frames] - seen.body_pose.mean(axis=0), axis=1)
     return seen.frame(int(frames[np.argmin(away)]))
 

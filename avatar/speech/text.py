@@ -26,7 +26,7 @@ _ONES = (
 ).split()
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
 
-_SELDOM, _SELDOM_LAST = ("AH", "ER", "IH"), ("IY", "OW")
+_SELDOM = ("AH", "ER", "IH")
 # Words that carry no stress in a sentence.
 _WEAK = frozenset(
     "a an the and or but nor as at by for from in into of on to with than that if is are was were be been am do does "
@@ -149,11 +149,11 @@ def cmu_dictionary() -> dict[str, str]:
 def _stressed(phones: str) -> list[str]:
     """Give a word its likely stress, which the dictionary leaves out: on its first full vowel, or its first.
 
-    AH, ER and IH are seldom full, nor are IY and OW at the end.
+    AH, ER and IH are seldom full, nor is IY at the end.
     """
     out = phones.split()
     vowels = [k for k, one in enumerate(out) if one[0] in "AEIOU"]
-    full = [k for k in vowels if out[k] not in _SELDOM and not (k == len(out) - 1 and out[k] in _SELDOM_LAST)]
+    full = [k for k in vowels if out[k] not in _SELDOM and (k, out[k]) != (len(out) - 1, "IY")]
     for k in vowels:
         out[k] += "1" if k == (full or vowels)[0] else "0"
     return out

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle, AvatarPlayer
 
 _BACKGROUND = (1.0, 1.0, 1.0)
-_FRAMING_POSES = 12
+_FRAMING_POSES = 36
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
@@ -16,10 +15,8 @@ from pipelines.commands.animate_student import StudentFilm, open_student, studen
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.talking_page import check_page_path, write_talking_page
-from pipelines.commands.templates import load_run_template
+from pipelines.commands.talking_person import person_of_bundle, person_of_run
 from pipelines.figures.film import write_film
-from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.layout import PARAMS
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
@@ -28,7 +25,7 @@ from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
-    from avatar.speech import Face, Speech, Stance
+    from avatar.speech import Speech
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows

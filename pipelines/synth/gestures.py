@@ -55,7 +55,8 @@ def _arm_turns(arm: Arm, hanging: Arm, size: float) -> dict[str, Float[np.ndarra
         at_rest = float(getattr(hanging, name))
         return at_rest + size * (float(getattr(arm, name)) - at_rest)
 
-    out = dict(zip(ARM_JOINTS, Arm(*map(sized, _SIZED)).turns, strict=True))
+    down, forward, inward, bend, palm = map(sized, _SIZED)
+    out = dict(zip(ARM_JOINTS, Arm(down, forward, inward, bend, palm).turns, strict=True))
     for finger in ("index", "middle", "ring", "pinky"):
         bend = np.radians(arm.fingers[0 if finger == "index" else 1])
         out |= {f"{finger}{k}": np.array([0.0, 0.0, -bend]) for k in (1, 2, 3)}
