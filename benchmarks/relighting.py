@@ -30,8 +30,9 @@ from pipelines.synth.person_file import person_of, read_layers
 from pipelines.synth.soft_light import LightConfig, environment_light, stage_light, vertex_light
 from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.light import Irradiance, Relighting, panorama_directions
+from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.panoramas import panoramas
 
 FIXTURE = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 _LIGHT = LightConfig(directions=144)
@@ -58,24 +59,6 @@ class RelightingBenchmark:
         print(json.dumps(figures, indent=1))
         if self.store:
             store_results("relighting", f"python -m benchmarks.relighting --run {self.run_folder.name}", figures)
-
-
-def panoramas() -> dict[str, np.ndarray]:
-    """(64, 128, 3) light by name: a low sun, a wood, two lamps of a studio."""
-    towards = panorama_directions(64, 128)
-
-    def lamp(place: tuple[float, float, float], color: tuple[float, float, float], sharp: float) -> np.ndarray:
-        middle = np.array(place) / np.linalg.norm(place)
-        return np.exp(sharp * (towards @ middle - 1.0))[..., None] * np.array(color)
-
-    above = np.maximum(towards[..., 1:2], 0.0)
-    return {
-        "low sun": 0.12 * np.array([0.5, 0.6, 1.0]) + lamp((1.0, 0.25, 0.35), (9.0, 4.2, 1.4), 8.0),
-        "wood": np.array([0.12, 0.1, 0.05]) + np.array([0.5, 0.9, 0.45]) * (above > 0) * (0.3 + 1.5 * above**2),
-        "two lamps": 0.05
-        + lamp((0.7, 0.5, 0.8), (6.0, 6.0, 6.0), 12.0)
-        + lamp((-0.8, 0.3, -0.4), (1.0, 2.0, 5.0), 12.0),
-    }
 
 
 def measure(capture: Capture, player: AvatarPlayer, lights: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:

@@ -21,6 +21,7 @@ from pipelines.runs.layout import (
     EVALUATE_STAGE,
     LANDMARKS_FILE,
     REFINE_STAGE,
+    RELIGHT_STAGE,
     TRAIN_STAGES,
 )
 from pipelines.runs.places import keep_out_of_capture
@@ -159,7 +160,8 @@ class Build:
         report = self.out / "report.html"
         manifests = [record.folder / "manifest.json" for record in records.values()]
         manifests += [
-            self.out / name / "manifest.json" for name in (REFINE_STAGE, BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE)
+            self.out / name / "manifest.json"
+            for name in (REFINE_STAGE, BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
         ]
         made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
         return report.is_file() and report.stat().st_mtime_ns > max(made)

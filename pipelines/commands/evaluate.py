@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,11 +11,19 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
+from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress
+from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
+from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.panoramas import STUDIO, panoramas
 
 log = logging.getLogger(__name__)
+
+
+TURNS = (0.0, 120.0, 240.0)
+"""Degrees by which the light of the report's pictures is turned."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,8 @@ class Evaluate:
     """Pictures that are timed; 0 leaves the speed out."""
     shown: int = 2
     """Views of each set to keep pictures of."""
+    lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
+    """The other light that the report shows the student in; by default two lamps of a studio."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
@@ -106,6 +116,7 @@ class Evaluate:
             speed_pictures=self.speed_pictures,
             shown=self.shown,
         )
+        lights = self._lights()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         with counted_progress("frames", enabled=not self.json) as progress:
             record = evaluate(
@@ -119,8 +130,14 @@ class Evaluate:
                 force=self.force,
                 progress=progress,
             )
-        page = self.run_folder / "report.html"
-        if not self.no_report and (record.ran or not page.is_file()) and rewrite_report(self.run_folder) is None:
+        page, ran = self.run_folder / "report.html", record.ran
+        if (self.run_folder / STUDENT).is_file():
+            from pipelines.stages.relight import relight
+
+            shown = self.lighting.environment
+            relit = relight(self.run_folder, STUDIO if shown is None else shown.stem, lights, force=self.force)
+            ran = ran or relit.ran
+        if not self.no_report and (ran or not page.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with it")
         report = EvalReport.load(record.folder / REPORT_FILE)
         if not self.json:
@@ -136,6 +153,18 @@ class Evaluate:
             if page.is_file():
                 console.print(f"report  {page}", soft_wrap=True, highlight=False, markup=False)
         return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
+
+    def _lights(self) -> dict[str, Relighting]:
+        """The lights of the report's pictures, by what is said of each."""
+        out = {}
+        for turn in TURNS:
+            turned = replace(self.lighting, environment_turn=self.lighting.environment_turn + turn)
+            lit = (self.lighting if self.lighting.environment is None else turned).relighting()
+            if lit is None:
+                studio = Irradiance.of_environment(panoramas()[STUDIO], turn=turn)
+                lit = Relighting(studio.exposed(), Irradiance.uniform())
+            out["relit" if turn == 0.0 else f"the light turned by {turn:.0f} degrees"] = lit
+        return out
 
 
 def _metric(name: str) -> str:

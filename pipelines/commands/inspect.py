@@ -12,7 +12,15 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.report.model import CheckRow, count_statuses, worst_status
-from pipelines.runs.layout import ALL_STAGES, BIND_STAGE, EVALUATE_STAGE, REFINE_STAGE, TEMPLATE_STAGES, TRAIN_STAGES
+from pipelines.runs.layout import (
+    ALL_STAGES,
+    BIND_STAGE,
+    EVALUATE_STAGE,
+    REFINE_STAGE,
+    RELIGHT_STAGE,
+    TEMPLATE_STAGES,
+    TRAIN_STAGES,
+)
 from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST, is_finished
 from smplxpp.core.errors import InputError
@@ -97,7 +105,7 @@ def _remedy(run: Path, stage: str) -> str:
         return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
     if stage in (REFINE_STAGE, *TRAIN_STAGES):
         return f"smplxpp train --run {run} --capture DIR (with the training's options)"
-    if stage == EVALUATE_STAGE:
+    if stage in (EVALUATE_STAGE, RELIGHT_STAGE):
         return f"smplxpp evaluate {run} --capture DIR (with the evaluation's options)"
     return f"smplxpp build --out {run} --from-stage {stage} (with the build's options)"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.commands.options import OptionalFloat, OptionalPath
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.hdr_file import read_radiance
+from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.validation import require_positive
 
@@ -17,7 +17,8 @@ class Lighting:
     """Options of another light."""
 
     environment: OptionalPath = None
-    """Show the person in the light of this panorama: equirectangular, Radiance (.hdr), straight up in its first row."""
+    """Show the person in the light of this panorama: equirectangular, Radiance (.hdr) or OpenEXR (.exr, extra
+    `exr`), straight up in its first row."""
     environment_turn: float = 0.0
     """Degrees about the vertical by which that light is turned."""
     exposure: OptionalFloat = None
@@ -53,7 +54,7 @@ def read_light(path: Path, *, turn: float = 0.0) -> Irradiance:
         InputError: no such picture, or no light in it.
     """
     try:
-        return Irradiance.of_environment(read_radiance(path), turn=turn)
+        return Irradiance.of_environment(read_panorama(path), turn=turn)
     except InputError as error:
         if error.subject != "panorama":
             raise

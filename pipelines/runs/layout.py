@@ -20,6 +20,7 @@ CLOTH_STAGE = "83_cloth"
 BAKE_STAGE = "85_bake"
 COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
+RELIGHT_STAGE = "97_relight"
 ABLATION = "ablation"
 
 TEMPLATE_STAGES = (
@@ -39,7 +40,7 @@ body found in a scan that comes alone, which a registration may start from."""
 TRAIN_STAGES = (TEACHER_STAGE, CLOTH_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
 """The stages that `smplxpp train` adds to a reference fit."""
 MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
-ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE)
+ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
 
 RECONSTRUCTION = f"{RECONSTRUCT_STAGE}/reconstruction.json"
 LOCATED_PARAMS = f"{LOCATE_STAGE}/params.npz"

@@ -10,11 +10,12 @@ import numpy as np
 from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton
-from smplxpp.core.files.hdr_file import read_radiance
+from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
 from smplxpp.export.bvh import write_bvh
+from tests.core.files.openexr import write_openexr
 from tests.core.files.radiance import write_radiance
 from tests.core.files.test_wave_file import coded, file_of
 from tests.fuzz.examine import Door
@@ -37,7 +38,7 @@ def motion_doors() -> list[Door]:
 
 
 def light_doors() -> list[Door]:
-    """Panoramas, with flat rows and with packed ones."""
+    """Panoramas, with flat rows and with packed ones, and of OpenEXR in both of its common codings."""
 
     def write(path: Path, packed: bool) -> None:
         write_radiance(path, np.random.default_rng(1).uniform(0.0, 5.0, (9, 18, 3)), packed=packed)
@@ -46,9 +47,18 @@ def light_doors() -> list[Door]:
         Door(
             f"panorama {kind}",
             lambda folder, kind=kind: write(folder / "x.hdr", kind == "packed"),
-            lambda folder: Irradiance.of_environment(read_radiance(folder / "x.hdr")),
+            lambda folder: Irradiance.of_environment(read_panorama(folder / "x.hdr")),
         )
         for kind in ("flat", "packed")
+    ] + [
+        Door(
+            f"panorama exr {kind}",
+            lambda folder, kind=kind: write_openexr(
+                folder / "x.exr", np.random.default_rng(1).uniform(0.0, 5.0, (9, 18, 3)), kind=kind
+            ),
+            lambda folder: Irradiance.of_environment(read_panorama(folder / "x.exr")),
+        )
+        for kind in ("zip", "piz")
     ]
 
 

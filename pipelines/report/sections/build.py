@@ -24,6 +24,7 @@ from pipelines.report.sections.readable import readable, readable_numbers
 from pipelines.report.sections.reconstruct import reconstruct_section
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
+from pipelines.report.sections.relight import relight_section, standing_relighting
 from pipelines.report.sections.template import (
     fidelity_section,
     parts_section,
@@ -45,6 +46,7 @@ from pipelines.runs.layout import (
     RECONSTRUCT_STAGE,
     REFINE_STAGE,
     REGISTER_STAGE,
+    RELIGHT_STAGE,
     SEGMENT_STAGE,
     TEMPLATE_STAGES,
     VALIDATE_STAGE,
@@ -65,11 +67,12 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     with values_of(records[ASSEMBLE_STAGE]):
         template_digest = records[ASSEMBLE_STAGE].manifest["files"]["smplxpp.npz"]
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
-    poses = standing_refinement(run, template_digest)
+    poses, relit = standing_refinement(run, template_digest), standing_relighting(run, template_digest)
     records = {**records, **({} if poses is None else {REFINE_STAGE: poses})}
     records = {**records, **({} if fit is None else {BIND_STAGE: fit})}
     trainings = standing_trainings(run, records.values())
     records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
+    records = {**records, **({} if relit is None else {RELIGHT_STAGE: relit})}
     template = Template.load(run / "60_assemble" / "smplxpp.npz")
     reference = load_params_of_run(run)
     checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
@@ -108,6 +111,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         *(section for record in trainings.values() for section in _optional(record, "Training", _trained)),
         *_optional(evaluation, "Avatar: figures", evaluation_figures),
         *_optional(evaluation, "Avatar: side by side", evaluation_views),
+        *_optional(relit, "Avatar: another light", relight_section),
     )
     seconds = {name: r.manifest["seconds"] for name, r in records.items()}
     key_numbers = [
