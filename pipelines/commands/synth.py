@@ -9,11 +9,13 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from pipelines.commands.options import OptionalInt, OptionalText
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from pipelines.synth.make_capture import SynthConfig, make_capture
 from pipelines.synth.motions import motion_kind
 from pipelines.synth.outfits import CLOTHES
+from pipelines.synth.soft_light import Environment
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.validation import require_at_least, require_choice
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -53,6 +55,13 @@ class Synth:
     """Normal maps of every n-th frame, of all (talking: 4)."""
     scan_faces: int = 80_000
     """Size of the reference frame's scan; 0 makes none."""
+    environment: OptionalPath = None
+    """Light of this panorama (.hdr, .exr) in the place of the stage's, with the shadows that she casts: with
+    the same seed and options the same performance in a second light."""
+    environment_turn: float = 0.0
+    """Degrees about the vertical by which that light is turned."""
+    exposure: OptionalFloat = None
+    """Factor on that light; by default it is as bright in the mean as the stage."""
     person: Path = FIXTURE
     """The person's folder, with geometry/topology.npz."""
     json: bool = False
@@ -67,7 +76,7 @@ class Synth:
                 received=str(self.out),
                 remedy="name another, or delete it",
             )
-        config = self._config()
+        config, environment = self._config(), self._environment()
         console = Console(stderr=True)
         columns = (TextColumn("{task.description:<8}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
         with Progress(*columns, console=console) as bars:
@@ -78,7 +87,8 @@ class Synth:
                     tasks[what] = bars.add_task(what, total=1.0)
                 bars.update(tasks[what], completed=share)
 
-            checks = make_capture(self.out, self.person / "geometry" / "topology.npz", config, progress=show)
+            topology = self.person / "geometry" / "topology.npz"
+            checks = make_capture(self.out, topology, config, environment=environment, progress=show)
         console.print(
             f"{self.out}: {config.motion}, {config.cameras} cameras, {config.frames} frames",
             highlight=False,
@@ -86,6 +96,16 @@ class Synth:
             markup=False,
         )
         return {"out": str(self.out), "cameras": config.cameras, "frames": config.frames, "checks": checks}
+
+    def _environment(self) -> Environment | None:
+        if self.environment is None:
+            if self.environment_turn or self.exposure is not None:
+                raise InputError(
+                    "--environment", expected="a panorama, for --environment-turn and --exposure", received="none"
+                )
+            return None
+        panorama = read_panorama(self.environment)
+        return Environment(panorama, self.environment.stem, self.environment_turn, self.exposure)
 
     def _config(self) -> SynthConfig:
         """Make the configuration: what is left out is as the motion has it."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 _TEXT = """# {name}
 
 A synthetic capture by `smplxpp synth`: motion `{motion}`, {frames} frames at {fps:g} a second, {cameras} cameras, seed
-{seed}; {worn}. Axes: y up, z to the front, x to the subject's left; metres; floor y = 0. Frame 0 is the reference: a
-relaxed A-pose, neutral face, cloth settled.
+{seed}; {worn}; light: {light}. Axes: y up, z to the front, x to the subject's left; metres; floor y = 0. Frame 0 is the
+reference: a relaxed A-pose, neutral face, cloth settled.
 
 {split} The held-out cameras are named in `manifest.json`.
 
@@ -41,6 +41,7 @@ def capture_readme(manifest: dict, *, motion: str, clothes: str, pattern: str, s
         fps=manifest["fps"],
         seed=manifest["seed"],
         cameras=len(manifest["images"]),
+        light=manifest["light"]["panorama"] if "light" in manifest else "even, brighter from above",
         worn=_WORN[clothes].format(pattern=pattern),
         split=split,
         normals=_every(next(iter(manifest["normals"].values()))),

@@ -23,7 +23,7 @@ from pipelines.synth.person_file import person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import SimulationConfig, Take, simulate
 from pipelines.synth.skirt_patterns import PATTERNS
-from pipelines.synth.soft_light import LightConfig, vertex_light
+from pipelines.synth.soft_light import Environment, LightConfig, vertex_light
 from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
 from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import LitFrame, RenderedView, hidden_faces, normal_map, render_view
@@ -101,7 +101,12 @@ class SynthConfig:
 
 
 def make_capture(
-    out: Path, topology_file: Path, config: SynthConfig, *, progress: Progress = lambda what, share: None
+    out: Path,
+    topology_file: Path,
+    config: SynthConfig,
+    *,
+    environment: Environment | None = None,
+    progress: Progress = lambda what, share: None,
 ) -> dict[str, float]:
     """Write a capture to the folder `out`, whole or not at all; what stands there is replaced.
 
@@ -109,6 +114,7 @@ def make_capture(
         out: folder of the capture.
         topology_file: the person's layers, `geometry/topology.npz` of the fixture.
         config: what to make.
+        environment: light in the place of the stage's, for the same performance; None: the stage's.
         progress: called with the name of the work under way and its share done.
 
     Returns:
@@ -152,7 +158,7 @@ def make_capture(
                 progress("scan", 0.0)
                 checks |= _write_scan(root / "scans", person, take, config)
                 progress("scan", 1.0)
-            manifest = _manifest(out, rig, config)
+            manifest = _manifest(out, rig, config, environment)
             atomic_write_text(root / "manifest.json", json.dumps(manifest, indent=1) + "\n")
             words = capture_readme(
                 manifest,
@@ -162,7 +168,9 @@ def make_capture(
                 scan=config.scan_faces > 0,
             )
             atomic_write_text(root / "README.md", words)
-        _write_views(images, _lit_frames(person, take, hidden, config.light), painted, rig, config, progress)
+        _write_views(
+            images, _lit_frames(person, take, hidden, config.light, environment), painted, rig, config, progress
+        )
         if config.layout == "simple":
             checks |= add_tracked_inputs(root, seed=config.seed, progress=progress)
             atomic_write_text(root / "checks.json", json.dumps(checks, indent=1) + "\n")
@@ -257,13 +265,16 @@ def _scan_attributes(
     return part, np.where(part == shown, label, PART_LABELS[part]), colors
 
 
-def _lit_frames(person: Person, take: Take, hidden: Bool[np.ndarray, " M"], light: LightConfig) -> Iterator[LitFrame]:
+def _lit_frames(
+    person: Person, take: Take, hidden: Bool[np.ndarray, " M"], light: LightConfig, environment: Environment | None
+) -> Iterator[LitFrame]:
     """Light the take's frames one after the other, without the hidden faces."""
     shown = np.flatnonzero(~hidden)
     faces = person.tpose.faces[shown]
     for vertices in take.vertices:
         mesh = TriangleMesh(vertices, faces)
-        yield LitFrame(mesh, shown, vertex_light(mesh, light))
+        other = None if environment is None else environment.at(mesh, light)
+        yield LitFrame(mesh, shown, vertex_light(mesh, light), other)
 
 
 def _write_views(
@@ -297,11 +308,14 @@ def _write_view(root: Path, camera: str, frame: int, view: RenderedView, config:
         write_gray_png(view_path(root, "label", camera, frame, ".png"), view.labels)
 
 
-def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:
+def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig, environment: Environment | None) -> dict:
     train, novel = split_frames(config.frames)
     everything, normals = list(range(config.frames)), list(range(0, config.frames, config.normals_step))
     names = [item.camera.name for item in rig]
     splits = {"train_frames": [0, train - 1]} | ({"novel_pose_frames": [train, config.frames - 1]} if novel else {})
+    light = {}
+    if environment is not None:
+        light = {"light": {"panorama": environment.name, "turn": environment.turn, "exposure": environment.exposure}}
     return {
         "name": out.name,
         "frames": config.frames,
@@ -310,6 +324,7 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig) -> dict:
         "background": [0, 0, 0],
         "label_set": "capture",
         "inputs": INPUTS,
+        **light,
         **splits,
         "train_views": [item.camera.name for item in rig if not item.novel],
         "novel_views": [item.camera.name for item in rig if item.novel],

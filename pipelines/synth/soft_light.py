@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Float64
 from smplxpp.core.camera import Camera
 from smplxpp.core.light import Irradiance, panorama_directions
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_positive
 from smplxpp.raster import rasterize_mesh, view_directions
 
 # The surroundings are brighter above than below, as a lit stage is.
@@ -39,6 +40,36 @@ class LightConfig:
     slack: float = 0.004
 
 
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """A panorama in the place of the stage's light.
+
+    Attributes:
+        panorama: linear light (`smplxpp.core.light`). name: of it.
+        turn: degrees about +Y by which it is turned.
+        exposure: factor on it; None: as bright in the mean as the stage.
+
+    Raises:
+        InputError: negative light, NaN or infinity, or no light at all; an exposure that is not above 0.
+    """
+
+    panorama: Float[np.ndarray, "h w 3"]
+    name: str = "panorama"
+    turn: float = 0.0
+    exposure: float | None = None
+
+    def __post_init__(self) -> None:
+        light = Irradiance.of_environment(self.panorama)
+        if self.exposure is None:
+            object.__setattr__(self, "exposure", stage_light().mean / max(light.mean, 1e-12))
+        require_positive("--exposure", self.exposure)
+
+    def at(self, mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray, "2 N 3"]:
+        """Return what `environment_light` does."""
+        assert self.exposure is not None  # set above
+        return environment_light(mesh, config, self.exposure * self.panorama, turn=self.turn)
+
+
 def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray, "2 N"]:
     """Return the irradiance over pi at each vertex, on its outer and its inner side; 1 is an open vertex's mean.
 
@@ -60,11 +91,15 @@ def stage_light() -> Irradiance:
 
 
 def environment_light(
-    mesh: TriangleMesh, config: LightConfig, panorama: Float[np.ndarray, "h w 3"]
+    mesh: TriangleMesh, config: LightConfig, panorama: Float[np.ndarray, "h w 3"], *, turn: float = 0.0
 ) -> Float64[np.ndarray, "2 N 3"]:
-    """Return the same in the light of a panorama (`smplxpp.core.light`), shadows that the person casts included."""
+    """Return the same in the light of a panorama (`smplxpp.core.light`), shadows that the person casts included.
+
+    Args:
+        turn: degrees about +Y by which it is turned.
+    """
     height, width = panorama.shape[:2]
-    toward = panorama_directions(height, width).reshape(-1, 3)
+    toward = panorama_directions(height, width, turn=turn).reshape(-1, 3)
     edges = np.cos(np.linspace(0.0, np.pi, height + 1))
     solid = np.repeat(edges[:-1] - edges[1:], width)
     # Every pixel's light comes from the nearest of the directions, so that none is lost between them.

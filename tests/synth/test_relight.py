@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pipelines.synth.person_file import load_person
-from pipelines.synth.soft_light import LightConfig, environment_light, stage_light, vertex_light
+from pipelines.synth.soft_light import Environment, LightConfig, environment_light, stage_light, vertex_light
 from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
 from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.mesh import TriangleMesh
 from tests.core.test_light import evening
@@ -48,6 +49,24 @@ def test_a_relit_picture_is_near_the_one_that_the_light_would_have_made(frames, 
     relit = relighting.colors(before.image / 255.0, normal_map(stage, camera))
     plain, found = (decibels(one, truth.image / 255.0, inside) for one in (before.image / 255.0, relit))
     assert plain < 20.0 and found > 26.0 and found > plain + 8.0
+
+
+def test_a_turned_environment_shines_from_elsewhere_as_brightly_as_the_stage(frames):
+    _, stage, _, panorama = frames
+    mesh, config = stage.mesh, LightConfig(directions=32, resolution=64)
+    found = Environment(7.0 * panorama, turn=40.0).at(mesh, config)
+    level = Environment(panorama, turn=40.0, exposure=2.0 * stage_light().mean).at(mesh, config)
+    np.testing.assert_allclose(2.0 * found, level, rtol=1e-6)
+    # Shadows aside, it is what the harmonics of the turned light say, and not those of another turn.
+    likeness = {
+        turn: np.corrcoef(Irradiance.of_environment(panorama, turn=turn).at(mesh.vertex_normals)[:, 0], found[0, :, 0])
+        for turn in (40.0, 0.0, -40.0)
+    }
+    assert likeness[40.0][0, 1] > 0.7 and likeness[40.0][0, 1] > max(likeness[t][0, 1] for t in (0.0, -40.0)) + 0.03
+    with pytest.raises(InputError, match="light"):
+        Environment(0.0 * panorama)
+    with pytest.raises(InputError, match="exposure"):
+        Environment(panorama, exposure=0.0)
 
 
 def test_an_open_plane_takes_what_the_harmonics_say():

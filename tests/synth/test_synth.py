@@ -16,9 +16,10 @@ from pipelines.synth.make_capture import SynthConfig, make_capture, split_frames
 from pipelines.synth.motion import Performance
 from pipelines.synth.person_file import load_person
 from pipelines.synth.simulate import SimulationConfig
-from pipelines.synth.soft_light import LightConfig, bounced, vertex_light
+from pipelines.synth.soft_light import Environment, LightConfig, bounced, vertex_light
 from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
+from smplxpp.capture import open_capture
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.writers.arrays import save_compact
 from smplxpp.capture.writers.cameras import FACE, write_calibration_csv, write_cameras_json
@@ -266,8 +267,6 @@ def test_a_capture_is_the_same_every_time(tiny, tmp_path):
 
 @pytest.mark.slow
 def test_a_tiny_capture_is_complete(tiny):
-    from smplxpp.capture import open_capture
-
     capture = open_capture(tiny)
     assert list(capture.cameras) == ["Cam001", "Cam002"] and capture.frames == (0, 1)
     assert not capture.problems and capture.fps == 25.0
@@ -283,9 +282,37 @@ def test_a_tiny_capture_is_complete(tiny):
 
 
 @pytest.mark.slow
-def test_the_other_layout_is_actorshqs(tmp_path):
-    from smplxpp.capture import open_capture
+def test_another_light_is_the_same_performance(tiny, tmp_path):
+    panorama = np.zeros((8, 16, 3))
+    panorama[:4] = [3.0, 1.0, 0.2]
+    make_capture(tmp_path / "lit", TOPOLOGY, QUICK, environment=Environment(panorama, "evening", turn=30.0))
+    changed = {
+        path.relative_to(tiny).parts[0]
+        for path in tiny.rglob("*")
+        if path.is_file()
+        and path.suffix != ".npz"
+        and path.read_bytes() != (tmp_path / "lit" / path.relative_to(tiny)).read_bytes()
+    }
+    assert changed == {"rgbs", "manifest.json", "README.md"}
+    light = json.loads((tmp_path / "lit" / "manifest.json").read_text())["light"]
+    assert (light["panorama"], light["turn"]) == ("evening", 30.0) and light["exposure"] > 0.0
+    capture = open_capture(tmp_path / "lit")
+    image, mask = capture.image("Cam001", 1), capture.mask("Cam001", 1) == 255
+    assert image[mask][:, 0].mean() > 2.0 * image[mask][:, 2].mean()
 
+
+def test_the_command_refuses_a_light_that_is_none(tmp_path, capsys):
+    for options, word in (
+        (["--environment", str(tmp_path / "none.hdr")], "none.hdr"),
+        (["--environment-turn", "30"], "panorama"),
+    ):
+        assert main(["synth", "--out", str(tmp_path / "new"), *options]) == 2
+        assert word in capsys.readouterr().err.replace("\n", "")
+        assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_the_other_layout_is_actorshqs(tmp_path):
     make_capture(tmp_path / "a", TOPOLOGY, replace(QUICK, layout="actorshq"))
     sequence = tmp_path / "a" / "Actor01" / "Sequence1"
     assert len((sequence / "aabbs.csv").read_text().splitlines()) == 3
