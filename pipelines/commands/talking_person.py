@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 
 def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, Stance]:
     """Return the face of a bundle's person and how the body stands, of what training saw."""
-    from avatar.runtime.skeleton import skeleton_body
+    from avatar.runtime.skeleton import clothed_template, skeleton_body
     from avatar.speech import Face, Stance
+    from avatar.speech.arkit import ARKIT
 
     seen = _motion_of(bundle)
     about = bundle.about
-    face = Face.of(about.expression_names, about.joint_names, seen)
+    # Only of numbered expressions is the surface asked what they do.
+    body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
+    face = Face.of(about.expression_names, about.joint_names, seen, body=body)
     stance = Stance.of(
         Skeleton.of(skeleton_body(bundle)),
         _whole(seen, len(about.expression_names)),
@@ -43,7 +46,7 @@ def person_of_run(run: Path) -> tuple[Face, Stance]:
     template = load_run_template(run)
     body = template.body
     seen = load_params_of_run(run) if (run / PARAMS).is_file() else None
-    face = Face.of(body.expression_names, body.joint_names, seen)
+    face = Face.of(body.expression_names, body.joint_names, seen, body=body)
     frames = _whole(seen, body.num_expressions)
     return face, Stance.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
 

@@ -32,7 +32,7 @@ from tests.capture.scene import make_scene
 from tests.capture.test_readers import CAMERA_NAMES
 from tests.capture.writers import WRITERS
 from tests.fuzz.examine import Door
-from tests.fuzz.motion_light_sound import light_doors, motion_doors, sound_doors
+from tests.fuzz.motion_light_sound import face_doors, light_doors, motion_doors, sound_doors
 from tests.fuzz.run_doors import run_doors
 
 _FRAMES = 3
@@ -358,6 +358,7 @@ def doors() -> dict[str, Door]:
         + motion_doors()
         + light_doors()
         + sound_doors()
+        + face_doors()
         + _detector_doors()
         + _basic_doors()
     )

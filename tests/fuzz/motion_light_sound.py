@@ -1,4 +1,4 @@
-"""The doors of an avatar in use: motions of other programs, panoramas, recordings."""
+"""The doors of an avatar in use: motions of other programs, panoramas, recordings, curves of a face."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar.speech.curve_files import read_curves
 from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton
@@ -19,6 +20,7 @@ from tests.core.files.openexr import write_openexr
 from tests.core.files.radiance import write_radiance
 from tests.core.files.test_wave_file import coded, file_of
 from tests.fuzz.examine import Door
+from tests.speech.test_curves import LIVE, live_link, waving
 
 
 def motion_doors() -> list[Door]:
@@ -59,6 +61,21 @@ def light_doors() -> list[Door]:
             lambda folder: Irradiance.of_environment(read_panorama(folder / "x.exr")),
         )
         for kind in ("zip", "piz")
+    ]
+
+
+def face_doors() -> list[Door]:
+    """Curves of a face: Live Link Face, Audio2Face, arrays."""
+    table = live_link(waving(4))
+    stored = json.dumps({"exportFps": 30.0, "facsNames": LIVE, "weightMat": waving(4).tolist()})
+    return [
+        Door("curves csv", lambda f: (f / "c.csv").write_text(table), lambda f: read_curves(f / "c.csv")),
+        Door("curves json", lambda f: (f / "c.json").write_text(stored), lambda f: read_curves(f / "c.json")),
+        Door(
+            "curves npz",
+            lambda f: np.savez(f / "c.npz", blendshapes=waving(4), fps=np.array(30.0)),
+            lambda f: read_curves(f / "c.npz"),
+        ),
     ]
 
 

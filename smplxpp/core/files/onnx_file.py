@@ -24,6 +24,7 @@ class OnnxModel:
         path: its file.
         subject: what errors call it.
         inputs, outputs: onnxruntime's, with `name`, `type` and `shape`.
+        metadata: what the model says of itself, by name.
 
     Raises:
         MissingExtraError: onnxruntime is not installed.
@@ -45,6 +46,7 @@ class OnnxModel:
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
             raise InputError(self.subject, expected="an ONNX model", received=f"{error}"[:_SHOWN]) from None
         self.inputs, self.outputs = self._session.get_inputs(), self._session.get_outputs()
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def run(self, values: Mapping[str, np.ndarray]) -> list[Any]:
         """What the model gives, in the order of `outputs`.

@@ -1,0 +1,151 @@
+"""Files of face curves that other programs write: Live Link Face, Audio2Face, and arrays of 52 or of FLAME."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.speech.arkit import ARKIT
+from avatar.speech.curves import FLAME, Curves
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.files.json_file import as_list, as_number, as_numbers, as_object, as_text, read_json
+from smplxpp.core.files.paths import read_text
+
+_FPS = 30.0
+_MOST_ROWS = 200_000
+_MOST_BYTES = 1 << 28
+_TIMES = ("timecode", "time", "timestamp", "seconds")
+_LOWER = {name.lower(): k for k, name in enumerate(ARKIT)}
+_ARRAYS = ("arkit", "blendshapes", "blendshape", "bs", "weights")
+_EXPRESSIONS = ("expression", "exp", "expr", "flame_expression")
+_JAWS = ("jaw_pose", "jaw", "jaw_rot")
+
+
+def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
+    """Read curves by the suffix of their file.
+
+    - `.csv`: a row a frame, columns by ARKit's names in any case, with or without words before a point (Live Link
+      Face, Audio2Face-3D); other columns are left out. A column of times: seconds, or hours:minutes:seconds:frames.
+    - `.json`: Audio2Face's export: `facsNames`, `weightMat`, `exportFps`.
+    - `.npz`: `blendshapes` (T, 52) with `names` of the columns, or `expression` (T, up to 50) and `jaw_pose` (T, 3) of
+      FLAME; `fps`.
+
+    Args:
+        fps: frames a second where the file does not say; None: 30.
+
+    Raises:
+        InputError: another suffix, a file that is none of these, and what `Curves` refuses.
+    """
+    path = Path(path)
+    readers: dict[str, Callable[[Path, float], Curves]] = {".csv": _csv, ".json": _json, ".npz": _npz}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"curves {path}", expected=".csv, .json or .npz", received=path.suffix or "no suffix")
+    return reader(path, fps or _FPS)
+
+
+def _csv(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    try:
+        rows = list(csv.reader(read_text(path, subject="curves", most=_MOST_BYTES).splitlines()))
+    except csv.Error as error:
+        raise InputError(subject, expected="comma-separated values", received=str(error)) from None
+    rows = [row for row in rows if row]
+    if not 2 <= len(rows) <= _MOST_ROWS:
+        expected = f"a row of names and up to {_MOST_ROWS} of numbers"
+        raise InputError(subject, expected=expected, received=f"{len(rows)} rows")
+    names = [name.strip().rsplit(".", 1)[-1].lower() for name in rows[0]]
+    where = _columns(names, subject)
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(names):
+            raise InputError(f"{subject}, row {number}", expected=f"{len(names)} values", received=str(len(row)))
+    values = np.zeros((len(rows) - 1, len(ARKIT)))
+    for column, k in where:
+        values[:, k] = _floats([row[column] for row in rows[1:]], f"{subject}, column {rows[0][column]}")
+    clock = next((names.index(one) for one in _TIMES if one in names), None)
+    if clock is None:
+        return Curves.evenly(values, fps)
+    times = _clock([row[clock] for row in rows[1:]], f"{subject}, column {rows[0][clock]}")
+    good = np.r_[True, np.diff(np.maximum.accumulate(times)) > 0.0]  # phones write some frames twice
+    return Curves(times[good] - times[0], values[good])
+
+
+def _columns(names: Sequence[str], subject: str) -> list[tuple[int, int]]:
+    """The columns of a table that are ARKit's, and which."""
+    where = [(column, _LOWER[name]) for column, name in enumerate(names) if name in _LOWER]
+    if "jawopen" not in names or len(where) < 10:
+        received = ", ".join(names[:6])[:120] or "none"
+        raise InputError(subject, expected="columns of ARKit's names, jawOpen among them", received=received)
+    if len({k for _, k in where}) < len(where):
+        raise InputError(subject, expected="every name once", received="one of ARKit's twice")
+    return where
+
+
+def _floats(texts: Sequence[str], subject: str) -> np.ndarray:
+    try:
+        return np.array([float(text or 0.0) for text in texts])
+    except ValueError as error:
+        raise InputError(subject, expected="numbers", received=str(error)[:120]) from None
+
+
+def _clock(texts: Sequence[str], subject: str) -> np.ndarray:
+    """Seconds, of seconds or of timecodes hours:minutes:seconds:frames at 60 frames a second, as phones write them."""
+    if not any(":" in text for text in texts):
+        return _floats(texts, subject)
+    out = []
+    for text in texts:
+        found = re.fullmatch(r"\s*(\d{1,3}):(\d{1,2}):(\d{1,2})[:;.](\d{1,3}(?:\.\d{1,9})?)\s*", text)
+        if not found:
+            raise InputError(subject, expected="hours:minutes:seconds:frames", received=repr(text[:40]))
+        hours, minutes, seconds, frames = (float(one) for one in found.groups())
+        out.append(3600.0 * hours + 60.0 * minutes + seconds + frames / 60.0)
+    return np.array(out)
+
+
+def _json(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    stored = as_object(read_json(path, subject="curves"), subject=subject)
+    names = [as_text(one, subject=f"{subject}: facsNames") for one in as_list(stored.get("facsNames"), subject=subject)]
+    where = _columns([name.lower() for name in names], subject)
+    matrix = as_numbers(stored.get("weightMat"), (None, len(names)), subject=f"{subject}: weightMat")
+    if "exportFps" in stored:
+        fps = as_number(stored["exportFps"], subject=f"{subject}: exportFps")
+    return Curves.evenly(_placed(matrix, where), fps)
+
+
+def _placed(matrix: np.ndarray, where: Sequence[tuple[int, int]]) -> np.ndarray:
+    values = np.zeros((len(matrix), len(ARKIT)))
+    for column, k in where:
+        values[:, k] = matrix[:, column]
+    return values
+
+
+def _npz(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    arrays = read_arrays(path, subject="curves")
+    if "fps" in arrays:
+        fps = float(as_numbers(arrays["fps"], (), subject=f"{subject}: fps"))
+
+    def take(wanted: Sequence[str]) -> Any:
+        return next((arrays[name] for name in wanted if name in arrays), None)
+
+    shapes, expression, jaw = take(_ARRAYS), take(_EXPRESSIONS), take(_JAWS)
+    if shapes is not None:
+        names = [str(one) for one in np.ravel(arrays["names"])] if "names" in arrays else []
+        where = _columns([name.lower() for name in names], subject) if names else [(k, k) for k in range(len(ARKIT))]
+        width = len(names) or len(ARKIT)
+        return Curves.evenly(_placed(as_numbers(shapes, (None, width), subject=subject), where), fps)
+    if expression is None or jaw is None:
+        raise InputError(
+            subject,
+            expected="blendshapes (T, 52), or expression and jaw_pose of FLAME",
+            received=", ".join(sorted(arrays)[:8]) or "nothing",
+        )
+    values = as_numbers(expression, (None, None), subject=f"{subject}: expression")
+    return Curves.evenly(values[:, :FLAME], fps, as_numbers(jaw, (len(values), 3), subject=f"{subject}: jaw_pose"))
