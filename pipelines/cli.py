@@ -77,7 +77,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "talk": (
         "pipelines.commands.talk",
         "Talk",
-        "an avatar that says a text or a recording: a film with sound, or the motion",
+        "an avatar that says a text or a recording: a film with sound, a page, or the motion",
+    ),
+    "chat": (
+        "pipelines.commands.chat",
+        "Chat",
+        "a page in which the avatar answers what is typed or said, with voice, face and hands",
     ),
     "export": (
         "pipelines.commands.export",

@@ -53,6 +53,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"ablation"},
         {"viewer"},
         {"web"},
+        {"chat"},
         {"commands"},
         {"cli"},
     ),
@@ -63,6 +64,7 @@ NARROW = {
     "pipelines.synth": {"runs", "stages", "report"},
     "pipelines.captures": {"stages", "synth"},
     "pipelines.viewer": {"report", "synth", "captures", "ablation"},
+    "pipelines.chat": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
     "pipelines.web": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
 }
 

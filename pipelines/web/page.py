@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +78,21 @@ def page_files(
     )
     files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
     return files if sound is None else {**files, SOUND: sound}
+
+
+def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str]) -> dict[str, bytes]:
+    """Return the files of a page that talks with its server, by name.
+
+    Args:
+        name: of the avatar. secret: path of the server's websocket, plain letters. sockets: addresses that it may have.
+    """
+    page = _PAGE.format(
+        policy=_POLICY.format(script="'self' blob:", connect=f"connect-src 'self' {' '.join(sockets)}"),
+        title=html.escape(name),
+        attributes=f' data-avatar="{AVATAR}" data-chat="{html.escape(secret)}"',
+        body=f'<script src="{SCRIPT}"></script>',
+    )
+    return {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
 
 
 def write_page_folder(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import PurePosixPath
+from typing import TypeVar
 from urllib.parse import unquote, urlsplit
 
 from smplxpp.core.errors import InputError
 
+T = TypeVar("T")
 HOST = "127.0.0.1"
 _TRIES = 32
 _TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".wav": "audio/wav"}
@@ -23,6 +25,48 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+
+
+def own_hosts(port: int) -> set[str]:
+    """Names under which pages of this machine ask; others reach it by a trick (DNS rebinding)."""
+    return {f"{name}:{port}" for name in (HOST, "localhost")}
+
+
+def at_free_port(make: Callable[[int], T], port: int) -> T:
+    """Return what is made at a port, or at the next free one; 0: any.
+
+    Raises:
+        InputError: no port is free.
+    """
+    for one in range(port, port + _TRIES if port else 1):
+        try:
+            return make(one)
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise
+    raise InputError("option port", expected="a port that is free", received=f"{port} and those after it taken")
+
+
+def answer(
+    files: Mapping[str, bytes], hosts: Collection[str], address: str, host: str
+) -> tuple[HTTPStatus, dict[str, str], bytes]:
+    """Return the status, headers and body for what a browser asks.
+
+    Args:
+        files: contents by plain name; "index.html" is "/" too. hosts: names that may be asked for.
+        address: path and query of the request. host: its header.
+    """
+    name = unquote(urlsplit(address).path).removeprefix("/") or "index.html"
+    content = files.get(name)
+    if host not in hosts:
+        status, content = HTTPStatus.FORBIDDEN, b"this server answers this machine alone\n"
+    elif content is None:
+        status, content = HTTPStatus.NOT_FOUND, b"no such file here\n"
+    else:
+        status = HTTPStatus.OK
+    kind = _TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
+    kind = kind if status == HTTPStatus.OK else "text/plain; charset=utf-8"
+    return status, {**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content))}, content
 
 
 class PageServer(ThreadingHTTPServer):
@@ -40,17 +84,8 @@ class PageServer(ThreadingHTTPServer):
     allow_reuse_address = False
 
     def __init__(self, files: Mapping[str, bytes], *, port: int = 0) -> None:
-        self.files = {f"/{name}": content for name, content in files.items()}
-        if "index.html" in files:
-            self.files["/"] = files["index.html"]
-        for one in range(port, port + _TRIES if port else 1):
-            try:
-                super().__init__((HOST, one), _Handler)
-                return
-            except OSError as error:
-                if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                    raise
-        raise InputError("option port", expected="a port that is free", received=f"{port} and those after it taken")
+        self.files = files
+        at_free_port(lambda at: super(PageServer, self).__init__((HOST, at), _Handler), port)
 
     @property
     def address(self) -> str:
@@ -59,9 +94,8 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def hosts(self) -> set[str]:
-        """Names under which pages of this machine ask; others reach it by a trick (DNS rebinding)."""
-        port = self.server_address[1]
-        return {f"{name}:{port}" for name in (HOST, "localhost")}
+        """Names of this server that pages of this machine ask for."""
+        return own_hosts(self.server_address[1])
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -76,22 +110,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(body=False)
 
     def _answer(self, *, body: bool) -> None:
-        path = unquote(urlsplit(self.path).path)
-        content = self.server.files.get(path)
-        if self.headers.get("Host", "") not in self.server.hosts:
-            status, content = HTTPStatus.FORBIDDEN, b"this server answers this machine alone\n"
-        elif content is None:
-            status, content = HTTPStatus.NOT_FOUND, b"no such file here\n"
-        else:
-            status = HTTPStatus.OK
-        suffix = ".html" if path == "/" else PurePosixPath(path).suffix
-        plain = "text/plain; charset=utf-8"
+        host = self.headers.get("Host", "")
+        status, headers, content = answer(self.server.files, self.server.hosts, self.path, host)
         self.send_response(status)
-        for name, value in _HEADERS.items():
+        for name, value in headers.items():
             self.send_header(name, value)
-        kind = _TYPES.get(suffix, "application/octet-stream") if status == HTTPStatus.OK else plain
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         if body:
             self.wfile.write(content)

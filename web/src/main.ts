@@ -1,6 +1,7 @@
 /** The page: finds a renderer and a bundle, and plays it. */
 
 import style from "./style.css";
+import { Conversation } from "./chat/conversation.ts";
 import { Player, type View } from "./player.ts";
 import { makeRenderer } from "./render/choose.ts";
 import type { Light } from "./light/irradiance.ts";
@@ -16,7 +17,7 @@ const LIGHT = "data-light";
 declare global {
   interface Window {
     /** For scripts on the page and for tests: the player, and pictures of single views. */
-    smplxppPlayer?: { player: Player; ready: Promise<void>; picture(view: View): Promise<string>; open(data: ArrayBuffer): Promise<void> };
+    smplxppPlayer?: { player: Player; talking: Promise<Conversation | null>; ready: Promise<void>; picture(view: View): Promise<string>; open(data: ArrayBuffer): Promise<void> };
   }
 }
 
@@ -35,8 +36,10 @@ async function start(): Promise<void> {
   const named = new URLSearchParams(location.search).get("avatar");
   const data = named ? download(named) : find("avatar");
   const ready = data ? app.open(data, named ? null : find("sound")) : Promise.resolve(app.invite());
+  const secret = document.body.getAttribute("data-chat");
+  const talking = ready.then(() => secret && player.summary ? new Conversation(player, secret) : null);
   window.smplxppPlayer = {
-    player, ready,
+    player, talking, ready: talking.then(() => {}),
     open: (bytes) => app.open(bytes),
     picture: async (view) => base64(await player.picture(view)),
   };

@@ -46,6 +46,12 @@ export interface Clock {
   at(playing: boolean, time: number, speed: number): number | null;
 }
 
+/** Somebody who acts by herself, in the place of the bundle's motion. */
+export interface Performer {
+  /** The pose now; null: none is known yet. */
+  pose(): Pose | null;
+}
+
 export type Frame = Extract<Reply, { kind: "frame" }>;
 
 export class Player {
@@ -73,6 +79,7 @@ export class Player {
   immersed = false;
   /** Of a sound that the motion goes with: it plays once, not in a loop. */
   clock: Clock | null = null;
+  performer: Performer | null = null;
   /** Called after each picture. */
   onpicture: () => void = () => {};
   /** Called after another light was set. */
@@ -160,14 +167,14 @@ export class Player {
 
   /** The pose at a time, with what was set by hand. */
   pose(time: number): Pose {
-    const { motion, jointNames, expressionNames } = this.summary!;
-    const pose = motion ? poseAt(motion, time) : restPose(jointNames.length, expressionNames.length);
+    const { motion, jointNames, expressionNames } = this.summary!, acted = this.performer?.pose();
+    const pose = acted ? { ...acted, expression: acted.expression.slice() } : motion ? poseAt(motion, time) : restPose(jointNames.length, expressionNames.length);
     for (const [k, value] of this.expressions) pose.expression[k] = value;
     return this.turns.size ? turned(pose, this.turns) : pose;
   }
 
   get duration(): number {
-    return this.summary?.motion ? duration(this.summary.motion) : 0;
+    return this.summary?.motion && !this.performer ? duration(this.summary.motion) : 0;
   }
 
   private readonly step = (now: number): void => {
@@ -198,6 +205,7 @@ export class Player {
       if (this.clock && next >= this.duration) this.playing = false;
       this.update();
     }
+    if (this.performer) this.update();
   }
 
   /** What the worker has made ready, null: nothing new; the worker goes on, with what the camera sees, in the meantime. */
@@ -241,7 +249,7 @@ export class Player {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
     const { motion } = this.summary!, target = [...this.orbit.target] as Orbit["target"];
-    if (motion) {
+    if (motion && !this.performer) {
       const now = poseAt(motion, this.time).translation;
       for (const axis of [0, 2]) target[axis] += now[axis] - motion.translation[axis];
     }

