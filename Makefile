@@ -12,7 +12,7 @@ $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/nativ
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[avatar,video,dev]'
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[avatar,video,chat,dev]'
 	touch $(STAMP)
 
 demo: $(STAMP)

@@ -78,6 +78,27 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Film:
+    """An MP4 film with its caption, shown with the browser's controls.
+
+    Raises:
+        InputError: other bytes.
+    """
+
+    caption: str
+    data: bytes
+
+    def __post_init__(self) -> None:
+        if self.data[4:8] != b"ftyp":
+            raise InputError(f"film {self.caption!r}", expected="MP4 bytes", received=repr(self.data[:8]))
+
+    @property
+    def uri(self) -> str:
+        """The film as a data URI."""
+        return f"data:video/mp4;base64,{base64.b64encode(self.data).decode()}"
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Two pictures of one size, laid on each other with a slider between them."""
 
@@ -157,6 +178,7 @@ class Section:
     text: tuple[str, ...] = ()
     pictures: tuple[Picture, ...] = ()
     comparisons: tuple[Comparison, ...] = ()
+    films: tuple[Film, ...] = ()
     tables: tuple[Table, ...] = ()
     histograms: tuple[Histogram, ...] = ()
     curves: tuple[Curve, ...] = ()

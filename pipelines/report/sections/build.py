@@ -25,6 +25,7 @@ from pipelines.report.sections.reconstruct import reconstruct_section
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import register_section
 from pipelines.report.sections.relight import relight_section, standing_relighting
+from pipelines.report.sections.talking import talking_section
 from pipelines.report.sections.template import (
     fidelity_section,
     parts_section,
@@ -112,6 +113,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         *_optional(evaluation, "Avatar: figures", evaluation_figures),
         *_optional(evaluation, "Avatar: side by side", evaluation_views),
         *_optional(relit, "Avatar: another light", relight_section),
+        *talking_section(run),
     )
     seconds = {name: r.manifest["seconds"] for name, r in records.items()}
     key_numbers = [
