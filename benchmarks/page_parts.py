@@ -347,7 +347,7 @@ PARTS = (
         "Eight sentences of one Piper voice, spoken in real time into the server of `smplxpp chat`; the rules "
         "answer. Seconds from the end of the speech, each from there: `pause` is what the server waits, `sentence` "
         "the first of the answer. No browser: `heard` is when the message with the sound has come, `seen` when the "
-        "runtime has drawn a picture of 512 x 640 after it. The two cores were shared with eight other processes, "
+        "runtime has drawn a picture of 512 x 640 after it. The two cores were shared with other processes (load 13), "
         "so that the clock's seconds are several times those of a free machine; seconds of CPU, of parts on their "
         "own, say what it would take there.",
     ),
