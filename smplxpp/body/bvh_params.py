@@ -18,8 +18,9 @@ from smplxpp.core.files.json_file import as_object, as_text, read_json
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import rotvec_from_matrix
 
-OURS = SMPLX_JOINTS[:22]
-"""Joints that a motion can turn."""
+_FINGERS = SMPLX_JOINTS[25:]
+OURS = (*SMPLX_JOINTS[:22], *_FINGERS)
+"""Joints that a motion can turn: the body's and the fingers'."""
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
 # Ours -> what others call them, without blanks, dashes, prefixes and capitals; `S` is left or right, or l or r. The
@@ -42,9 +43,19 @@ _SIDES = {
     "elbow": "Sforearm lowerarmS Slowarm Slowerarm Selbow",
     "wrist": "Shand handS Swrist",
 }
+# A finger's bones count from the hand, in these ways: Mixamo's and CMU's, Unreal's, Poser's and DAZ's.
+_FINGER_NAMES = {
+    "index": ["index"],
+    "middle": ["middle", "mid"],
+    "pinky": ["pinky", "little"],
+    "ring": ["ring"],
+    "thumb": ["thumb"],
+}
+_FINGER_WAYS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}", "{finger}{bone}S")
 _SPOKEN = {"left": ("left", "l"), "right": ("right", "r")}
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
 _CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
+_CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in _FINGER_NAMES for bone in (1, 2)}
 
 
 def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] | None = None) -> BodyParams:
@@ -90,7 +101,7 @@ def named_joints(
                 f"{subject}: joint map", expected=f"names of {', '.join(names)}"[:600], received=unknown[0]
             )
         found = {ours: names.index(theirs) for theirs, ours in joint_map.items()}
-    elif sum(name in names for name in OURS) >= len(NEEDED):
+    elif all(name in names for name in NEEDED):
         found = {name: names.index(name) for name in OURS if name in names}
     else:
         found = _known(names)
@@ -122,41 +133,43 @@ def _known(names: tuple[str, ...]) -> dict[str, int]:
         # The shoulder first: what is called so is a collar where there is an arm beside it.
         for part in ("shoulder", *(name for name in _SIDES if name != "shoulder")):
             take(f"{side}_{part}", [word.replace("S", one) for one in spoken for word in _SIDES[part].split()])
+        for finger, called in _FINGER_NAMES.items():
+            for bone in (1, 2, 3):
+                ways = [way.format(finger=one, bone=bone) for one in called for way in _FINGER_WAYS]
+                take(f"{side}_{finger}{bone}", [way.replace("S", one) for one in spoken for way in ways])
     return found
 
 
 def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> BodyParams:
     """Return the parameters of a body that moves as the skeleton does.
 
-    A joint's turn in the world is the file's, times what takes our rest pose to theirs: for hips, knees, shoulders and
-    elbows the smallest turn between the directions of their bones, for all others that between both trunks. So arms
-    that hang at rest there hang here. Ways are scaled by the legs' lengths, which takes care of units too; the lowest
+    A joint's turn in the world is the file's, times what takes our rest pose to theirs: for hips, knees, shoulders,
+    elbows and fingers the smallest turn between the directions of their bones, for all others that between both
+    trunks. So arms that hang at rest there hang here. Fingers that the file lacks go on as their hands, or, where it
+    has none at all, rest. Ways are scaled by the legs' lengths, which takes care of units too; the lowest
     foot comes to where the feet are at rest, the first frame above the origin.
     """
     world = _in_world(motion)
     rest = motion.rest
     trunk = _trunk(rest, joints, body)
     upright = _upright(rest, joints)
-    turned: dict[str, Float64[np.ndarray, "T 3 3"]] = {}
-    for name, joint in joints.items():
-        side, _, part = name.rpartition("_")
-        child = f"{side}_{_CHILD[part]}" if part in _CHILD else ""
-        away = trunk
-        if child in joints:
-            ours = body.places[body.names.index(child)] - body.places[body.names.index(name)]
-            away = _between(trunk @ ours, rest[joints[child]] - rest[joint]) @ trunk
-        elif part == "wrist":
-            away = _arm(rest, joints, body, trunk, side)
-        turned[name] = upright @ world[:, joint] @ away
-    pose = np.zeros((len(world), 22, 3))
-    whole: list[Float64[np.ndarray, "T 3 3"]] = []
-    for k, name in enumerate(OURS):
-        parent = whole[body.parents[k]] if k else np.broadcast_to(np.eye(3), (len(world), 3, 3))
-        own = turned.get(name, parent)
-        pose[:, k] = rotvec_from_matrix(np.swapaxes(parent, 1, 2) @ own)
-        whole.append(own)
-    everything = np.concatenate([pose, np.zeros((len(pose), 33, 3))], axis=1)
-    params = BodyParams.from_full_pose(everything, betas=np.zeros(0), expression=np.zeros(0), transl=np.zeros(3))
+    pose = np.zeros((len(world), len(SMPLX_JOINTS), 3))
+    away: dict[str, Float64[np.ndarray, "3 3"]] = {}
+    whole: dict[str, Float64[np.ndarray, "T 3 3"]] = {}
+    # Parents first; a face is not read, fingers only where there are some.
+    fingers = any(name in joints and name in body.names for name in _FINGERS)
+    for name in OURS if fingers else OURS[:22]:
+        k = body.at(name)[0]
+        above = body.names[body.parents[k]] if body.parents[k] >= 0 else ""
+        parent = whole.get(above, np.broadcast_to(np.eye(3), (len(world), 3, 3)))
+        whole[name] = parent
+        if name in joints:
+            away[name] = _away(name, rest, joints, body, away.get(above, trunk) if name in _FINGERS else trunk)
+            whole[name] = upright @ world[:, joints[name]] @ away[name]
+        pose[:, SMPLX_JOINTS.index(name)] = rotvec_from_matrix(np.swapaxes(parent, 1, 2) @ whole[name])
+    params = BodyParams.from_full_pose(
+        pose, betas=np.zeros(0), expression=np.zeros(0), transl=np.zeros(3), flat_hand_mean=fingers
+    )
     return _placed(replace(params, fps=motion.fps), motion, joints, body, upright)
 
 
@@ -224,17 +237,21 @@ def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Sk
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
-def _arm(
+def _away(
+    name: str,
     rest: Float64[np.ndarray, "J 3"],
     joints: Mapping[str, int],
     body: Skeleton,
-    trunk: Float64[np.ndarray, "3 3"],
-    side: str,
+    above: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "3 3"]:
-    """A hand goes on as its forearm is."""
-    elbow, wrist = body.places[body.at(f"{side}_elbow", f"{side}_wrist")]
-    theirs = rest[joints[f"{side}_wrist"]] - rest[joints[f"{side}_elbow"]]
-    return _between(trunk @ (wrist - elbow), theirs) @ trunk
+    """What takes a joint of ours at rest to theirs: `above`, and what its bone is turned beyond that."""
+    side, _, part = name.rpartition("_")
+    # A hand goes on as its forearm is.
+    bone = (f"{side}_elbow", name) if part == "wrist" else (name, f"{side}_{_CHILD.get(part)}")
+    if any(end not in joints for end in bone):
+        return above
+    begin, end = body.places[body.at(*bone)]
+    return _between(above @ (end - begin), rest[joints[bone[1]]] - rest[joints[bone[0]]]) @ above
 
 
 def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:

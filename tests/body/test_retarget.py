@@ -120,6 +120,74 @@ def test_our_own_file_comes_back(file):
     np.testing.assert_allclose(np.diff(params.transl, axis=0), np.diff(walk(None).transl, axis=0), atol=1e-5)
 
 
+def waving() -> BodyParams:
+    """The walk with fingers that bend and spread."""
+    rng, motion = np.random.default_rng(5), walk(None)
+    left, right = rng.normal(0.0, 0.3, (2, len(motion), 45))
+    return replace(motion, left_hand_pose=left, right_hand_pose=right, flat_hand_mean=True)
+
+
+def complete_hands(params: BodyParams) -> np.ndarray:
+    """(T, 30, 3, 3) turns of the fingers' joints."""
+    return load_body().joint_rotations(replace(params, betas=np.zeros((len(params), 0))))[:, 25:]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda motion: motion,
+        lambda motion: fingers_named(motion, "mixamorig:{side}Hand{finger}{bone}"),
+        lambda motion: fingers_named(motion, "{finger}_0{bone}_{s}"),
+        lambda motion: fingers_named(motion, "{s}{finger}{bone}"),
+    ],
+)
+def test_fingers_come_back_by_anyones_names(tmp_path, change):
+    write_bvh(tmp_path / "a.bvh", load_body(), waving())
+    motion = change(read_bvh(tmp_path / "a.bvh"))
+    params = bvh_params(motion, named_joints(motion.names, None), shaped(None))
+    np.testing.assert_allclose(complete_hands(params), complete_hands(waving()), atol=2e-4)
+    same_motion(params, walk(None))
+
+
+def fingers_named(motion: BvhMotion, way: str) -> BvhMotion:
+    def other(name: str) -> str:
+        side, _, part = name.rpartition("_")
+        if part[:-1] not in ("index", "middle", "pinky", "ring", "thumb"):
+            return MIXAMO.get(name, name)
+        return way.format(side=side.capitalize(), s=side[0], finger=part[:-1].capitalize(), bone=part[-1])
+
+    return replace(motion, names=tuple(map(other, motion.names)))
+
+
+def test_fingers_that_are_bent_at_rest_point_where_the_files_do(tmp_path):
+    """A skeleton whose first finger bones point down at rest: the same pose, told by other turns."""
+    write_bvh(tmp_path / "a.bvh", load_body(), waving())
+    motion = read_bvh(tmp_path / "a.bvh")
+    names, turn = list(motion.names), rotation_z(-0.6)
+    bent = [k for k, name in enumerate(names) if name.startswith("left_index")]
+    offsets, rotations = motion.offsets.copy(), motion.rotations.copy()
+    # G' = G A along the finger: its own turns follow, bones at rest are A times what they were.
+    for k in bent:
+        parent = motion.parents[k]
+        rotations[:, k] = (turn.T if parent in bent else np.eye(3)) @ rotations[:, k] @ turn
+        if parent in bent:
+            offsets[k] = turn.T @ offsets[k]
+    other = replace(motion, offsets=offsets, rotations=rotations)
+    params = bvh_params(other, named_joints(other.names, None), shaped(None))
+    body, truth, found = load_body(), waving(), replace(params, transl=waving().transl)
+    joints = [body.joint_names.index(f"left_index{bone}") for bone in (1, 2, 3)]
+    where = [body.forward(replace(one, betas=np.zeros((len(one), 10)))).joints[:, joints] for one in (truth, found)]
+    np.testing.assert_allclose(np.diff(where[1], axis=1), np.diff(where[0], axis=1), atol=1e-5)
+
+
+def test_hands_of_a_file_without_fingers_stay_as_they_are(file):
+    motion = read_bvh(file)
+    names = named_joints(motion.names, None)
+    bare = {name: joint for name, joint in names.items() if name in shaped(None).names[:22]}
+    params = bvh_params(motion, bare, shaped(None))
+    assert not params.flat_hand_mean and not params.left_hand_pose.any()
+
+
 def test_a_walk_of_another_skeleton_does_not_slide(file):
     target = shaped(2)
     assert slide(target, load_bvh(file, target)) < 1.5
