@@ -286,8 +286,8 @@ PARTS = (
     Part(
         "bundle_woman_casual",
         "The student as a bundle",
-        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in held-out views by torch "
-        "from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of the person, dB; "
+        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in all 120 held-out views by "
+        "torch from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of the person, dB; "
         "`lost`: what the full student has more, mean and worst view; to the full student: the least PSNR of a picture "
         "against torch's. Loose clothes are where the field has them, in new poses too.",
     ),
@@ -313,7 +313,9 @@ PARTS = (
         "Motions between their frames",
         "The performances of the synthetic captures, curves that are known at every instant, 4 s each; every third of "
         "60 frames a second is given, the others come from in between. `shortest turns` is what `--interpolate` does. "
-        "Vertices and joints of the open body, mm; the angle of a frame's worst joint.",
+        "Vertices and joints of the open body, mm; the angle of a frame's worst joint. Pictures: of the student of "
+        "`woman_casual` (preset `cpu`, her skirt simulated) at the frames in between against those at the true poses, "
+        "from the front, 640 pixels high; PSNR of the person, dB.",
     ),
     Part(
         "relighting",
@@ -328,12 +330,13 @@ PARTS = (
         "web_player",
         "The student in a browser",
         "The student of `woman_casual`, preset `cpu`, with its skirt, and students of its sizes with Gaussians as they "
-        "are sampled before any training; least of 20 poses, on one thread of a busy machine. Milliseconds of the "
+        "are sampled before any training; least of 12 poses, on one thread of a busy machine. Milliseconds of the "
         "processor: native kernels (with AVX-512), the same C++ as WebAssembly in Node (vectors of 16 bytes), and the "
         "player's TypeScript before it. `sort` and `records`, what the GPU takes of each Gaussian, are the page's "
         "alone; `cloth, a step` of 1/30 s, natively with numpy's part of the driver. Pictures in Chromium, where the "
-        "CPU plays the GPU: milliseconds of the clock, the least of six, with eight other processes on the two cores, "
-        "so that only their ratio says something. No GPU and no phone was at hand.",
+        "CPU plays the GPU: milliseconds of the clock, the least of five, with many other processes on the two cores, "
+        "so that only ratios say something; `drawing`, and by WebGPU `projection and sort`, as the GPU tells them, the "
+        "rest as the page does. No GPU and no phone was at hand.",
     ),
     Part(
         "talking",

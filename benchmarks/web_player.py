@@ -29,9 +29,11 @@ from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
 from benchmarks.machine import store_results
 from benchmarks.runtime import SAMPLED, from_the_front, poses_of, sampled
-from pipelines.web.page import single_page
+from pipelines.web.page import PageLight, single_page
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.camera import Camera
+from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.panoramas import STUDIO, panoramas
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 from tests.web.chromium import Page, find_chromium
@@ -71,13 +73,21 @@ for (let k = 0; driver && k < repeats; ++k) {
 process.stdout.write(JSON.stringify(best));
 """
 _PICTURES = """(async () => {
-  const { player } = smplxppPlayer, best = { picture: Infinity, draw: Infinity };
+  const { player } = smplxppPlayer, best = {};
+  const note = (part, ms) => { if (ms !== null) best[part] = Math.min(best[part] ?? Infinity, ms); };
+  player.lit = %s;
   for (let k = 0; k < %d; ++k) {
     const start = performance.now();
+    // Rates are means over pictures: those of this one alone.
+    Object.assign(player.rates, { deform: 0, sort: 0 });
     await player.picture({ time: 0.1 * k, seconds: null, camera: %s });
-    best.picture = Math.min(best.picture, performance.now() - start);
-    // WebGL2 knows the time of a picture when the next one comes.
-    if (k) best.draw = Math.min(best.draw, player.renderer.milliseconds ?? Infinity);
+    note("picture", performance.now() - start);
+    note("pose and records", player.rates.deform);
+    if (!player.renderer.sorts) note("sort", player.rates.sort);
+    // A renderer knows the time of a picture when the next one comes.
+    const { sorts, sorting, milliseconds } = player.renderer;
+    if (k) note(sorts && sorting === null ? "sort and drawing" : "drawing", milliseconds);
+    if (k) note("projection and sort", sorting);
   }
   return JSON.stringify(best);
 })()"""
@@ -158,20 +168,24 @@ def in_node(path: Path, modules: Path, repeats: int) -> dict[str, float]:
 
 
 def drawn(path: Path, camera: Camera, pictures: int) -> dict[str, dict[str, float]]:
-    """Return the least milliseconds of a picture, its bytes read back, and of its drawing alone, by renderer."""
+    """Return the least milliseconds of a picture, its bytes read back, and of its parts, by renderer and light."""
     K = camera.K
     view = {"view": camera.cam_from_world[:3].ravel().tolist(), "width": camera.width, "height": camera.height}
     view |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     out = {}
     with tempfile.TemporaryDirectory() as folder, Page(Path(folder) / "profile") as page:
         file = Path(folder) / "player.html"
-        file.write_bytes(single_page(path.read_bytes(), name="benchmark"))
+        studio = Irradiance.of_environment(panoramas()[STUDIO]).exposed()
+        light = PageLight(STUDIO, Relighting(studio, Irradiance.uniform()))
+        file.write_bytes(single_page(path.read_bytes(), name="benchmark", light=light))
         for renderer in ("webgl2", "webgpu"):
             page.go(f"{file.as_uri()}?renderer={renderer}")
             page.evaluate("smplxppPlayer.player.playing = false")
-            best = json.loads(page.evaluate(_PICTURES % (pictures, json.dumps(view))))
             name = page.evaluate("smplxppPlayer.player.renderer.name")
-            out[f"pictures of {camera.width}x{camera.height} by {name} on SwiftShader"] = best
+            for lit in (False, True):
+                best = json.loads(page.evaluate(_PICTURES % (json.dumps(lit), pictures, json.dumps(view))))
+                words = ", in another light" if lit else ""
+                out[f"pictures of {camera.width}x{camera.height} by {name} on SwiftShader{words}"] = best
     return out
 
 

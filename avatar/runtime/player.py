@@ -116,6 +116,11 @@ class AvatarPlayer:
         return BodyParams.from_mapping(arrays, source="motion of the bundle")
 
     @property
+    def has_clothes(self) -> bool:
+        """Whether there are loose clothes, which `step` simulates."""
+        return self._clothes is not None
+
+    @property
     def said(self) -> list[str]:
         """What went otherwise than asked for with the loose clothes, a sentence each."""
         return [] if self._clothes is None else self._clothes.said

@@ -60,9 +60,9 @@ class Environment:
 
     def __post_init__(self) -> None:
         light = Irradiance.of_environment(self.panorama)
-        if self.exposure is None:
-            object.__setattr__(self, "exposure", stage_light().mean / max(light.mean, 1e-12))
-        require_positive("--exposure", self.exposure)
+        exposure = stage_light().mean / max(light.mean, 1e-12) if self.exposure is None else self.exposure
+        require_positive("--exposure", exposure)
+        object.__setattr__(self, "exposure", exposure)
 
     def at(self, mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray, "2 N 3"]:
         """Return what `environment_light` does."""

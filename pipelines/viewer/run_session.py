@@ -25,11 +25,14 @@ from smplxpp.template.template import Template
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarPlayer
+    from avatar.runtime.splatting import WorldSplats
 
 Coloring = Literal["photograph", "labels", "weights", "one joint"]
 COLORINGS: tuple[Coloring, ...] = ("photograph", "labels", "weights", "one joint")
 TURNED = SMPLX_JOINTS[:23]
 """Joints that can be turned by hand: the body's and the jaw."""
+_FOLLOWED = 1.0
+"""Seconds of the motion that clothes follow at once; after more they start anew."""
 _PLACES = {
     name: (block, 3 * k)
     for (block, count), first in zip(POSE_BLOCKS[:3], (0, 1, 22), strict=True)
@@ -56,6 +59,14 @@ class DrawnSplats:
     opacities: Float[np.ndarray, "N 1"]
 
 
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """What simulated clothes have followed last: player, frame and what was changed by hand; and what came of it."""
+
+    shown: tuple[AvatarPlayer, int, dict[str, tuple[float, float, float]], dict[str, float]]
+    splats: WorldSplats
+
+
 @dataclass(eq=False)
 class RunSession:
     """What is shown of a run.
@@ -66,6 +77,7 @@ class RunSession:
         now: the training that is under way.
         relighting: another light than the capture's, which the Gaussians are shown in; None: there is none.
         relit: whether they are.
+        simulated: loose clothes follow what is shown, frame after frame; else field and skinning say where they are.
         at: row of the motion. turned: degrees about x, y and z by which joints are turned beyond the frame's pose.
         expression: added to the frame's coefficients.
     """
@@ -80,9 +92,11 @@ class RunSession:
     now: TrainingNow | None = None
     relighting: Relighting | None = None
     relit: bool = True
+    simulated: bool = False
     at: int = 0
     turned: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     expression: dict[str, float] = field(default_factory=dict)
+    _stepped: _Step | None = None
 
     @property
     def frame(self) -> int:
@@ -162,8 +176,7 @@ class RunSession:
         """The Gaussians as they look from a point, metres; None where the run has none."""
         if self.player is None:
             return None
-        frame = self.frame if self.motion.photographed and not self.turned else None
-        drawn = self.player.pose(self.params, frame=frame)
+        drawn = self._posed(self.player)
         colors = np.clip(drawn.colors(np.ascontiguousarray(eye, dtype=np.float32)), 0.0, 1.0)
         if self.relighting is not None and self.relit:
             colors = self.relighting.colors(colors, self.player.normals)
@@ -173,6 +186,26 @@ class RunSession:
             colors,
             drawn.opacities[:, None].copy(),
         )
+
+    @property
+    def dressed(self) -> bool:
+        """Whether the Gaussians have loose clothes that can be simulated."""
+        return self.player is not None and self.player.has_clothes
+
+    def _posed(self, player: AvatarPlayer) -> WorldSplats:
+        """The Gaussians of what is shown; simulated clothes go on from what was shown before."""
+        if not (self.simulated and self.dressed):
+            self._stepped = None
+            return player.pose(self.params, frame=self.frame if self.motion.photographed and not self.turned else None)
+        now, before = (player, self.frame, dict(self.turned), dict(self.expression)), self._stepped
+        if before is not None and before.shown == now:
+            return before.splats
+        passed = 0 if before is None else self.frame - before.shown[1]
+        # Other frames than the next ones are another scene.
+        if before is None or before.shown[0] is not player or not 0 <= passed <= _FOLLOWED * self.motion.fps:
+            player.restart()
+        self._stepped = _Step(now, player.step(self.params, max(passed, 1) / self.motion.fps))
+        return self._stepped.splats
 
     def refresh(self) -> bool:
         """Look again what a training has left; returns whether there are other Gaussians than before."""
@@ -205,4 +238,6 @@ def open_run(
     motion = motion_of_run(run, template, shown, params)
     session = RunSession(run, template, motion, shown, tracked=tracked_surface(run, template), relighting=relighting)
     session.refresh()
+    # Frames of the training have codes that know their clothes; a new motion has none.
+    session.simulated = session.dressed and not motion.photographed
     return session

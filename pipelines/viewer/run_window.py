@@ -82,6 +82,7 @@ class RunWindow:
         with gui.add_folder("Show"):
             self._splats = gui.add_checkbox("Gaussians", has_splats, disabled=not has_splats)
             self._light = gui.add_checkbox("in the new light", True, visible=session.relighting is not None)
+            self._cloth = gui.add_checkbox("loose clothes simulated", session.simulated, visible=session.dressed)
             for layer in session.layers:
                 self._layers[layer.name] = gui.add_checkbox(layer.name, not has_splats)
             self._tracked = gui.add_checkbox("followed surface", False, disabled=session.tracked is None)
@@ -112,6 +113,7 @@ class RunWindow:
         for box in (self._splats, self._tracked, self._joint, *self._layers.values()):
             box.on_update(lambda _: self._redraw())
         self._light.on_update(lambda _: self._relight())
+        self._cloth.on_update(lambda _: self._simulate())
         self._coloring.on_update(lambda _: self._recolor())
         self._turned.on_update(lambda _: self._show_turned())
         for axis in self._axes:
@@ -133,6 +135,11 @@ class RunWindow:
     @one_at_a_time
     def _relight(self) -> None:
         self.session.relit = bool(self._light.value)
+        self._redraw()
+
+    @one_at_a_time
+    def _simulate(self) -> None:
+        self.session.simulated = bool(self._cloth.value)
         self._redraw()
 
     @one_at_a_time
@@ -197,6 +204,7 @@ class RunWindow:
         if self.session.refresh():
             if self._splats.disabled:
                 self._splats.disabled, self._splats.value = False, True
+            self._cloth.visible = self.session.dressed
             self._redraw()
         self._tell()
 

@@ -238,7 +238,8 @@ export class Player {
     this.lastDrawn = now;
     rates.deform = mean(rates.deform, frame.deform);
     rates.cloth = mean(rates.cloth, frame.cloth);
-    rates.sort = mean(rates.sort, frame.sort);
+    // What leaves out the hidden, where the GPU sorts, is told by the GPU's own time.
+    rates.sort = this.renderer.sorting ?? mean(rates.sort, frame.sort);
     rates.draw = this.renderer.milliseconds;
     ++this.pictures;
     this.onpicture();

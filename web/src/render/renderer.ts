@@ -27,8 +27,10 @@ export interface Renderer {
   draw(picture: Picture): void;
   /** (H, W, 4) bytes of the picture drawn last in this task, from the top. */
   pixels(): Promise<Uint8Array>;
-  /** Milliseconds that the GPU took for a recent picture; null: not measured here. */
+  /** Milliseconds that the GPU took to draw a recent picture; null: not measured here. */
   readonly milliseconds: number | null;
+  /** Those that it took before for projection and sort; null: it does not sort, or they are among the others. */
+  readonly sorting: number | null;
   /** Loses context or device, as a driver that restarts does: for tests. It comes back by itself. */
   lose(): void;
 }

@@ -50,6 +50,7 @@ export class WebGL2Renderer implements Renderer {
   readonly sorts = false;
   lost = false;
   milliseconds: number | null = null;
+  readonly sorting = null;
   private readonly gl: WebGL2RenderingContext;
   private resources: Resources;
   private timer: Timer | null = null;

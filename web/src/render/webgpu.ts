@@ -10,6 +10,7 @@ import {
 const BLENDED: GPUTextureFormat = "rgba16float", READ: GPUTextureFormat = "rgba8unorm";
 /** Pictures under way at once: one is drawn while the next is made ready. */
 const MOST_PENDING = 2;
+const TIMES = "timestamp-query", CLOCK_BYTES = 32;
 const SPLAT_BYTES = 32, PROJECT_THREADS = 64, ROW_ALIGNMENT = 256;
 
 /** What the number of Gaussians decides. */
@@ -44,11 +45,22 @@ interface Pipelines {
   lit: Painting | null;
 }
 
+/** What tells the times of two passes: begin and end of each, nanoseconds. */
+interface Clock {
+  queries: GPUQuerySet;
+  resolved: GPUBuffer;
+  read: GPUBuffer;
+  /** No answer is awaited. */
+  free: boolean;
+}
+
 export class WebGPURenderer implements Renderer {
   readonly name = "WebGPU";
   readonly sorts = true;
   lost = false;
   milliseconds: number | null = null;
+  sorting: number | null = null;
+  private clock: Clock | null = null;
   private pending = 0;
   private device!: GPUDevice;
   private pipelines!: Pipelines;
@@ -95,7 +107,11 @@ export class WebGPURenderer implements Renderer {
     device.queue.writeBuffer(own.records, 0, records.buffer, records.byteOffset, 4 * RECORD * count);
 
     const encoder = device.createCommandEncoder();
-    const compute = encoder.beginComputePass();
+    const clock = this.clock?.free ? this.clock : null;
+    const timed = (first: number) => clock
+      ? { timestampWrites: { querySet: clock.queries, beginningOfPassWriteIndex: first, endOfPassWriteIndex: first + 1 } }
+      : {};
+    const compute = encoder.beginComputePass(timed(0));
     const run = (pipeline: GPUComputePipeline, group: GPUBindGroup, workgroups: number) => {
       compute.setPipeline(pipeline);
       compute.setBindGroup(0, group);
@@ -113,20 +129,38 @@ export class WebGPURenderer implements Renderer {
       colorAttachments: targets.map((target) => ({
         view: target.createView(), loadOp: "clear", storeOp: "store", clearValue: [0, 0, 0, 1],
       })),
+      ...timed(2),
     });
     splats.setPipeline(painting.draw);
     splats.setBindGroup(0, light ? (own.lit ??= this.group(painting.draw, [...own.drawn, own.records])) : own.plain);
     if (count) splats.draw(4, count);
     splats.end();
     this.resolve(encoder, painting.resolve, this.context.getCurrentTexture().createView());
+    if (clock) {
+      encoder.resolveQuerySet(clock.queries, 0, 4, clock.resolved, 0);
+      encoder.copyBufferToBuffer(clock.resolved, 0, clock.read, 0, CLOCK_BYTES);
+    }
     const submitted = performance.now();
     device.queue.submit([encoder.finish()]);
     ++this.pending;
+    if (clock) this.tell(clock);
     const done = () => {
       --this.pending;
-      this.milliseconds = performance.now() - submitted;
+      if (!this.clock) this.milliseconds = performance.now() - submitted;
     };
     device.queue.onSubmittedWorkDone().then(done, done);
+  }
+
+  /** Reads the times of a picture, once it is drawn. */
+  private async tell(clock: Clock): Promise<void> {
+    clock.free = false;
+    // A device that is lost never answers: the next one has a clock of its own.
+    if (!(await clock.read.mapAsync(GPUMapMode.READ).then(() => true, () => false))) return;
+    const [began, sorted, drawing, drawn] = new BigInt64Array(clock.read.getMappedRange());
+    this.sorting = Number(sorted - began) / 1e6;
+    this.milliseconds = Number(drawn - drawing) / 1e6;
+    clock.read.unmap();
+    clock.free = true;
   }
 
   async pixels(): Promise<Uint8Array> {
@@ -178,6 +212,11 @@ export class WebGPURenderer implements Renderer {
     this.scene = uniform(SCENE_BYTES);
     this.background = uniform(16);
     this.lights = uniform(4 * MATRICES);
+    const buffer = (usage: number) => device.createBuffer({ size: CLOCK_BYTES, usage: usage | GPUBufferUsage.COPY_DST });
+    this.clock = !device.features.has(TIMES) ? null : {
+      queries: device.createQuerySet({ type: "timestamp", count: 4 }), free: true,
+      resolved: buffer(GPUBufferUsage.QUERY_RESOLVE | GPUBufferUsage.COPY_SRC), read: buffer(GPUBufferUsage.MAP_READ),
+    };
     this.shifts = Array.from({ length: PASSES }, (_, pass) => {
       const buffer = uniform(16);
       device.queue.writeBuffer(buffer, 0, new Uint32Array([(pass * KEY_BITS) / PASSES]));
@@ -255,7 +294,7 @@ export class WebGPURenderer implements Renderer {
 async function freshDevice(anyDevice = true): Promise<GPUDevice | null> {
   const adapter = await globalThis.navigator?.gpu?.requestAdapter({ powerPreference: "high-performance" });
   if (adapter && !anyDevice && isSoftware(adapter)) return null;
-  return (await adapter?.requestDevice()) ?? null;
+  return (await adapter?.requestDevice({ requiredFeatures: adapter.features.has(TIMES) ? [TIMES] : [] })) ?? null;
 }
 
 /** Whether the CPU plays this GPU: browsers say so in one of two places, or by the name of what plays it. */

@@ -194,7 +194,7 @@ export class App {
     const { fps, deform, cloth, sort, draw } = player.rates;
     const parts = [`pose ${deform.toFixed(1)}`];
     if (player.summary!.garments.length && player.simulating) parts.push(`cloth ${cloth.toFixed(1)}`);
-    if (!player.renderer.sorts) parts.push(`sort ${sort.toFixed(1)}`);
+    if (!player.renderer.sorts || player.renderer.sorting !== null) parts.push(`sort ${sort.toFixed(1)}`);
     if (draw !== null) parts.push(`draw ${draw.toFixed(1)}`);
     const size = `${(player.summary!.bytes / 1e6).toFixed(1)} MB`;
     this.rates.replaceChildren(element("b", {}, `${fps.toFixed(fps < 10 ? 1 : 0)} fps`),
