@@ -286,10 +286,10 @@ PARTS = (
     Part(
         "bundle_woman_casual",
         "The student as a bundle",
-        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in all 120 held-out views by "
-        "torch from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of the person, dB; "
-        "`lost`: what the full student has more, mean and worst view; to the full student: the least PSNR of a picture "
-        "against torch's. Loose clothes are where the field has them, in new poses too.",
+        "The student of `woman_casual`, preset `cpu`, 50,000 Gaussians, exact inputs; drawn in all 120 held-out "
+        "views by torch from the full file, and by the runtime from bundles of coarser and coarser numbers. PSNR of "
+        "the person, dB; `lost`: what the full student has more, mean and worst view; to the full student: the least "
+        "PSNR of a picture against torch's. Loose clothes are where the field has them, in new poses too.",
     ),
     Part(
         "runtime",
@@ -330,13 +330,14 @@ PARTS = (
         "web_player",
         "The student in a browser",
         "The student of `woman_casual`, preset `cpu`, with its skirt, and students of its sizes with Gaussians as they "
-        "are sampled before any training; least of 12 poses, on one thread of a busy machine. Milliseconds of the "
+        "are sampled before any training; least of 20 poses, on one thread of a busy machine. Milliseconds of the "
         "processor: native kernels (with AVX-512), the same C++ as WebAssembly in Node (vectors of 16 bytes), and the "
         "player's TypeScript before it. `sort` and `records`, what the GPU takes of each Gaussian, are the page's "
         "alone; `cloth, a step` of 1/30 s, natively with numpy's part of the driver. Pictures in Chromium, where the "
-        "CPU plays the GPU: milliseconds of the clock, the least of five, with many other processes on the two cores, "
-        "so that only ratios say something; `drawing`, and by WebGPU `projection and sort`, as the GPU tells them, the "
-        "rest as the page does. No GPU and no phone was at hand.",
+        "CPU plays the GPU: milliseconds of the clock, the least of five, in a later run of their own (another student "
+        "of that preset) with seventeen other processes on the two cores, so that only ratios say something; "
+        "`drawing`, and by WebGPU `projection and sort`, as the GPU tells them, the rest as the page does. No GPU and "
+        "no phone was at hand.",
     ),
     Part(
         "talking",

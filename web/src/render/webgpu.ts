@@ -3,11 +3,9 @@
 import { RECORD } from "../avatar/deform.ts";
 import { MATRICES } from "../light/irradiance.ts";
 import type { Picture, Renderer } from "./renderer.ts";
-import {
-  COUNT, DIGITS, draw, KEY_BITS, PASSES, PROJECT, resolve, SCAN, SCATTER, SCENE_BYTES, TILE_KEYS,
-} from "./webgpu_shaders.ts";
+import { asPainting, BLENDED, makePipelines, paintings, READ, type Painting, type Pipelines } from "./webgpu_pipelines.ts";
+import { DIGITS, KEY_BITS, PASSES, SCENE_BYTES, TILE_KEYS } from "./webgpu_shaders.ts";
 
-const BLENDED: GPUTextureFormat = "rgba16float", READ: GPUTextureFormat = "rgba8unorm";
 /** Pictures under way at once: one is drawn while the next is made ready. */
 const MOST_PENDING = 2;
 const TIMES = "timestamp-query", CLOCK_BYTES = 32;
@@ -26,23 +24,6 @@ interface Buffers {
   plain: GPUBindGroup;
   /** Made when it is asked for. */
   lit: GPUBindGroup | null;
-}
-
-/** What draws and shows; with another light normals are drawn, too. */
-interface Painting {
-  draw: GPURenderPipeline;
-  resolve: GPURenderPipeline;
-  resolveToRead: GPURenderPipeline;
-}
-
-interface Pipelines {
-  project: GPUComputePipeline;
-  count: GPUComputePipeline;
-  scan: GPUComputePipeline;
-  scatter: GPUComputePipeline;
-  plain: Painting;
-  /** Made when it is asked for. */
-  lit: Painting | null;
 }
 
 /** What tells the times of two passes: begin and end of each, nanoseconds. */
@@ -318,41 +299,4 @@ async function canShow(device: GPUDevice): Promise<boolean> {
   const result = await Promise.race([shown, lost]);
   context.unconfigure();
   return result;
-}
-
-async function makePipelines(device: GPUDevice, format: GPUTextureFormat): Promise<Pipelines> {
-  const compute = (code: string, entryPoint: string) =>
-    device.createComputePipelineAsync({ layout: "auto", compute: { module: device.createShaderModule({ code }), entryPoint } });
-  const [[project, count, scan, scatter], painting] = await Promise.all([
-    Promise.all([compute(PROJECT, "project"), compute(COUNT, "count"), compute(SCAN, "scan"), compute(SCATTER, "scatter")]),
-    Promise.all(paintings(device, format, false).map((it) => device.createRenderPipelineAsync(it))),
-  ]);
-  return { project, count, scan, scatter, plain: asPainting(painting), lit: null };
-}
-
-function asPainting([draw, resolve, resolveToRead]: GPURenderPipeline[]): Painting {
-  return { draw, resolve, resolveToRead };
-}
-
-/** What draws splats, shows them on the canvas, and shows them to be read. */
-function paintings(device: GPUDevice, format: GPUTextureFormat, lit: boolean): GPURenderPipelineDescriptor[] {
-  const painting = (
-    code: string, entries: [string, string], targets: GPUColorTargetState[], topology: GPUPrimitiveTopology,
-  ): GPURenderPipelineDescriptor => {
-    const module = device.createShaderModule({ code });
-    return {
-      layout: "auto", primitive: { topology },
-      vertex: { module, entryPoint: entries[0] }, fragment: { module, entryPoint: entries[1], targets },
-    };
-  };
-  const under: GPUBlendState = {
-    color: { srcFactor: "dst-alpha", dstFactor: "one", operation: "add" },
-    alpha: { srcFactor: "zero", dstFactor: "one-minus-src-alpha", operation: "add" },
-  };
-  const blended = new Array(lit ? 2 : 1).fill({ format: BLENDED, blend: under });
-  return [
-    painting(draw(lit), ["corner", "blend"], blended, "triangle-strip"),
-    painting(resolve(lit), ["whole", "resolve"], [{ format }], "triangle-list"),
-    painting(resolve(lit), ["whole", "resolve"], [{ format: READ }], "triangle-list"),
-  ];
 }
