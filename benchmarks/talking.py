@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,10 +22,12 @@ from jaxtyping import Float
 
 from avatar.speech import ARTICULATORS, Speech, articulate
 from avatar.speech.aligner import align
-from avatar.speech.phonemes import BILABIALS
+from avatar.speech.phonemes import BILABIALS, SILENCE
 from avatar.speech.voice import PiperVoice
 from benchmarks.machine import store_results
 
+SPEEDS = (0.8, 1.0, 1.25)
+"""Factors of the voice's durations."""
 SENTENCES = (
     "Please bring my umbrella before the big storm.",
     "People may put both blue boats by the pier!",
@@ -32,6 +35,18 @@ SENTENCES = (
     "Remember, the problem is simple: move up, then stop.",
     "Five very brave men opened the heavy door.",
 )
+VISEMES = {
+    "lips closed": ("P", "B", "M"),
+    "lip at teeth": ("F", "V"),
+    "tongue ahead": ("TH", "DH", "T", "D", "N", "L"),
+    "tongue behind": ("K", "G", "NG", "HH", "Y"),
+    "teeth": ("S", "Z"),
+    "teeth, round": ("CH", "JH", "SH", "ZH", "R", "ER"),
+    "open": ("AA", "AE", "AH", "AY", "AW"),
+    "half open": ("EH", "EY", "IH", "IY"),
+    "round": ("AO", "OW", "OY", "UH", "UW", "W"),
+}
+"""Phonemes that look alike."""
 PICTURES = 30
 CLOSED = 0.95
 """Of the lips' pressing, from which they count as closed."""
@@ -50,6 +65,8 @@ class Talking:
         closures: dict[str, list[float]] = {}
         factors: dict[str, list[float]] = {}
         missed: dict[str, int] = {}
+        confused: dict[str, Counter[tuple[str, str]]] = {}
+        by_speed: dict[float, list[float]] = {}
         phonemes = bilabials = 0
         for text in SENTENCES:
             began = time.process_time()
@@ -63,6 +80,12 @@ class Talking:
                 starts.setdefault(name, []).extend(starts_apart(said.speech, heard[name]))
             phonemes += len(said.speech.spoken)
             bilabials += sum(phoneme.name in BILABIALS for phoneme in said.speech.spoken)
+            for name in ("words given", "words recognised"):
+                confused.setdefault(name, Counter()).update(visemes_apart(said.speech, heard[name]))
+            for slower in SPEEDS:
+                slow = said if slower == 1.0 else voice.say(text, slower=slower)
+                aligned = heard["words given"] if slower == 1.0 else align(slow.sound, text)
+                by_speed.setdefault(slower, []).extend(starts_apart(slow.speech, aligned))
             for name, speech in heard.items():
                 found, lost = closures_apart(said.speech, speech)
                 closures.setdefault(name, []).extend(found)
@@ -73,6 +96,12 @@ class Talking:
             "bilabials": bilabials,
             "starts of phonemes, ms": {k: {"matched": len(v), **milliseconds(v)} for k, v in starts.items()},
             "lips closed, ms": {k: {"missed": missed[k], **milliseconds(v)} for k, v in closures.items()},
+            "mouth shapes, % of the time": {k: shares(v) for k, v in confused.items()},
+            "starts by speed, words given, ms": {str(k): milliseconds(v) for k, v in by_speed.items()},
+            "the same, less the other speeds' bias": {
+                str(k): milliseconds(np.asarray(v) - np.mean([np.mean(w) for j, w in by_speed.items() if j != k]))
+                for k, v in by_speed.items()
+            },
             "seconds of CPU a second of sound": {k: round(float(np.mean(v)), 3) for k, v in factors.items()},
         }
         for name, value in figures.items():
@@ -106,6 +135,33 @@ def closures_apart(truth: Speech, other: Speech) -> tuple[list[float], int]:
         else:
             missed += 1
     return found, missed
+
+
+def visemes_apart(truth: Speech, other: Speech) -> Counter[tuple[str, str]]:
+    """Return how many hundredths of a second one mouth shape was taken for another, (true, taken), equal ones too."""
+    out: Counter[tuple[str, str]] = Counter()
+    for t in np.arange(0.005, truth.seconds, 0.01):
+        out[_viseme(truth, t), _viseme(other, t)] += 1
+    return out
+
+
+def shares(counts: Counter[tuple[str, str]]) -> dict[str, float]:
+    """Return how much is equal, by true shape where anything is said, and the commonest mistakes; percent."""
+    spoken = Counter({pair: n for pair, n in counts.items() if pair[0] != SILENCE})
+    right = sum(n for pair, n in spoken.items() if pair[0] == pair[1])
+    out = {"right": round(100.0 * right / spoken.total(), 1)}
+    for shape in sorted({pair[0] for pair in spoken}):
+        mine = sum(n for pair, n in spoken.items() if pair[0] == shape)
+        out[f"right of {shape}"] = round(100.0 * spoken[shape, shape] / mine, 1)
+    wrong = Counter({pair: n for pair, n in spoken.items() if pair[0] != pair[1]})
+    for (one, taken), n in wrong.most_common(5):
+        out[f"{one} taken for {taken}"] = round(100.0 * n / spoken.total(), 1)
+    return out
+
+
+def _viseme(speech: Speech, time: float) -> str:
+    name = next((one.name for one in speech.phonemes if one.start <= time < one.end), SILENCE)
+    return next((viseme for viseme, names in VISEMES.items() if name in names), SILENCE)
 
 
 def milliseconds(apart: Sequence[float] | Float[np.ndarray, " N"]) -> dict[str, Any]:

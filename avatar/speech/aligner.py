@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -109,5 +110,5 @@ def _stresses(word: str, count: int) -> list[int]:
 
 def _clipped(phonemes: list[Phoneme], seconds: float) -> list[Phoneme]:
     """Phonemes within the sound: the last frame may end behind it."""
-    held = [Phoneme(one.name, one.start, min(one.end, seconds)) for one in phonemes]
+    held = [replace(one, end=min(one.end, seconds)) for one in phonemes]
     return [one for one in held if one.end > one.start]

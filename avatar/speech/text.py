@@ -19,6 +19,9 @@ MOST_CHARACTERS = 20_000
 """Of a text that is spoken at once: some twenty minutes."""
 PAUSES = ".,;:!?"
 EXTRA = "talk"
+# Marks at which a sentence breaks: not within numbers, behind one letter or behind a title.
+_POINT = "".join(rf"(?<!\b{title})" for title in ("[A-Za-z]", "Dr", "Mr", "Ms", "St", "Mrs", "Prof")) + r"\."
+_BREAK = re.compile(rf"((?:{_POINT}|[,;:!?])[{re.escape(PAUSES)}]*)(?=[\s\"'”’)\]]|$)")
 _WAIT = 60.0  # seconds for espeak-ng
 _ONES = (
     "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
@@ -161,7 +164,7 @@ def _stressed(phones: str) -> list[str]:
 
 def _by_espeak(program: str, text: str, language: str) -> str:
     """Ask the user's own espeak-ng; pauses are kept, which it drops."""
-    parts = re.split(rf"([{re.escape(PAUSES)}]+)", text)
+    parts = _BREAK.split(text)
     spoken = [part.strip() for part in parts[::2]]
     command = [program, "-q", "--ipa", "-b", "1", "-v", language, "--stdin"]
     out = ""
@@ -171,7 +174,8 @@ def _by_espeak(program: str, text: str, language: str) -> str:
             if done.returncode:
                 said = done.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
                 raise InputError(f"language {language}", expected="one that espeak-ng speaks", received=said[-1])
-            out += " " + " ".join(done.stdout.decode(errors="replace").split())
+            # Names of languages in brackets say where it changes to another for a word.
+            out += " " + " ".join(re.sub(r"\([a-z-]+\)", "", done.stdout.decode(errors="replace")).split())
         if 2 * k + 1 < len(parts):
             out += parts[2 * k + 1][0]
     return out.strip()

@@ -22,7 +22,6 @@ _DURATIONS = "/Ceil_output_0"  # inside Piper's models: frames of each symbol
 _HOP = 256  # samples a frame
 _PAD, _BEGIN, _END = "_", "^", "$"
 _STRESS = {"ˈ": 1, "ˌ": 2}
-_MARKS = "ˈˌːˑ"
 
 
 @dataclass
@@ -137,7 +136,7 @@ def _symbols(ipa: str) -> list[tuple[str, str]]:
             out.append((piece, SILENCE))
         elif piece == " ":
             out.append((piece, ""))
-        elif out and piece in _MARKS:
+        elif out:  # length, and sounds that no mouth shows, go with what stands before them
             out[-1] = (out[-1][0] + piece, out[-1][1])
         at += length
     return out

