@@ -2,7 +2,7 @@
 
     python -m benchmarks.gestures
 
-A Piper voice (extra `[talk]`) says some minutes; the embedded body, seen in an A-pose alone, gestures to them. Measured are
+A Piper voice (extra `[talk]`) says some minutes; the embedded body, seen in an A-pose alone, gestures to them:
 the way of the feet's joints, the distance of hands from the trunk's skin, when gestures are struck against stressed
 vowels, after how many seconds of speech a gesture is used again, and how alike any two pieces of the arms' angles are.
 Beside it how much of ARKit's expressions numbered ones leave (`avatar.speech.bases`).

