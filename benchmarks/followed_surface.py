@@ -4,8 +4,10 @@
 
 The tracking of a preset follows the loose part of a RUN's template through every n-th training frame of its capture,
 from the RUN's own Gaussians and poses. Measured are the part's points, each against where it truly is ("vertexwise"),
-its surface, and pictures of cameras that training did not see. Patterns other than the photographs' own are painted
-over them (`benchmarks.repainted`). The truth is for painting and measuring alone.
+its surface, and pictures of cameras that training did not see; beside them what the tracking itself expects of its
+errors, with its rank correlation (Spearman's) with the true ones, point by point, and how far a way back drifts.
+Patterns other than the photographs' own are painted over them (`benchmarks.repainted`). The truth is for painting and
+measuring alone.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, Int
+from scipy.stats import spearmanr
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.gaussians.binding import BoundGaussians
@@ -33,7 +36,8 @@ from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.render.avatar_view import render_view
 from avatar.training.engine.session import Session
 from avatar.training.presets import training_preset
-from avatar.training.tracking.track import TrackConfig, follow_surface
+from avatar.training.tracking.config import TrackConfig
+from avatar.training.tracking.track import follow_surface
 from benchmarks.machine import store_results
 from benchmarks.repainted import RepaintedSequence
 from pipelines.runs.artefacts import load_params_of_run
@@ -67,22 +71,26 @@ class FollowedSurface:
     """That is measured."""
     patterns: tuple[str, ...] = (PHOTOGRAPHS,)
     """On the part: "photographs", as it is, or among those of `benchmarks.repainted`."""
-    count: int | None = None
-    """Of the frames that are followed, the first ones; None: all."""
+    seconds: float | None = None
+    """Frames of the first so many are followed; None: all."""
     levels: int | None = None
     """Of the preset's sizes of images, the first ones, the coarse; None: all."""
     simulate: tuple[bool, ...] = (True, False)
     """With simulated clothes that foresee where frames begin, and without."""
+    held: tuple[float, ...] = ()
+    """Weights of what pictures do not tell where it was foreseen, in the place of the preset's; one row each."""
+    back: bool = False
+    """Go back to the first frame too and measure the drift."""
     name: str = ""
     """Of the stored file; by default that of the capture."""
 
     def run(self) -> None:
-        """Print and store all rows."""
+        """Print all rows; what is done is stored."""
         bench = Bench(self.run_folder, self.capture, self.part)
         config = training_preset(self.preset).teacher.track
         if config is None:
             raise InputError("preset", expected="one that follows the surface", received=self.preset)
-        config = replace(config, levels=config.levels[: self.levels])
+        config = replace(config, levels=config.levels[: self.levels], back=self.back)
         figures: dict[str, Any] = {
             "protocol": bench.protocol,
             "preset": self.preset,
@@ -90,19 +98,23 @@ class FollowedSurface:
             "halvings": [level.halvings for level in config.levels],
             "rows": {},
         }
-        for pattern, every, simulate in product(self.patterns, self.every, self.simulate):
-            own = replace(config, simulate=simulate)
-            row = bench.row(own, every, count=self.count, pattern=None if pattern == PHOTOGRAPHS else pattern)
+        for pattern, every, simulate, held in product(
+            self.patterns, self.every, self.simulate, self.held or (config.held,)
+        ):
+            own = replace(config, simulate=simulate, held=held)
+            row = bench.row(own, every, seconds=self.seconds, pattern=None if pattern == PHOTOGRAPHS else pattern)
             name = f"{pattern}, every {every}, {'foreseen' if simulate else 'carried on'}"
+            name += f", held {held:g}" if self.held else ""
             figures["rows"][name] = row
             print(f"{name:44s} {row}", flush=True)
-        path = store_results(f"followed_surface_{self.name or bench.capture.name}", self._command(), figures)
-        print(f"stored {path.name}")
+            store_results(f"followed_surface_{self.name or bench.capture.name}", self._command(), figures)
 
     def _command(self) -> str:
         lists = {"every": self.every, "patterns": self.patterns}
         words = [f"--{name} {' '.join(map(str, values))}" for name, values in lists.items()]
-        words += [f"--{name} {value}" for name, value in (("count", self.count), ("levels", self.levels)) if value]
+        words += [f"--{name} {value}" for name, value in (("seconds", self.seconds), ("levels", self.levels)) if value]
+        words += ["--held " + " ".join(f"{held:g}" for held in self.held)] if self.held else []
+        words += ["--back"] if self.back else []
         words += ["--simulate " + " ".join(map(str, self.simulate)), f"--preset {self.preset} --part {self.part}"]
         return " ".join(["python -m benchmarks.followed_surface --run RUN --capture DIR", *words])
 
@@ -123,14 +135,17 @@ class Bench:
         self.same = SamePoints.found(scene, self.reference, part)
 
     def row(
-        self, config: TrackConfig, every: int, *, count: int | None = None, pattern: str | None = None
+        self, config: TrackConfig, every: int, *, seconds: float | None = None, pattern: str | None = None
     ) -> dict[str, Any]:
-        """Follow every n-th training frame, of these the first `count`, and measure.
+        """Follow every n-th training frame, of these those of the first `seconds`, and measure.
 
         Args:
             pattern: among those of `benchmarks.repainted`, painted on the part; None: the photographs as they are.
         """
-        frames = self.capture.splits.train_frames[::every][:count]
+        frames = self.capture.splits.train_frames[::every]
+        if seconds is not None:
+            last = frames[0] + seconds * (self.capture.fps or 1.0)
+            frames = tuple(frame for frame in frames if frame <= last)
         capture = replace(self.capture, splits=replace(self.capture.splits, train_frames=frames))
         sequence, gaussians = AvatarSequence(capture, self.scene.template), self.gaussians
         if pattern is not None:
@@ -144,22 +159,25 @@ class Bench:
         begin = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
             track, _ = follow_surface(sequence, gaussians, config, Session(Path(folder)))
-        seconds = (time.perf_counter() - begin) / len(frames)
+        each = (time.perf_counter() - begin) / len(frames)
         return {
             **self.measured(sequence, track, gaussians),
             "frames": len(frames),
-            "seconds_a_frame": round(seconds, 2),
+            "seconds_a_frame": round(each, 2),
         }
 
     def measured(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> dict[str, Any]:
-        """Distances of the part to the truth, mm, over the frames; dB of held-out cameras."""
+        """Distances of the part to the truth, mm, over the frames, and the expected ones; dB of held-out cameras."""
         rig, apart, worst, found = sequence.rig, {}, {}, []
+        true, expected = [], []
         for frame in sequence.train_frames[1:]:
             truth = self.capture.truth_mesh(frame)
             if truth is None:
                 continue
             vertices = rig.places(sequence.motion(frame), track.displacements(frame))
             wrong = 1e3 * np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1)
+            true.append(wrong)
+            expected.append(1e3 * track.expected_error(frame).numpy()[self.same.own])
             apart[frame], worst[frame] = float(wrong.mean()), float(np.percentile(wrong, 95))
             mesh = TriangleMesh(vertices, rig.template.faces)
             found.append(surface_quality(mesh, rig.template.vertex_labels, truth, samples=SAMPLES).labels[self.part])
@@ -170,10 +188,21 @@ class Bench:
             "vertexwise_p95": round(mean(worst.values()), 1),
             "worst_frame": latest,
             "vertexwise_there": round(apart[latest], 1),
+            "expected": round(float(np.mean(expected)), 2),
+            "rank_correlation": round(float(spearmanr(np.concatenate(expected), np.concatenate(true))[0]), 2),
+            **self._drift(track, true),
             "p2s": _rounded(surface.p2s),
             "truth_to_mesh": _rounded(surface.truth_to_mesh),
             "psnr": round(self._psnr(sequence, track, gaussians), 2),
         }
+
+    def _drift(self, track: Track, true: list[np.ndarray]) -> dict[str, float]:
+        """Mean drift of a way back, mm, and its rank correlation with the points' mean error; nothing without one."""
+        if track.drift is None:
+            return {}
+        drift = 1e3 * track.cage(track.drift[:, None])[:, 0].numpy()[self.same.own]
+        correlation = float(spearmanr(drift, np.mean(true, axis=0))[0])
+        return {"drift": round(float(drift.mean()), 2), "drift_rank_correlation": round(correlation, 2)}
 
     @torch.no_grad()
     def _psnr(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> float:

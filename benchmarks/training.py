@@ -29,7 +29,8 @@ from avatar.training.student.compensate import CompensateTask
 from avatar.training.student.pretrain import PretrainFieldTask
 from avatar.training.teacher.fit_teacher import TeacherTask
 from avatar.training.teacher.pretrain import PretrainTeacherTask
-from avatar.training.tracking.track import TrackConfig, TrackTask
+from avatar.training.tracking.config import TrackConfig
+from avatar.training.tracking.track import TrackTask
 from benchmarks.machine import store_results
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.protocol import run_protocol

@@ -132,7 +132,8 @@ def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Teache
     if "track_controls" in stored.tensors:
         frames, controls = stored.track(rig.template.vertex_count)
         row = {frame: k for k, frame in enumerate(frames)}
-        teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1])))
+        told = stored.track_errors(*controls.shape[:2])
+        teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1]), **told))
     return teacher
 
 

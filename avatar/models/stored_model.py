@@ -82,6 +82,12 @@ class StoredModel:
             raise InputError("track_frames", expected="each frame once", received="one of them again")
         return frames, controls
 
+    def track_errors(self, frames: int, count: int) -> dict[str, Tensor]:
+        """Read what the track of so many frames and controls tells of its errors, as its arguments, metres."""
+        shapes = {"sigma": (frames, count), "drift": (count,)}  # older files hold neither
+        stored = {name: shape for name, shape in shapes.items() if f"track_{name}" in self.tensors}
+        return {name: self.require(f"track_{name}", shape) for name, shape in stored.items()}
+
     def poses(self, name: str) -> Tensor:
         """Read poses (T, 63) of at least one frame, radians."""
         value = self.tensors[name]

@@ -24,6 +24,8 @@ from avatar.render.mesh_maps import front_back_maps, vertex_normals
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
 
+TOLD = ("sigma", "drift")
+"""What a track may tell of its errors."""
 HALF_EXTENT = 1.0
 """Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""
 
@@ -87,10 +89,14 @@ class TeacherAvatar(nn.Module):
 
     def remember(self, track: Track) -> None:
         """Keep the surface that was followed through the training frames; it is saved with the teacher."""
-        self.track = track = replace(track, controls=track.controls.to(self.rig.device))
+        device = self.rig.device
+        told = {name: value.to(device) for name in TOLD if (value := getattr(track, name)) is not None}
+        self.track = track = replace(track, controls=track.controls.to(device), **told)
         frames = sorted(track.row, key=lambda frame: track.row[frame])
         self.register_buffer("track_frames", torch.tensor(frames, device=self.rig.device))
         self.register_buffer("track_controls", track.controls)
+        for name in TOLD:
+            self.register_buffer(f"track_{name}", told.get(name))
 
     def centre(self, motions: Iterable[Motion]) -> None:
         """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""

@@ -20,6 +20,8 @@ from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
 from smplxpp.template.template import Template
 
+HALF = 1e-2
+"""Metres of expected error at which a vertex counts half."""
 STILL = 1e-3
 """Metres: motion off the clothes much below this costs nearly nothing."""
 
@@ -53,8 +55,8 @@ class ControlCage(nn.Module):
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
 
-    def forward(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, "V 3"]:
-        """Return the displacements of the vertices, metres, from those of the control points."""
+    def forward(self, controls: Float[Tensor, "K C"]) -> Float[Tensor, "V C"]:
+        """Return the displacements of the vertices, metres, or other values, from those of the control points."""
         return self.rows(controls)
 
     def roughness(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
@@ -124,12 +126,27 @@ class Track:
     Attributes:
         row: each frame's row of the controls. cage: interpolates them.
         controls: metres, 0 in a frame whose surface the template is.
+        sigma: distance of the control points from the truth that is to be expected, metres; None: nobody knows.
+        drift: of the control points: how far from its start a way back ended, metres; None: nobody went back.
     """
 
     row: dict[int, int]
     controls: Float[Tensor, "T K 3"]
     cage: ControlCage
+    sigma: Float[Tensor, "T K"] | None = None
+    drift: Float[Tensor, " K"] | None = None
 
     def displacements(self, frame: int) -> Float[Tensor, "V 3"]:
         """Return the displacements of a frame, metres along the axes of the T-pose."""
         return self.cage(self.controls[self.row[frame]])
+
+    def expected_error(self, frame: int) -> Float[Tensor, " V"]:
+        """Return how far from the truth the vertices of a frame are to be expected, metres; 0 where nobody knows."""
+        sigma = (
+            torch.zeros_like(self.controls[0, :, :1]) if self.sigma is None else self.sigma[self.row[frame], :, None]
+        )
+        return self.cage(sigma)[:, 0]
+
+    def confidence(self, frame: int) -> Float[Tensor, " V"]:
+        """Return in (0, 1] how much a frame's vertices count in what learns from them: `1 / (1 + (e / HALF)^2)`."""
+        return 1.0 / (1.0 + (self.expected_error(frame) / HALF).square())

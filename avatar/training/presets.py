@@ -16,7 +16,7 @@ from avatar.training.reference_fit.config import PRESETS, FitConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig
-from avatar.training.tracking.track import Level, TrackConfig
+from avatar.training.tracking.config import Level, TrackConfig
 from smplxpp.core.validation import require_choice
 
 LOCAL_PARTS = 256

@@ -50,6 +50,9 @@ MIRRORED_VIEWS = Gate("", 0.65, 0.8, higher_is_better=False)
 symmetric colours, 0.66 to 1.2 of mirrored ones."""
 SILHOUETTE = Gate("IoU", 0.95, 0.8)
 """The skinned template on the masks."""
+DRIFT = Gate("mm", 15.0, 60.0, higher_is_better=False)
+"""How far from its start the surface of the clothes ends when it is followed to the last frame and back: a period of a
+pattern is some centimetres."""
 PSNR: Mapping[str, Gate] = {"novel_view": Gate("dB", 18.0, 16.0), "novel_pose": Gate("dB", 17.0, 15.0)}
 """PSNR over the person by kind of view; training views of a capture without held-out cameras count as novel views.
 

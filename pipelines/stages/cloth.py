@@ -204,15 +204,17 @@ def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment,
     """Where the followed surface has a garment's particles in the training frames; gaps between frames are NaN."""
     frames = np.arange(min(track.row), max(track.row) + 1)
     rig, poses, world = sequence.rig, [], np.full((len(frames), len(garment.particles), 3), np.nan)
+    confidence = np.ones(world.shape[:2])
     last = None
     for k, frame in enumerate(frames.tolist()):
         params = sequence.capture.params(frame)
         if frame in track.row and params is not None:
             world[k] = rig.places(sequence.motion(frame), track.displacements(frame))[garment.particles]
+            confidence[k] = track.confidence(frame).cpu().numpy()[garment.particles]
         last = params if params is not None else last
         assert last is not None  # the first frame is a training frame, which has parameters
         poses.append(last.without_shape())
-    return Followed(BodyParams.concatenate(poses), fps, world)
+    return Followed(BodyParams.concatenate(poses), fps, world, confidence)
 
 
 def clothed_sequence(trainer: Trainer, ground: str, cloth: ModelStage | None) -> AvatarSequence:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.speed import parameter_counts
@@ -17,14 +19,15 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
-from avatar.training.engine.session import PRETRAIN, TRACK, Session
+from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
 from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
 from pipelines.stages.train_names import KINDS, kind_name
 
-BEFORE = {TRACK: "track_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
+WAY_BACK = f"{TRACK}/{BACK}"
+BEFORE = {TRACK: "track_metrics.jsonl", WAY_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
 """Logs of what comes before a training, by its folder."""
 
 
@@ -101,7 +104,8 @@ def _output(
         "held_out_cameras": held_out,
         "normals": _normals(sequence, folder),
         "convention": CONVENTION,
-        "seconds_of_tracking": seconds[TRACK],
+        "seconds_of_tracking": seconds[TRACK] + seconds[WAY_BACK],
+        **_followed(model),
         "seconds_of_pretraining": seconds[PRETRAIN],
         "iterations_before": sum(lines[-1]["iteration"] for lines in before.values() if lines),
         "measured_at": end.get("iteration"),
@@ -109,6 +113,20 @@ def _output(
         **found,
     }
     return StageOutput(_checks(everything, overlap), everything)
+
+
+def _followed(model: TeacherAvatar | Student | Baseline) -> dict[str, Any]:
+    """How far off a teacher's followed clothes are expected to be, and the drift of a way back, mm."""
+    track = model.track if isinstance(model, TeacherAvatar) else None
+    if track is None or track.sigma is None:
+        return {}
+    clothes = ~track.cage.off_clothes
+    clothes = clothes if bool(clothes.any()) else torch.ones_like(clothes)
+    told = {
+        "expected_error_mm": track.sigma[:, clothes],
+        "drift_mm": None if track.drift is None else track.drift[clothes],
+    }
+    return {"followed": {name: 1e3 * float(value.mean()) for name, value in told.items() if value is not None}}
 
 
 def _normals(sequence: AvatarSequence, folder: Path) -> str:
@@ -126,6 +144,8 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
             explanation="mean over some training views; low: another pose, or other cameras",
         ),
     ]
+    if "drift_mm" in numbers.get("followed", {}):
+        checks.append(gates.DRIFT.check("clothes followed back to the first frame", numbers["followed"]["drift_mm"]))
     for kind, gate in gates.PSNR.items():
         if kind not in numbers:
             continue

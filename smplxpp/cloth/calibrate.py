@@ -80,11 +80,13 @@ class Followed:
     Attributes:
         params: T frames, evenly spaced. fps: of them.
         world: where the particles of a garment were found, metres; NaN rows are not looked at, and count for nothing.
+        confidence: from 0 to 1, how much each counts; None: all alike.
     """
 
     params: BodyParams
     fps: float
     world: Float[np.ndarray, "T n 3"]
+    confidence: Float[np.ndarray, "T n"] | None = None
 
 
 def calibrate(
@@ -122,10 +124,12 @@ def calibrate(
     if not area.sum() > 0:
         area = _particle_areas(garment)
 
+    trust = np.ones(followed.world.shape[:2]) if followed.confidence is None else followed.confidence
+
     def errors(positions: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, " L"]:
         """Of the L frames in which the surface was followed."""
         apart = np.linalg.norm((np.stack(positions) - followed.world)[followed_frames], axis=2)
-        weight = area * np.isfinite(apart)
+        weight = area * trust[followed_frames] * np.isfinite(apart)
         return (np.minimum(np.nan_to_num(apart, nan=0.0), MOST) * weight).sum(1) / np.maximum(weight.sum(1), 1e-12)
 
     def simulated(drag: float, pin: float) -> Float[np.ndarray, " L"]:

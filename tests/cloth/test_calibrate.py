@@ -57,6 +57,18 @@ def test_frames_and_particles_that_were_not_followed_are_not_looked_at():
     assert (calibration.drag, calibration.pin_depth) == (8.0, 0.1)
 
 
+def test_particles_that_were_followed_badly_count_less():
+    truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
+    lost = np.arange(truth.shape[1]) % 3 == 0
+    confidence = np.where(lost, 1e-6, 1.0) * np.ones((len(truth), 1))
+    wrong = np.where(lost[:, None], skinned(), truth)
+    blind, told = (
+        calibrate(person(), garment(), Followed(swaying(), FPS, wrong, trust), config=FEW, driver=QUICK)[1]
+        for trust in (None, confidence)
+    )
+    assert (told.drag, told.pin_depth) == (8.0, 0.1) and told.simulated < 1e-6 < blind.simulated
+
+
 def test_a_garment_is_as_far_from_skinning_as_in_the_frames_that_were_followed():
     truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
     whole, every_fourth = (

@@ -6,6 +6,7 @@ import json
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,8 +53,8 @@ def followed(displacements: np.ndarray) -> SimpleNamespace:
     )
 
 
-def write_skirted(root: Path) -> Path:
-    """Write the capture, which says how many frames a second it has."""
+def write_skirted(root: Path, **changes: Any) -> Path:
+    """Write the capture, which says how many frames a second it has; `changes` of the doll."""
     template, surfaces = person(), []
     for frame in range(FRAMES):
         joints = template.posed_body(pose(frame)).posed_from_rest[0]
@@ -74,6 +75,7 @@ def write_skirted(root: Path) -> Path:
         scanned={frame: surfaces[frame] for frame in NOVEL_POSES},
         novel_frames=NOVEL_POSES,
         supersampling=1,
+        **changes,
     )
     doll.write_capture(root)
     about = json.loads((root / "capture.json").read_text())

@@ -14,7 +14,7 @@ from avatar.training.reference_fit.config import FitConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig
-from avatar.training.tracking.track import Level, TrackConfig
+from avatar.training.tracking.config import Level, TrackConfig
 
 TINY_TEACHER = TeacherConfig(
     in_size=16,

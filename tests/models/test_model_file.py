@@ -36,8 +36,10 @@ def rig() -> Rig:
 
 def followed(rig: Rig) -> Track:
     """A surface in frames that do not follow each other."""
-    controls = 0.05 * torch.randn(3, 24, 3, generator=torch.Generator().manual_seed(4))
-    return Track({1: 0, 4: 1, 7: 2}, controls, ControlCage(rig, 24))
+    random = torch.Generator().manual_seed(4)
+    controls = 0.05 * torch.randn(3, 24, 3, generator=random)
+    sigma, drift = 0.01 * torch.rand(3, 24, generator=random), 0.02 * torch.rand(24, generator=random)
+    return Track({1: 0, 4: 1, 7: 2}, controls, ControlCage(rig, 24), sigma, drift)
 
 
 def make(kind: str, rig: Rig):
@@ -132,6 +134,8 @@ def test_a_teacher_comes_back_with_the_surface_that_it_remembers(rig, tmp_path):
         assert own.displacements(frame).abs().max() > 0.01
         assert torch.equal(whole.displacements(frame), own.displacements(frame))
         torch.testing.assert_close(compact.displacements(frame), own.displacements(frame), rtol=0, atol=0.05 * 2.0**-8)
+        assert torch.equal(whole.confidence(frame), own.confidence(frame)) and own.confidence(frame).max() < 1.0
+    assert torch.equal(whole.drift, own.drift)
 
 
 def test_a_teacher_that_followed_no_surface_comes_back_without(rig, tmp_path):
@@ -146,6 +150,7 @@ def test_what_is_remembered_last_is_saved(rig, tmp_path):
     save_avatar(tmp_path / "a", teacher)
     track = load_avatar(tmp_path / "a", rig).track
     assert track.row == {5: 0} and torch.equal(track.displacements(5), own.displacements(4))
+    assert track.sigma is None and track.drift is None and (track.confidence(5) == 1.0).all()
 
 
 def changed(path, *, about=None, tensors=None, header=HEADER) -> None:

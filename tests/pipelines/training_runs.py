@@ -9,7 +9,7 @@ from unittest import mock
 
 from avatar.models.networks.presets import NetworkPreset
 from avatar.training.presets import TRAINING_PRESETS
-from avatar.training.tracking.track import Level, TrackConfig
+from avatar.training.tracking.config import Level, TrackConfig
 from pipelines.cli import main
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 

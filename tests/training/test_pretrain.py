@@ -22,7 +22,7 @@ from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
 from avatar.training.teacher.pretrain import PretrainTeacherTask
-from avatar.training.tracking.track import Level
+from avatar.training.tracking.config import Level
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import dance, gaussians, sequence, template, write_dance
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
@@ -286,3 +286,21 @@ def test_a_share_of_the_steps():
 def test_senseless_choices_are_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):
         replace(CONFIG, **change)
+
+
+def test_points_that_were_followed_badly_do_not_tell(frames, track):
+    """Networks and field hear nothing of points that are expected to be wrong by a metre."""
+    lost = torch.arange(24) % 2 == 0
+    wrong = torch.where(lost[:, None], track.controls + 0.2, track.controls)
+    sigma = torch.where(lost, 1.0, 0.0).expand(len(wrong), -1)
+    for kind in ("displacements", "field"):
+        losses = {}
+        for told in (None, sigma):
+            teachers = []
+            for controls in (track.controls, wrong):
+                own = replace(track, controls=controls, sigma=told)
+                task = make(kind, frames, own)
+                task.teacher.remember(own)
+                teachers.append(float(task.loss(task.micro_batches(0)[0])[0].detach()))
+            losses[told is None] = abs(teachers[0] - teachers[1])
+        assert losses[False] < 0.5 * losses[True]

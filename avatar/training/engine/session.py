@@ -16,6 +16,8 @@ from avatar.training.engine.processes import Distributed
 
 TRACK, PRETRAIN = "track", "pretrain"
 """Folders of what comes before a training."""
+BACK = "back"
+"""Folder, in that of the tracking, of the way back."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,19 +89,21 @@ class PretrainFieldTask(PretrainTask):
             frames[k] if k < len(frames) and draw >= self.null_share else None
             for k, draw in zip(item, draws, strict=True)
         ]
-        pose, known = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
-        found = self.field.at_points(pose, self.codes(shown))
-        loss = (found - known).abs().sum(-1).mean() / self.teacher.config.position_scale
+        pose, known, weight = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
+        apart = (self.field.at_points(pose, self.codes(shown)) - known).abs().sum(-1)
+        loss = (weight * apart).sum() / weight.sum() / self.teacher.config.position_scale
         return loss, {"loss": float(loss.detach())}
 
     def _of(self, number: int) -> tuple[Tensor, ...]:
-        """Return theta (63,) and the teacher's displacements (K, 3) metres at the field's points."""
+        """Return theta (63,), displacements (K, 3) metres at the field's points, and how much each counts (K,)."""
 
         def make() -> tuple[Tensor, ...]:
             motion, track = self._motion(number), self.teacher.track
             if motion.frame is not None and track is not None:
-                return motion.pose, track.displacements(motion.frame)[self.field.points]
-            return motion.pose, self._lookup(self.teacher.displacement_maps([motion]))[0]
+                found, counts = track.displacements(motion.frame), track.confidence(motion.frame)
+                return motion.pose, found[self.field.points], counts[self.field.points]
+            imagined = self._lookup(self.teacher.displacement_maps([motion]))[0]
+            return motion.pose, imagined, imagined.new_ones(len(imagined))
 
         return self._known.get(number, make)
 

@@ -20,8 +20,9 @@ from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, Ph
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.surface_normals import with_surface_normals
-from avatar.training.tracking.track import TrackConfig, follow_surface
+from avatar.training.tracking.track import follow_surface
 from smplxpp.core.spread import spread_inside
 
 

@@ -21,6 +21,8 @@ from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, Pret
 class PretrainTeacherTask(PretrainTask):
     """Displacements that are known, `mean |dU - known|` where the Gaussians look the maps up; or all residuals zero.
 
+    The mean is weighted by the track's confidence.
+
     Args:
         teacher: whose networks learn.
         track: the displacements that are known, of a teacher whose other residuals start at zero; None: every residual
@@ -49,20 +51,25 @@ class PretrainTeacherTask(PretrainTask):
             sizes = [m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps]
             loss = sum(sizes[1:], sizes[0]) / len(maps)
             return loss, {"loss": float(loss.detach())}
-        inputs, known = zip(*(self._of(frame, self.track) for frame in frames), strict=True)
+        inputs, known, weights = zip(*(self._of(frame, self.track) for frame in frames), strict=True)
         with self.autocast():
             found = self.teacher.networks.positions(torch.cat(inputs), self.teacher.semantics)
         units = torch.stack(known) / self.teacher.config.position_scale
-        loss = (self.teacher.sampler(found.float()) - units).abs().sum(-1).mean()
+        apart, weight = (self.teacher.sampler(found.float()) - units).abs().sum(-1), torch.stack(weights)
+        loss = (weight * apart).sum() / weight.sum()
         return loss, {"loss": float(loss.detach())}
 
     def _of(self, frame: int, track: Track) -> tuple[Tensor, ...]:
-        """Return the input map and the Gaussians' known displacements, (N, 3) metres along the axes of the T-pose."""
+        """Return the input map, the Gaussians' known displacements, (N, 3) metres along the axes of the T-pose, and how
+        much each counts (N,).
+        """
 
         def make() -> tuple[Tensor, ...]:
-            corners = track.displacements(frame)[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
+            known = torch.cat([track.displacements(frame), track.confidence(frame)[:, None]], dim=1)
+            corners = known[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
+            at_gaussians = on_triangles(corners, self.teacher.gaussians.barycentric)
             inputs = self.teacher.position_input(self.sequence.motion(frame))
-            return inputs, on_triangles(corners, self.teacher.gaussians.barycentric)
+            return inputs, at_gaussians[:, :3].contiguous(), at_gaussians[:, 3].contiguous()
 
         return self._known.get(frame, make)
 

@@ -28,6 +28,10 @@ DOUBT = 1e-3
 """Metres that every forecast may be wrong by: two that are better are alike."""
 
 
+Solved = Mapping[int, tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"] | None]]
+"""Displacements of frames, metres, and the share of every direction that pictures told of them; None: all."""
+
+
 @dataclass(frozen=True, eq=False)
 class SimulatedControls:
     """Simulated clothes of frames at the control points of a cage.
@@ -105,37 +109,63 @@ class Foresight:
         extrapolation: share of the motion between the two frames before that is carried on.
         simulated: clothes; None: nothing is simulated.
         reference: frame in which the template is the surface: what was found there is an error of the Gaussians.
+        error: that error where it is known before; None: from the frames that are done.
     """
 
     extrapolation: float
     simulated: SimulatedControls | None = None
     reference: int | None = None
+    error: Float[Tensor, "K 3"] | None = None
 
-    def start(self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]) -> Float[Tensor, "K 3"]:
+    @property
+    def share(self) -> Float[Tensor, "*K 1 1"]:
+        """How much of the displacements is simulated; 0 where nothing is."""
+        return torch.zeros(1, 1) if self.simulated is None else self.simulated.share[:, None, None]
+
+    def start(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return what a frame begins with.
 
-        Either forecast counts by the inverse square of how far it was from what was found in the last frames.
+        Either forecast counts by the inverse square of how far it was from what was found in the last frames, in the
+        directions in which pictures told.
 
         Args:
-            solved: displacements of the frames that are done, at least one, in the order in which they were found.
+            solved: the frames that are done, at least one, in the order in which they were found.
         """
-        carried, foreseen = self._forecasts(frame, solved)
+        return self._blended(frame, solved, self.extrapolation)
+
+    def anchor(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
+        """Return where a frame's displacements are held as far as pictures do not tell.
+
+        No motion is carried on: what nothing checks would go on for ever. Simulated clothes are believed wholly as long
+        as they were no worse than those of the frame before: cloth that stays behind would be taken for truth.
+        """
+        return self._blended(frame, solved, 0.0, favour=2.0)
+
+    def _blended(self, frame: int, solved: Solved, extrapolation: float, favour: float = 1.0) -> Tensor:
+        carried, foreseen = self._forecasts(frame, solved, extrapolation)
         if self.simulated is None:
             return carried
-        before = [(self._forecasts(one, dict(_until(one, solved))), solved[one]) for one in self._judged(frame, solved)]
-        trust = self.simulated.share * self._trust([(a - true, b - true) for (a, b), true in before])
+        wrong = []
+        for one in self._judged(frame, solved):
+            a, b = self._forecasts(one, _until(one, solved), extrapolation)
+            found, told = solved[one]
+            wrong.append((_seen(a - found, told), _seen(b - found, told)))
+        trust = self.simulated.share * (favour * self._trust(wrong)).clamp(max=1.0)
         return carried + trust[:, None] * (foreseen - carried)
 
-    def shape(self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]) -> Float[Tensor, "K 3"]:
+    def shape(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return the shape about which a frame's displacements are smooth: between skinning's, 0, and the simulated.
 
         Either counts by the inverse square of how far it was from what was found in the last frames.
         """
         if self.simulated is None:
-            return torch.zeros_like(next(iter(solved.values())))
-        own = self.simulated.displacements
-        found = {one: solved[one] - self._error(solved) for one in self._judged(frame, solved)}
-        trust = self._trust([(true, own[one] - true) for one, true in found.items()])
+            return torch.zeros_like(next(iter(solved.values()))[0])
+        own, wrong = self.simulated.displacements, []
+        for one in self._judged(frame, solved):
+            found, told = solved[one]
+            true = found - self._error(solved)
+            wrong.append((_seen(true, told), _seen(own[one] - true, told)))
+        trust = self._trust(wrong)
         return trust[:, None] * own[frame]
 
     def _trust(self, wrong: Sequence[tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]]) -> Float[Tensor, " K"]:
@@ -155,7 +185,7 @@ class Foresight:
             good.append(1.0 / (mean + DOUBT**2))
         return (good[1] / (good[0] + good[1]))[part]
 
-    def _judged(self, frame: int, solved: Mapping[int, Tensor]) -> list[int]:
+    def _judged(self, frame: int, solved: Solved) -> list[int]:
         """The nearest done frames on the same side of the first one, those that had frames before them."""
         done = list(solved)
         first = done[0]
@@ -163,31 +193,37 @@ class Foresight:
         return sorted(side, key=lambda other: abs(other - frame))[:JUDGED]
 
     def _forecasts(
-        self, frame: int, solved: Mapping[int, Float[Tensor, "K 3"]]
+        self, frame: int, solved: Solved, extrapolation: float
     ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]:
-        """The motion before carried on, and the simulated one."""
+        """A share of the motion before carried on, and the simulated one."""
         near = min(solved, key=lambda other: abs(other - frame))
-        carried = solved[near]
+        last = carried = solved[near][0]
         behind = [other for other in solved if (other - near) * (near - frame) > 0]
         if behind:
             far = min(behind, key=lambda other: abs(other - near))
-            share = self.extrapolation * (frame - near) / (near - far)
-            carried = carried + share * (carried - solved[far])
+            share = extrapolation * (frame - near) / (near - far)
+            carried = carried + share * (carried - solved[far][0])
         if self.simulated is None:
             return carried, carried
         own = self.simulated.displacements
         kept = exp(-abs(frame - near) / self.simulated.fps / FADING)
         error = self._error(solved)
-        return carried, error + own[frame] + kept * (solved[near] - error - own[near])
+        return carried, error + own[frame] + kept * (last - error - own[near])
 
-    def _error(self, solved: Mapping[int, Tensor]) -> Tensor:
+    def _error(self, solved: Solved) -> Tensor:
         """What was found where the template is the surface."""
+        if self.error is not None:
+            return self.error
         if self.reference is None or self.reference not in solved:
-            return torch.zeros_like(next(iter(solved.values())))
-        return solved[self.reference]
+            return torch.zeros_like(next(iter(solved.values()))[0])
+        return solved[self.reference][0]
 
 
-def _until(frame: int, solved: Mapping[int, Tensor]) -> list[tuple[int, Tensor]]:
+def _until(frame: int, solved: Solved) -> Solved:
     """What had been found before a frame was."""
-    items = list(solved.items())
-    return items[: list(solved).index(frame)]
+    return dict(list(solved.items())[: list(solved).index(frame)])
+
+
+def _seen(error: Float[Tensor, "K 3"], told: Float[Tensor, "K 3 3"] | None) -> Float[Tensor, "K 3"]:
+    """The part of an error that pictures could tell."""
+    return error if told is None else torch.einsum("kij,kj->ki", told, error)

@@ -7,115 +7,68 @@ all frames at once into the wrong stripe. From one frame to the next the way is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import require_finite, require_like
-from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.session import Session
+from avatar.training.engine.session import BACK, Session
+from avatar.training.tracking.certainty import expected_distances, held_directions
+from avatar.training.tracking.config import LEVEL_END, Level, TrackConfig
 from avatar.training.tracking.foresight import Foresight, simulate_controls
+from avatar.training.tracking.structure import picture_structure
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+
+USUAL_FPS = 20.0
+"""Frames a second of captures that do not say."""
+SEEN = 1
+"""Halvings of the photographs, about, that say how much can be told."""
 
 
-@dataclass(frozen=True)
-class Level:
-    """A part of the steps of a frame.
-
-    Attributes:
-        halvings: of the images. steps: of Adam. lr: metres, at its first step; it falls to `LEVEL_END` of that.
-    """
-
-    halvings: int
-    steps: int
-    lr: float
-
-
-LEVEL_END = 0.1
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackConfig:
-    """Choices of the tracking.
+@dataclass(frozen=True, eq=False)
+class Begin:
+    """What a frame begins with, metres along the axes of the T-pose.
 
     Attributes:
-        levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
-        control_points: on the template. views: cameras a step.
-        smoothness: weight of the mean squared difference of neighbouring control points' displacements from the shape
-            that is foreseen, a square metre.
-        body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
-            parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
-            clothes.
-        still_body: the body's own surface follows its joints alone: poses say better where it is than photographs of a
-            few hundred pixels do. Not applied to a template that is a body alone.
-        tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
-            what lies on the body goes where the body goes. 0: no clothes do.
-        extrapolation: share of the motion between the two frames before that a frame starts with.
-        simulate: let simulated clothes say where frames start and what shape they are smooth about, the more the better
-            they told the frames before; where `reference` and the capture's frames a second are known.
-        weights: of the losses.
-        reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
-            comes first.
-        seed: of the order of views.
+        start: displacements. shape: those about which the frame's are smooth.
+        anchor: those that the frame's are held to. held: how much of that stands, see `held_directions`.
     """
 
-    levels: tuple[Level, ...] = (Level(2, 20, 5e-3), Level(1, 16, 4e-3), Level(0, 20, 2e-3))
-    control_points: int = 2400
-    views: int = 4
-    smoothness: float = 80.0
-    body_motion_weight: float = 0.0
-    tight_reach: float = 0.0
-    still_body: bool = False
-    extrapolation: float = 1.0
-    simulate: bool = True
-    weights: ReconstructionWeights = field(
-        default_factory=lambda: ReconstructionWeights(perceptual=0.0, normal=0.0, alpha=0.5)
-    )
-    reference: int | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.levels or any(level.steps < 1 or level.halvings < 0 or level.lr <= 0 for level in self.levels):
-            raise InputError("tracking: levels", expected="one or more, each with steps", received=str(self.levels))
-        for name, least in (
-            ("control_points", 1),
-            ("views", 1),
-            ("smoothness", 0),
-            ("body_motion_weight", 0),
-            ("tight_reach", 0),
-            ("extrapolation", 0),
-        ):
-            require_at_least(f"tracking: {name}", getattr(self, name), least)
-
-    @property
-    def steps(self) -> int:
-        """Steps of one frame."""
-        return sum(level.steps for level in self.levels)
-
-    def shortened(self, share: float) -> TrackConfig:
-        """Return the same with `share` of the steps of every level."""
-        levels = tuple(replace(level, steps=max(1, round(share * level.steps))) for level in self.levels)
-        return replace(self, levels=levels)
+    start: Float[Tensor, "K 3"]
+    shape: Float[Tensor, "K 3"]
+    anchor: Float[Tensor, "K 3"]
+    held: Float[Tensor, "K 3 3"]
 
 
 class TrackTask(PhotometricTask):
-    """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels."""
+    """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels.
+
+    Args:
+        ahead: one that is done; the way back begins with what it found in the frames farthest from the first, and ends
+            there.
+    """
 
     sequence: AvatarSequence
 
     def __init__(
-        self, sequence: AvatarSequence, avatar: TrackedAvatar, config: TrackConfig, context: TaskContext = ALONE
+        self,
+        sequence: AvatarSequence,
+        avatar: TrackedAvatar,
+        config: TrackConfig,
+        context: TaskContext = ALONE,
+        *,
+        ahead: TrackTask | None = None,
     ) -> None:
         frames = sequence.train_frames
         if config.reference is not None and config.reference not in frames:
@@ -124,9 +77,13 @@ class TrackTask(PhotometricTask):
             )
         first = frames[0] if config.reference is None else config.reference
         self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
+        self.ends: tuple[int, ...] = ()
+        if ahead is not None:
+            self.ends = tuple(sorted({frames[0], frames[-1]} - {first}))
+            self.order = [frame for frame in reversed(self.order) if frame not in self.ends]
         self.row = {frame: row for row, frame in enumerate(frames)}
         shared = PhotometricConfig(
-            iterations=len(frames) * config.steps,
+            iterations=len(self.order) * config.steps,
             views=config.views,
             weights=config.weights,
             seed=config.seed,
@@ -137,10 +94,15 @@ class TrackTask(PhotometricTask):
             sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], context
         )
         self.avatar, self.track_config = avatar, config
-        self.foresight = _foresight(sequence, avatar.cage, config)
-        self._shapes: dict[int, Tensor] = {}
+        self.foresight = _foresight(sequence, avatar.cage, config) if ahead is None else ahead.foresight_known()
+        self._begun: tuple[int, Begin] | None = None
         self._small: tuple[int, dict[tuple[str, int], View]] = (-1, {})
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
+        self.structure = torch.zeros(len(frames), avatar.cage.count, 3, 3, device=sequence.device)
+        self._unit = torch.eye(3, device=sequence.device)
+        for row in (self.row[frame] for frame in self.ends):
+            assert ahead is not None
+            self.solved[row], self.structure[row] = ahead.solved[row], ahead.structure[row]
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
         """Return one frame, until its steps are done."""
@@ -171,17 +133,17 @@ class TrackTask(PhotometricTask):
 
     def views(self, item: Item) -> list[View]:
         """Return the photographs at the level's size; halved ones are kept while the frame is followed."""
-        if self._small[0] != item.frame:
-            self._small = (item.frame, {})
         halvings = self._level(self.iteration)[0].halvings
-        return [self._halved(view, halvings) for view in super().views(item)]
+        return [self._halved(view, item.frame, halvings) for view in super().views(item)]
 
-    def _halved(self, view: View, times: int) -> View:
+    def _halved(self, view: View, frame: int, times: int) -> View:
+        if self._small[0] != frame:
+            self._small = (frame, {})
         kept = self._small[1]
         if not times:
             return view
         if (view.name, times) not in kept:
-            kept[view.name, times] = self._halved(view, times - 1).halved()
+            kept[view.name, times] = self._halved(view, frame, times - 1).halved()
         return kept[view.name, times]
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
@@ -190,7 +152,11 @@ class TrackTask(PhotometricTask):
         posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         cage, controls = self.avatar.cage, self.avatar.controls
-        total = total + self.track_config.smoothness * cage.roughness(controls - self._shape(item.frame))
+        begin = self.begin(item.frame)
+        total = total + self.track_config.smoothness * cage.roughness(controls - begin.shape)
+        if self.track_config.held:
+            off = controls - begin.anchor
+            total = total + self.track_config.held * torch.einsum("ki,kij,kj->k", off, begin.held, off).mean()
         if self.track_config.body_motion_weight and not cage.off_clothes.all():
             left = cage.motion_off_clothes(controls, reach=self.track_config.tight_reach)
             total = total + self.track_config.body_motion_weight * left
@@ -201,30 +167,41 @@ class TrackTask(PhotometricTask):
         place, step = divmod(iteration, self.track_config.steps)
         if step == 0:
             with torch.no_grad():
-                self.avatar.controls.copy_(self._start(place))
+                self.avatar.controls.copy_(self.begin(self.order[place]).start)
             self.optimiser.state.clear()
         metrics = super().step(iteration)
         with torch.no_grad():
             self.solved[self.row[self.order[place]]] = self.avatar.controls
         return metrics
 
-    def _start(self, place: int) -> Tensor:
-        """Displacements that a frame begins with: 0 in the first, what is foreseen in the others."""
-        if place == 0:
-            return torch.zeros_like(self.avatar.controls)
-        return self.foresight.start(self.order[place], self._done(place))
+    def begin(self, frame: int) -> Begin:
+        """Return what a frame begins with; it is kept while the frame is followed, what pictures tell for good."""
+        if self._begun is None or self._begun[0] != frame:
+            self._begun = (frame, self._begin(frame))
+        return self._begun[1]
 
-    def _shape(self, frame: int) -> Tensor:
-        """The shape that a frame's displacements are smooth about, kept while the frame is followed."""
-        if frame not in self._shapes:
-            place = self.order.index(frame)
-            nothing = torch.zeros_like(self.avatar.controls)
-            self._shapes = {frame: self.foresight.shape(frame, self._done(place)) if place else nothing}
-        return self._shapes[frame]
+    def _begin(self, frame: int) -> Begin:
+        done = {}
+        for other in (*self.ends, *self.order[: self.order.index(frame)]):
+            row = self.row[other]
+            done[other] = (self.solved[row], self._unit - held_directions(self.structure[row]))
+        start = self.foresight.start(frame, done) if done else torch.zeros_like(self.avatar.controls)
+        own = self.structure[self.row[frame]]
+        own.copy_(self._structure(frame, start))
+        if not done:
+            return Begin(start, start, start, torch.zeros_like(own))
+        # What is not simulated has nothing to be held to: plain cloth would stay where it was.
+        held, anchor = self.foresight.share * held_directions(own), self.foresight.anchor(frame, done)
+        start = start + torch.einsum("kij,kj->ki", held, anchor - start)
+        return Begin(start, self.foresight.shape(frame, done), anchor, held)
 
-    def _done(self, place: int) -> dict[int, Tensor]:
-        """Displacements of the frames before a place in the order."""
-        return {frame: self.solved[self.row[frame]] for frame in self.order[:place]}
+    def _structure(self, frame: int, controls: Tensor) -> Tensor:
+        """What photographs of a frame can tell of displacements about these."""
+        halvings = min((level.halvings for level in self.track_config.levels), key=lambda size: abs(size - SEEN))
+        names = self.sequence.cameras(frame, 0, len(self.sequence.train_cameras), self.track_config.seed)
+        views = [self._halved(self.sequence.view(name, frame), frame, halvings) for name in names]
+        motion, background = self.sequence.motion(frame), self.sequence.background
+        return picture_structure(self.avatar, controls, motion, views, background, halvings=halvings)
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         """Return nothing: the control points are those of one frame."""
@@ -232,14 +209,25 @@ class TrackTask(PhotometricTask):
 
     def state(self) -> Mapping[str, Tensor]:
         """Return the frames that are done too."""
-        return {**super().state(), "solved": self.solved}
+        return {**super().state(), **self.found()}
+
+    def found(self) -> dict[str, Tensor]:
+        """Return displacements of the frames that are done and what pictures told; rows in the frames' order."""
+        return {"solved": self.solved, "structure": self.structure}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take what `state` gave."""
-        require_like(tensors, {"solved": self.solved}, subject="checkpoint")
-        require_finite({"solved": tensors["solved"]}, subject="checkpoint")
+        require_like(tensors, self.found(), subject="checkpoint")
+        require_finite({name: tensors[name] for name in self.found()}, subject="checkpoint")
         super().restore(tensors)
-        self.solved.copy_(tensors["solved"])
+        for name, own in self.found().items():
+            own.copy_(tensors[name])
+        self._begun = None
+
+    def foresight_known(self) -> Foresight:
+        """Return the foresight with what was found in the reference frame, where a way back has yet to come."""
+        reference = self.track_config.reference
+        return self.foresight if reference is None else replace(self.foresight, error=self.solved[self.row[reference]])
 
     def track(self) -> Track:
         """Return what was found, less what was found in the reference frame.
@@ -249,7 +237,21 @@ class TrackTask(PhotometricTask):
         solved = self.solved.clone()
         if self.track_config.reference is not None:
             solved -= self.solved[self.row[self.track_config.reference]]
-        return Track(self.row, solved, self.avatar.cage)
+        return Track(self.row, solved, self.avatar.cage, self._sigma(solved))
+
+    def _sigma(self, solved: Tensor) -> Tensor:
+        """Distances (T, K) from the truth that are to be expected of displacements."""
+        structure = {frame: self.structure[self.row[frame]] for frame in self.order}
+        seconds, known = 1.0 / (self.sequence.capture.fps or USUAL_FPS), self.track_config.reference is not None
+        moved = solved.square().sum(-1).mean(0).sqrt()
+        found = expected_distances(self.order, seconds, structure, moved, known=known)
+        return torch.stack([found[frame] for frame in self.row])
+
+    def apart_at_first(self, back: TrackTask) -> Tensor:
+        """Return how far (K,), metres, a way back ends from where this one began."""
+        frames = self.sequence.train_frames
+        row = self.row[frames[0] if self.track_config.reference is None else self.track_config.reference]
+        return (back.solved[row] - self.solved[row]).norm(dim=-1)
 
 
 def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> Foresight:
@@ -264,14 +266,27 @@ def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig)
 def follow_surface(
     sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
 ) -> tuple[Track, Progress]:
-    """Find the displacements of every training frame, one frame after the other.
+    """Find the displacements of every training frame, one frame after the other; go back, where that is asked for.
 
     Steps have one frame each: of several processes the first follows it, and the others hear what it found.
     """
     count = min(config.control_points, len(sequence.rig.vertices))
     avatar = TrackedAvatar(sequence.rig, gaussians, count, still_body=config.still_body)
-    task = TrackTask(sequence, avatar, config, replace(session.context, distributed=None))
+    context = replace(session.context, distributed=None)
+    task = TrackTask(sequence, avatar, config, context)
     progress = session.run_alone(lambda: task, task.config)
+    _share(task, session)
+    if not (config.back and progress.finished and len(sequence.train_frames) > 1):
+        return task.track(), progress
+    way_back = TrackTask(sequence, avatar, config.coarse(), context, ahead=task)
+    after = session.after(progress).within(BACK).run_alone(lambda: way_back, way_back.config)
+    _share(way_back, session)
+    found = replace(task.track(), drift=task.apart_at_first(way_back)) if after.finished else task.track()
+    return found, replace(after, session_seconds=progress.session_seconds + after.session_seconds)
+
+
+def _share(task: TrackTask, session: Session) -> None:
+    """Tell all processes what the first one found."""
     processes = session.distributed or Distributed()
-    task.solved.copy_(processes.run_on_rank0(lambda: task.solved.cpu()))
-    return task.track(), progress
+    for own in task.found().values():
+        own.copy_(processes.run_on_rank0(own.cpu))

@@ -12,8 +12,9 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import TrackedAvatar
-from avatar.training.tracking.foresight import Foresight, SimulatedControls, simulate_controls
-from avatar.training.tracking.track import Level, TrackConfig, TrackTask
+from avatar.training.tracking.config import Level, TrackConfig
+from avatar.training.tracking.foresight import Foresight, SimulatedControls, Solved, simulate_controls
+from avatar.training.tracking.track import TrackTask
 from smplxpp.capture import open_capture
 from smplxpp.core.labels import LOWER
 from tests.cloth.persons import person, standing
@@ -37,8 +38,8 @@ def simulated(late: float = 0.0, *, scale: float = 1.0) -> SimulatedControls:
     return SimulatedControls({f: scale * share[:, None] * swung(f, late) for f in range(12)}, share, part, FPS)
 
 
-def solved(count: int) -> dict[int, torch.Tensor]:
-    return {frame: swung(frame) for frame in range(count)}
+def solved(count: int) -> Solved:
+    return {frame: (swung(frame), None) for frame in range(count)}
 
 
 def wrong(foresight: Foresight, frame: int = 8) -> float:
@@ -69,14 +70,14 @@ def test_what_is_not_simulated_is_carried_on():
 
 def test_the_error_of_the_reference_stays_in_all_frames():
     error = torch.tensor([0.0, 0.01, 0.0])
-    found = {frame: one + error for frame, one in solved(8).items()}
+    found = {frame: (one + error, None) for frame, (one, _) in solved(8).items()}
     moved = Foresight(1.0, simulated(), 0).start(8, found)
     torch.testing.assert_close(moved, Foresight(1.0, simulated(), 0).start(8, solved(8)) + error)
 
 
 def test_both_directions_from_the_reference_are_judged_apart():
     foresight = Foresight(1.0, simulated(), 5)
-    found = {frame: swung(frame) for frame in (5, 4, 6, 3, 7)}
+    found = {frame: (swung(frame), None) for frame in (5, 4, 6, 3, 7)}
     assert foresight._judged(8, found) == [7, 6] and foresight._judged(2, found) == [3, 4]
     forth = foresight.start(8, found)
     assert float((forth - swung(8))[:3].norm(dim=-1).mean()) < 0.01
@@ -146,9 +147,9 @@ def test_frames_of_a_capture_start_nearer_to_a_skirt_that_swings(skirted):
         true = torch.tensor(moved()[:, rows], dtype=torch.float32)
         for frame in skirted.train_frames:
             made.solved[made.row[frame]] = true[frame]
-        starts = {place: made._start(place) - true[made.order[place]] for place in range(3, len(made.order))}
-        wrong[simulate] = sum(float(apart.norm(dim=-1).mean()) for apart in starts.values())
-        assert (made._shape(5).abs().max() > 1e-3) == simulate
+        begins = {frame: made.begin(frame) for frame in made.order[3:]}
+        wrong[simulate] = sum(float((one.start - true[frame]).norm(dim=-1).mean()) for frame, one in begins.items())
+        assert (begins[5].shape.abs().max() > 1e-3) == simulate
     assert wrong[True] < 0.7 * wrong[False]
 
 

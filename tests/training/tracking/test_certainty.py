@@ -1,0 +1,167 @@
+"""What pictures tell of a followed surface: along stripes and on plain cloth little, and it says so; the way back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, sqrt
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+from avatar.data.sequence import AvatarSequence
+from avatar.gaussians.binding import world_from_local
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.training.engine.session import Session
+from avatar.training.tracking.certainty import ASTRAY, CONTRAST, KNOWN, LIT, expected_distances, held_directions
+from avatar.training.tracking.config import Level
+from avatar.training.tracking.foresight import FADING
+from avatar.training.tracking.structure import picture_structure
+from avatar.training.tracking.track import TrackTask, follow_surface
+from smplxpp.capture import open_capture
+from tests.cloth.persons import person
+from tests.dolls.dancing import doll, gaussians, sequence, template
+from tests.dolls.doll import paint
+from tests.dolls.skirted import moved, write_skirted
+from tests.training.tracking.test_track import CONFIG
+
+STRIPED, PLAIN = 40.0, 0.0
+HELD = replace(CONFIG, levels=(Level(0, 12, 8e-3),), reference=0)
+
+
+def painted(stripes: float):
+    """Gaussians in the colours of the photographs."""
+    bound, it = gaussians(1200), template()
+    where = world_from_local(bound, torch.tensor(it.vertices, dtype=torch.float32), torch.tensor(it.faces)).means
+    return replace(bound, dc=torch.tensor(paint(where.numpy(), stripes), dtype=torch.float32))
+
+
+@pytest.fixture(scope="module")
+def dances(tmp_path_factory) -> dict[float, AvatarSequence]:
+    """The doll in stripes, hoops around it, and in plain colours."""
+    root = tmp_path_factory.mktemp("captures")
+    return {
+        stripes: sequence(replace(doll(), stripes=stripes).write_capture(root / f"{stripes:g}"))
+        for stripes in (STRIPED, PLAIN)
+    }
+
+
+@pytest.fixture(scope="module")
+def tracks(dances, tmp_path_factory) -> dict[float, Track]:
+    found = {}
+    for stripes, frames in dances.items():
+        config = replace(HELD, back=stripes == STRIPED)
+        found[stripes], progress = follow_surface(
+            frames, painted(stripes), config, Session(tmp_path_factory.mktemp("track"))
+        )
+        assert progress.finished
+    return found
+
+
+def structure(frames: AvatarSequence, stripes: float, cameras: tuple[str, ...]) -> tuple[torch.Tensor, TrackedAvatar]:
+    avatar = TrackedAvatar(frames.rig, painted(stripes), 48)
+    views = [frames.view(camera, 0) for camera in cameras]
+    still = torch.zeros_like(avatar.controls)
+    return picture_structure(avatar, still, frames.motion(0), views, frames.background, halvings=0), avatar
+
+
+def test_what_has_contrast_is_let_go_and_what_has_none_is_held():
+    told = torch.diag(torch.tensor([0.0, CONTRAST**2, 100.0 * CONTRAST**2]))[None]
+    held = torch.linalg.eigvalsh(held_directions(told))[0].flip(0)
+    torch.testing.assert_close(held, torch.tensor([1.0, 0.25, 1e-8]), rtol=1e-3, atol=1e-8)
+
+
+def test_what_is_expected_of_points_that_nothing_tells_of_and_of_others():
+    blind, seen = torch.zeros(1, 3, 3), 4.0 * LIT**2 / KNOWN**2 * torch.eye(3)[None]
+    order, step, swing = [0, 1, 2, 60], 0.1, torch.tensor([0.03])
+    unseen = expected_distances(order, step, {frame: blind for frame in order}, swing, known=True)
+    kept, astray = exp(-2.0 * step / FADING), ASTRAY * 0.03 + KNOWN
+    once = sqrt(3.0 * (kept * KNOWN**2 + (1.0 - kept) * astray**2))
+    assert float(unseen[0]) == pytest.approx(sqrt(3.0) * KNOWN) and float(unseen[1]) == pytest.approx(once)
+    assert unseen[1] < unseen[2] < unseen[60] and float(unseen[60]) == pytest.approx(sqrt(3.0) * astray)
+    told = expected_distances(order, step, {frame: seen for frame in order}, swing, known=True)
+    assert max(map(float, told.values())) < 0.5 * sqrt(3.0) * KNOWN
+    lost = expected_distances(order, step, {frame: blind for frame in order}, swing, known=False)
+    assert float(lost[0]) == pytest.approx(sqrt(3.0) * astray)
+
+
+def test_stripes_tell_across_them_and_plain_cloth_tells_of_nothing(dances):
+    cameras = tuple(dances[STRIPED].train_cameras)
+    across, along = {}, {}
+    for stripes in (STRIPED, PLAIN):
+        told, avatar = structure(dances[stripes], stripes, cameras)
+        dress = told[~avatar.cage.off_clothes]
+        across[stripes], along[stripes] = dress[:, 1, 1].median(), torch.linalg.eigvalsh(dress)[:, 0].median()
+    assert across[STRIPED] > 2.0 * across[PLAIN]
+    assert across[STRIPED] > 2.0 * along[STRIPED]
+
+
+def test_what_no_camera_sees_is_not_told_of(dances):
+    (camera,) = (name for name in dances[STRIPED].train_cameras if name == "Ring0")
+    told, avatar = structure(dances[STRIPED], STRIPED, (camera,))
+    rig, towards = dances[STRIPED].rig, dances[STRIPED].capture.cameras[camera].position
+    posed = rig.pose(dances[STRIPED].motion(0))[avatar.cage.vertices]
+    side = (posed - posed.mean(0)) @ torch.tensor(towards / np.linalg.norm(towards), dtype=torch.float32)
+    size = told.diagonal(dim1=1, dim2=2).sum(-1)
+    hidden, shown = size[side < side.quantile(0.2)], size[side > side.quantile(0.8)]
+    assert hidden.min() < 0.01 * shown.min()
+
+
+def test_a_plain_skirt_is_believed_less_and_least_where_it_is_wrong(tmp_path):
+    """A hem that swings, in stripes and plain: what is expected of its errors, beside what they are."""
+    found, wrong = {}, []
+    for stripes in (STRIPED, PLAIN):
+        frames = AvatarSequence(open_capture(write_skirted(tmp_path / f"{stripes:g}", stripes=stripes)), person())
+        bound = sample_on_mesh(person(), SamplingConfig(count=1500, sh_degree=0))
+        where = world_from_local(bound, frames.rig.vertices, frames.rig.faces).means
+        bound = replace(bound, dc=torch.tensor(paint(where.numpy(), stripes), dtype=torch.float32))
+        config = replace(HELD, levels=(Level(0, 4, 5e-3),), control_points=60)
+        found[stripes], _ = follow_surface(frames, bound, config, Session(tmp_path / f"track{stripes:g}"))
+    skirt = torch.tensor(person().cloth_mask)
+    expected = []
+    for frame in frames.train_frames[1:]:
+        striped, plain = (found[stripes].expected_error(frame)[skirt] for stripes in (STRIPED, PLAIN))
+        assert plain.mean() > 1.2 * striped.mean()
+        expected.append(plain)
+        truth = torch.tensor(moved()[frame], dtype=torch.float32)
+        wrong.append((found[PLAIN].displacements(frame) - truth)[skirt].norm(dim=-1))
+    assert spearmanr(torch.cat(expected), torch.cat(wrong))[0] > 0.3
+
+
+@pytest.mark.parametrize(
+    ("reference", "ends", "order"), [(0, (3,), [2, 1, 0]), (2, (0, 3), [1, 2]), (3, (0,), [1, 2, 3])]
+)
+def test_the_way_back_begins_with_what_was_found_at_the_ends(dances, reference, ends, order):
+    avatar = TrackedAvatar(dances[STRIPED].rig, painted(STRIPED), CONFIG.control_points)
+    config = replace(HELD, reference=reference, held=0.0)
+    ahead = TrackTask(dances[STRIPED], avatar, config)
+    ahead.solved[:] = torch.randn(ahead.solved.shape, generator=torch.Generator().manual_seed(1))
+    back = TrackTask(dances[STRIPED], avatar, config.coarse(), ahead=ahead)
+    assert (back.ends, back.order) == (ends, order) and back.config.iterations == len(order) * config.steps
+    nearest = min(ends, key=lambda end: abs(end - order[0]))
+    torch.testing.assert_close(back.begin(order[0]).start, ahead.solved[nearest])
+    back.solved[reference] = ahead.solved[reference] + torch.tensor([0.0, 0.03, 0.04])
+    torch.testing.assert_close(ahead.apart_at_first(back), torch.full((CONFIG.control_points,), 0.05))
+
+
+def test_the_way_back_is_measured_where_it_was_asked_for(tracks):
+    assert tracks[PLAIN].drift is None
+    drift = tracks[STRIPED].drift
+    assert drift.shape == (CONFIG.control_points,) and drift.isfinite().all() and drift.any()
+
+
+def test_a_way_back_that_was_stopped_goes_on(dances, tracks, tmp_path):
+    config, frames = replace(HELD, back=True), dances[STRIPED]
+    stops = 0
+    while True:
+        track, progress = follow_surface(frames, painted(STRIPED), config, Session(tmp_path, max_seconds=1e-9))
+        if progress.finished and track.drift is not None:
+            break
+        stops += 1
+        if stops == 2:
+            track, progress = follow_surface(frames, painted(STRIPED), config, Session(tmp_path))
+            break
+    assert stops == 2 and progress.finished
+    assert torch.equal(track.controls, tracks[STRIPED].controls) and torch.equal(track.drift, tracks[STRIPED].drift)
