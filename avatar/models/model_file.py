@@ -21,7 +21,7 @@ from avatar.models.networks.deformation_field import FieldConfig, FieldNetwork, 
 from avatar.models.networks.teacher import Teacher, TeacherConfig
 from avatar.models.stored_model import StoredModel
 from avatar.models.student import Student, StudentConfig
-from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.teacher_avatar import TOLD, TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
@@ -47,7 +47,9 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
     """
     about = {"schema": SCHEMA, "face_count": model.gaussians.face_count, "topology": model.gaussians.topology}
     if isinstance(model, TeacherAvatar):
-        about |= {"kind": "teacher", "config": config_to_dict(model.config)}
+        track = model.track
+        told = [name for name in TOLD if track is not None and getattr(track, name) is not None]
+        about |= {"kind": "teacher", "config": config_to_dict(model.config), "track_tells": told}
     else:
         config = model.config
         about |= {

@@ -84,9 +84,9 @@ class StoredModel:
 
     def track_errors(self, frames: int, count: int) -> dict[str, Tensor]:
         """Read what the track of so many frames and controls tells of its errors, as its arguments, metres."""
-        shapes = {"sigma": (frames, count), "drift": (count,)}  # older files hold neither
-        stored = {name: shape for name, shape in shapes.items() if f"track_{name}" in self.tensors}
-        return {name: self.require(f"track_{name}", shape) for name, shape in stored.items()}
+        shapes = {"sigma": (frames, count), "drift": (count,)}
+        told = as_list(self.about.get("track_tells", []), subject="track_tells")  # older files do not say: nothing
+        return {name: self.require(f"track_{name}", shape) for name, shape in shapes.items() if name in told}
 
     def poses(self, name: str) -> Tensor:
         """Read poses (T, 63) of at least one frame, radians."""

@@ -150,3 +150,10 @@ class Track:
     def confidence(self, frame: int) -> Float[Tensor, " V"]:
         """Return in (0, 1] how much a frame's vertices count in what learns from them: `1 / (1 + (e / HALF)^2)`."""
         return 1.0 / (1.0 + (self.expected_error(frame) / HALF).square())
+
+    def errors_of_clothes(self) -> dict[str, float]:
+        """Return the mean `expected_error` and `drift`, metres, of control points on clothes, of all where none are."""
+        clothes = ~self.cage.off_clothes
+        clothes = clothes if bool(clothes.any()) else ~clothes
+        told = {"expected_error": self.sigma, "drift": self.drift}
+        return {name: float(value[..., clothes].mean()) for name, value in told.items() if value is not None}

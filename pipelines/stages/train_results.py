@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from avatar.baselines.avatar_base import Baseline
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.speed import parameter_counts
@@ -120,13 +118,7 @@ def _followed(model: TeacherAvatar | Student | Baseline) -> dict[str, Any]:
     track = model.track if isinstance(model, TeacherAvatar) else None
     if track is None or track.sigma is None:
         return {}
-    clothes = ~track.cage.off_clothes
-    clothes = clothes if bool(clothes.any()) else torch.ones_like(clothes)
-    told = {
-        "expected_error_mm": track.sigma[:, clothes],
-        "drift_mm": None if track.drift is None else track.drift[clothes],
-    }
-    return {"followed": {name: 1e3 * float(value.mean()) for name, value in told.items() if value is not None}}
+    return {"followed": {f"{name}_mm": 1e3 * metres for name, metres in track.errors_of_clothes().items()}}
 
 
 def _normals(sequence: AvatarSequence, folder: Path) -> str:
