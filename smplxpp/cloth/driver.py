@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
-from scipy.sparse import csr_matrix
+from jaxtyping import Float32, Int64
 
 from smplxpp.body.model import PosedBody
+from smplxpp.cloth.carried import SkinnedRows
 from smplxpp.cloth.fabric import SolverConfig
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.poses import pose_between, reference_facing_as
@@ -25,8 +25,6 @@ LONGEST_STEP = 0.26
 _RAMP_STEP = 1.0 / 30.0
 # Metres of the root from what places are measured from, beyond which that follows it.
 _FAR = 4.0
-# Of a blend of rotations; below, its inverse blows up what the cloth did.
-_LEAST_DETERMINANT = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +95,11 @@ class ClothDriver:
         # Vertices of the template that steps need; the others are not posed.
         self._rows = np.unique(np.concatenate([np.r_[g.collider.vertices, g.particles] for g in garments]))
         self._fine = np.concatenate([g.vertices for g in garments])
-        weights = csr_matrix(template.weights.dense(), dtype=np.float32)
-        self._row_weights, self._fine_weights = weights[self._rows], weights[self._fine]
-        rest = template.vertices.astype(np.float32)
-        self._row_rest, self._fine_rest = rest[self._rows], rest[self._fine]
-        self._skin = self._rows < template.body.vertex_count
+        self._rows_skinned, self._fine_skinned = (SkinnedRows(template.weights, r) for r in (self._rows, self._fine))
+        self._rest = template.vertices.astype(np.float32)
+        # The same with the body's shape of the moment, where steps need it.
+        self._shaped_rest = self._rest.copy()
+        self._skin = self._rows[self._rows < template.body.vertex_count]
         self._threads = [GarmentThread(g, self._rows, self.config) for g in garments]
         # What places are measured from: near the person, so that float32 knows micrometres wherever that stands.
         self._origin = np.zeros(3)
@@ -216,10 +214,8 @@ class ClothDriver:
 
     def _places(self, posed: PosedBody) -> Float32[np.ndarray, "R 3"]:
         """Return where skinning has the vertices that steps need, metres from the origin."""
-        rest = self._row_rest.copy()
-        rest[self._skin] = posed.rest_vertices[0][self._rows[self._skin]]
-        blended = _blended(self._row_weights, posed, self._origin)
-        return np.einsum("nij,nj->ni", blended[:, :, :3], rest) + blended[:, :, 3]
+        self._shaped_rest[self._skin] = posed.rest_vertices[0][self._skin]
+        return self._rows_skinned.posed(posed, self._shaped_rest, origin=self._origin)
 
     def over(self, params: BodyParams) -> ClothShape:
         """Return the cloth where it hangs now, for a body that is drawn in another pose than the last step's.
@@ -229,33 +225,8 @@ class ClothDriver:
         return self._shaped(self.template.posed_body(params))
 
     def _shaped(self, posed: PosedBody) -> ClothShape:
-        """Take the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`."""
-        carried = np.concatenate([thread.carried() for thread in self._threads]).astype(np.float32)
-        blended = _blended(self._fine_weights, posed, self._origin)
-        back, volume = _solved(blended[:, :, :3], carried - blended[:, :, 3])
-        # Joints that turn against each other flatten a blend; such a vertex stays with skinning.
-        displacements = np.where(volume > _LEAST_DETERMINANT, back - self._fine_rest, np.float32(0.0))
+        """Take the cloth as it is back to the T-pose."""
+        carried = np.concatenate([thread.carried() for thread in self._threads])
+        displacements = self._fine_skinned.unposed(posed, self._rest, carried, origin=self._origin)
         self._shape = ClothShape(self._fine, displacements, self._shape.share)
         return self._shape
-
-
-def _blended(weights: csr_matrix, posed: PosedBody, origin: Float[np.ndarray, " 3"]) -> Float32[np.ndarray, "N 3 4"]:
-    transforms = np.array(posed.posed_from_rest[0, :, :3])
-    transforms[:, :, 3] -= origin
-    return (weights @ transforms.reshape(-1, 12).astype(np.float32)).reshape(-1, 3, 4)
-
-
-def _solved(
-    matrices: Float32[np.ndarray, "N 3 3"], right: Float32[np.ndarray, "N 3"]
-) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 1"]]:
-    """The solutions of `A x = b` by Cramer's rule, and the determinants: ten times as fast as LAPACK for so small A."""
-    columns = np.ascontiguousarray(matrices.transpose(2, 1, 0))
-    b = np.ascontiguousarray(right.T)
-    across = [_cross(columns[1], columns[2]), _cross(columns[2], columns[0]), _cross(columns[0], columns[1])]
-    volume = (columns[0] * across[0]).sum(axis=0)
-    over = 1.0 / np.where(np.abs(volume) > _LEAST_DETERMINANT, volume, 1.0)
-    return np.stack([(b * one).sum(axis=0) * over for one in across], axis=1), volume[:, None]
-
-
-def _cross(a: Float32[np.ndarray, "3 N"], b: Float32[np.ndarray, "3 N"]) -> Float32[np.ndarray, "3 N"]:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

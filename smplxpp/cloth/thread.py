@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float32, Int64
 
+from smplxpp.cloth.carried import CarriedVertices
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.solver import ClothSolver, ClothState, push_out
 from smplxpp.core.mesh import row_lengths
@@ -33,6 +34,9 @@ class GarmentThread:
         self._model = garment.model()
         collider = garment.collider
         self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
+        self._carried = CarriedVertices(
+            garment.embedding, garment.rest.faces, self._solver.collider, len(garment.particles)
+        )
         self._particles = np.searchsorted(rows, garment.particles)
         self._skin = np.searchsorted(rows, collider.vertices)
         self._pinned = np.flatnonzero(garment.pinned)
@@ -91,17 +95,12 @@ class GarmentThread:
         """Return where the particles are, metres from the driver's origin."""
         return self._state.position.copy()
 
-    def carried(self) -> Float[np.ndarray, "N 3"]:
+    def carried(self) -> Float32[np.ndarray, "N 3"]:
         """Return the vertices that the garment carries, metres, `_FINE_MARGIN` outside of what it touches.
 
         Between particles that keep their margin a limb's curve can come through.
         """
-        coarse = self.garment.rest.with_vertices(self._state.position)
-        points, normals = self.garment.embedding.carried_with_normals(coarse)
-        if not self._surfaces or not len(self._skin):
-            return points
-        collider = self._solver.collider
-        return push_out(points.astype(np.float32), normals, self._surfaces[-1], collider, margin=_FINE_MARGIN)
+        return self._carried.at(self._state.position, self._surfaces[-1], margin=_FINE_MARGIN)
 
     def buried(self) -> int:
         """Return how many particles lie inside what the garment touches."""
@@ -120,7 +119,7 @@ class GarmentThread:
             return surface
         out = surface.copy()
         share = self._share[at[mine], None]
-        out[mine] += share * (self.carried()[at[mine]].astype(np.float32) - out[mine])
+        out[mine] += share * (self.carried()[at[mine]] - out[mine])
         return out
 
     def _sound(self) -> bool:

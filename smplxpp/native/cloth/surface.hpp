@@ -15,13 +15,15 @@ public:
     // Cells are a little wider than twice the reach: all within it of a place lie in the 8 cells that are nearest to that.
     void fill(const Vec3* points, int64_t count, float reach) {
         over_ = 1.0f / (2.01f * reach);
-        head_.assign(kCells, -1);
-        next_.resize(size_t(count));
+        first_.assign(kCells + 1, 0);
+        at_.resize(size_t(count));
+        order_.resize(size_t(count));
         for (int32_t i = 0; i < count; ++i) {
-            const uint32_t at = key(cell(points[i].x), cell(points[i].y), cell(points[i].z));
-            next_[size_t(i)] = head_[at];
-            head_[at] = i;
+            at_[size_t(i)] = key(cell(points[i].x), cell(points[i].y), cell(points[i].z));
+            ++first_[at_[size_t(i)]];
         }
+        for (uint32_t k = 1; k <= kCells; ++k) first_[k] += first_[k - 1];
+        for (int32_t i = 0; i < count; ++i) order_[size_t(--first_[at_[size_t(i)]])] = i;  // the last one first
     }
     // Calls visit with the points within the reach of a place, and with others about it; some of those twice.
     template <class Visit>
@@ -29,8 +31,10 @@ public:
         const int32_t x = first(p.x), y = first(p.y), z = first(p.z);
         for (int32_t i = x; i <= x + 1; ++i)
             for (int32_t j = y; j <= y + 1; ++j)
-                for (int32_t k = z; k <= z + 1; ++k)
-                    for (int32_t q = head_[key(i, j, k)]; q >= 0; q = next_[size_t(q)]) visit(q);
+                for (int32_t k = z; k <= z + 1; ++k) {
+                    const uint32_t at = key(i, j, k);
+                    for (int32_t q = first_[at]; q < first_[at + 1]; ++q) visit(order_[size_t(q)]);
+                }
     }
 
 private:
@@ -45,7 +49,8 @@ private:
     int32_t cell(float x) const { return whole(x * over_); }
     int32_t first(float x) const { return whole(x * over_ - 0.5f); }  // of the two cells nearest to a place
     float over_ = 1.0f;
-    std::vector<int32_t> head_, next_;
+    std::vector<uint32_t> at_;              // of points: their cells
+    std::vector<int32_t> first_, order_;  // of cells: where their points begin; the points, cell by cell
 };
 
 struct Contact {
@@ -86,8 +91,8 @@ public:
     }
     Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
 
-    Contact find(Vec3 p, Vec3 cloth_normal) const {
-        Contact found = {-1, {0, 0, 0}};
+    // The nearest vertex within reach that faces as the cloth does, -1: none.
+    int32_t nearest(Vec3 p, Vec3 cloth_normal) const {
         int32_t near = -1;
         float best = kReach * kReach;
         grid_.around(p, [&](int32_t j) {
@@ -96,8 +101,19 @@ public:
             // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
             if (squared < best && dot(normal_[size_t(j)], cloth_normal) > kCovers) best = squared, near = j;
         });
+        return near;
+    }
+    // Whether a place is so far before its nearest vertex that no face about can be over it.
+    bool clear(Vec3 p, int32_t near) const {
+        const Vec3 d = p - vertex_[near];
+        const float height = dot(d, normal_[size_t(near)]);
+        return height > kClear && 2.0f * height * height > dot(d, d);
+    }
+    Contact find(Vec3 p, Vec3 cloth_normal) const { return find_from(nearest(p, cloth_normal), p, cloth_normal); }
+    Contact find_from(int32_t near, Vec3 p, Vec3 cloth_normal) const {
+        Contact found = {-1, {0, 0, 0}};
         if (near < 0) return found;
-        best = 1e9f;
+        float best = 1e9f;
         // Among large and small triangles the nearest face need not be one of the nearest vertex: where the place lies on
         // the far side of the vertex's faces, look on from there.
         for (int step = 0; step < kSteps && scan(p, near, best, found); ++step) {
@@ -132,6 +148,7 @@ private:
 
     static constexpr int kSteps = 8;          // from one vertex's faces to the next one's
     static constexpr float kReach = 0.035f;   // metres within which a vertex is found
+    static constexpr float kClear = 0.01f;    // metres before a vertex
     static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
     const int32_t* face_;
     int64_t faces_;

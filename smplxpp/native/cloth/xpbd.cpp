@@ -290,33 +290,3 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_advance(const Model* model, const Forces* f
         Solver(*model, *forces, (Vec3*)position, (Vec3*)velocity).advance(*moments, seconds, substeps, contacts_every);
     });
 }
-
-// Moves n points (3 n metres, in place) with outward normals to `margin` metres outside a surface of c vertices and d faces,
-// where they lie less than `deepest` metres behind it.
-SMPLXPP_EXPORT int32_t smplxpp_cloth_push_out(int64_t n, float* points, const float* normals, int64_t c, const float* vertices,
-                                              const int32_t* faces, int64_t d, float margin, const float* deepest) {
-    return smplxpp::guarded([&] {
-        smplxpp::check_indices(faces, 3 * d, c);
-        Surface surface(c, faces, d);
-        const Vec3* skin = (const Vec3*)vertices;
-        surface.look(skin);
-        for (int64_t i = 0; i < n; ++i) {
-            Vec3& p = ((Vec3*)points)[i];
-            const Contact contact = surface.find(p, ((const Vec3*)normals)[i]);
-            if (contact.face < 0) continue;
-            const int32_t* q = faces + 3 * int64_t(contact.face);
-            Vec3 foot = {0, 0, 0}, normal = {0, 0, 0};
-            float most = 0;
-            for (int j = 0; j < 3; ++j) {
-                foot = foot + skin[q[j]] * contact.weight[j];
-                normal = normal + surface.normal(q[j]) * contact.weight[j];
-                most += deepest[q[j]] * contact.weight[j];
-            }
-            const float l = length(normal);
-            if (l < 1e-6f) continue;
-            normal = normal * (1.0f / l);
-            const float height = dot(p - foot, normal);
-            if (height < margin && height > -most) p = p + normal * (margin - height);
-        }
-    });
-}

@@ -36,6 +36,8 @@ export class Deformer {
   readonly transforms: Block<Float32Array>;
   /** (V, 3) of the last pose, in the T-pose: with expression and correctives, without the field. */
   readonly rest: Block<Float32Array>;
+  /** (V, influences) joints and weights of the vertices. */
+  readonly skinning: { joints: Block<Int32Array>; weights: Block<Float32Array> };
   private readonly posed: Block<Float32Array>;
   private readonly skeleton: { parents: Block<Int32Array>; turns: Block<Float64Array>; rest: Block<Float64Array>; place: Block<Float64Array> };
   private readonly features: Block<Float32Array> | null;
@@ -73,8 +75,9 @@ export class Deformer {
     this.blend = avatar.blendShapes && new BlendAdder(native, avatar.blendShapes, avatar.known, N);
     this.rest = native.keep(mesh.vertices);
     this.posed = native.floats(3 * V);
+    this.skinning = { joints: native.keep(mesh.joints), weights: native.keep(mesh.weights) };
     this.surface = native.struct([V, J, mesh.influences, field ? field.setOf.length : 0, field ? field.neighbourCount : 0], [
-      native.keep(mesh.joints), native.keep(mesh.weights), field && native.keep(field.neighbours), field && native.keep(field.weights),
+      this.skinning.joints, this.skinning.weights, field && native.keep(field.neighbours), field && native.keep(field.weights),
     ]);
     const faces = native.keep(mesh.faces), dc = native.keep(g.color);
     this.bound = native.struct([F, N, V], [

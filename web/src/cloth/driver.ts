@@ -4,6 +4,8 @@ import type { Pose } from "../avatar/avatar.ts";
 import type { Deformer, Displaced } from "../avatar/deform.ts";
 import { between } from "../avatar/motion.ts";
 import { multiply, quaternionFromRotvec, rotvecFromQuaternion } from "../math/rotations.ts";
+import type { Block } from "../native/memory.ts";
+import { SkinnedRows } from "./carried.ts";
 import type { Garment } from "./garment.ts";
 import { GarmentThread } from "./thread.ts";
 
@@ -15,8 +17,6 @@ const TELEPORT = 12;
 const FAR = 4;
 /** Metres from where what holds the cloth was at the last cold start, within which that start serves again. */
 const AGAIN = 0.06;
-/** Of a blend of rotations; below, its inverse blows up what the cloth did. */
-const LEAST_DETERMINANT = 0.2;
 /** Seconds between pictures beyond which a motion is not followed. */
 export const LONGEST_FOLLOWED = 1;
 
@@ -28,8 +28,9 @@ export interface Start {
 
 /** What a garment needs of the surface: vertices of the avatar and what moves them. */
 interface Rows {
-  particles: Int32Array;
-  collider: Int32Array;
+  particles: SkinnedRows;
+  collider: SkinnedRows;
+  carried: SkinnedRows;
   /** Of each vertex of the collider the vertex that an inner garment carries: [garment, index]. */
   under: Map<number, [number, number]>;
 }
@@ -38,6 +39,11 @@ export class ClothDriver {
   private readonly threads: GarmentThread[];
   private readonly rows: Rows[];
   private readonly displaced: Displaced;
+  /** (V, 3) the T-pose: without expression, and with the body's shape of the moment where steps need it. */
+  private readonly still: Block<Float32Array>;
+  private readonly shapedRest: Block<Float32Array>;
+  /** Vertices of the body that steps need. */
+  private readonly skin: Int32Array;
   /** What places are measured from: near the person, so that float32 knows micrometres wherever that stands. */
   private origin = [0, 0, 0];
   private last: Pose | null = null;
@@ -47,14 +53,18 @@ export class ClothDriver {
   constructor(private readonly deformer: Deformer, garments: readonly Garment[], private readonly start: Start = { ramp: RAMP, hold: HOLD }) {
     const { native, avatar: { mesh, gaussians } } = deformer, V = mesh.vertices.length / 3;
     this.threads = garments.map((garment) => new GarmentThread(native, garment));
-    this.rows = garments.map(({ particles, collider }, k) => {
+    this.rows = garments.map(({ particles, collider, vertices }, k) => {
       const under = new Map<number, [number, number]>();
       garments.slice(0, k).forEach(({ vertices }, inner) => {
         const place = new Map(Array.from(vertices, (vertex, i) => [vertex, i]));
         collider.vertices.forEach((vertex, i) => place.has(vertex) && under.set(i, [inner, place.get(vertex)!]));
       });
-      return { particles, collider: collider.vertices, under };
+      const [own, touched, carried] = [particles, collider.vertices, vertices].map((rows) => new SkinnedRows(deformer, rows));
+      return { particles: own, collider: touched, carried, under };
     });
+    [this.still, this.shapedRest] = [native.keep(mesh.vertices), native.keep(mesh.vertices)];
+    const needed = new Set(garments.flatMap(({ particles, collider }) => [...particles, ...collider.vertices]));
+    this.skin = Int32Array.from([...needed].filter((vertex) => !mesh.parts[vertex]));
     const share = new Float32Array(V);
     this.threads.forEach(({ garment, share: own }) => garment.vertices.forEach((vertex, i) => (share[vertex] = own[i])));
     const keep = Float32Array.from(gaussians.face, (face) => {
@@ -163,51 +173,22 @@ export class ClothDriver {
   }
 
   /** Where skinning has some vertices, (R, 3) metres from the origin; the parts know no expression. */
-  private places(vertices: Int32Array): Float32Array {
-    const { mesh } = this.deformer.avatar, rest = this.deformer.rest.view, out = new Float32Array(3 * vertices.length);
-    vertices.forEach((v, row) => {
-      const m = this.blended(v), from = mesh.parts[v] ? mesh.vertices : rest;
-      const x = from[3 * v], y = from[3 * v + 1], z = from[3 * v + 2];
-      for (let r = 0; r < 3; ++r) out[3 * row + r] = m[4 * r] * x + m[4 * r + 1] * y + m[4 * r + 2] * z + m[4 * r + 3];
-    });
-    return out;
+  private places(rows: SkinnedRows): Float32Array {
+    const from = this.deformer.rest.view, to = this.shapedRest.view;
+    for (const v of this.skin) for (let k = 3 * v; k < 3 * v + 3; ++k) to[k] = from[k];
+    return rows.pose(this.shapedRest).slice();
   }
 
-  private readonly blend = new Float64Array(12);
-
-  /** The transform of a vertex: (3, 4), good until the next call. */
-  private blended(v: number): Float64Array {
-    const { joints, weights, influences } = this.deformer.avatar.mesh, transforms = this.deformer.transforms.view, m = this.blend;
-    m.fill(0);
-    for (let k = v * influences; k < (v + 1) * influences; ++k) {
-      const weight = weights[k], at = 12 * joints[k];
-      if (weight === 0) continue;
-      for (let i = 0; i < 12; ++i) m[i] += weight * transforms[at + i];
-    }
-    return m;
-  }
-
-  /** Takes the cloth as it is back to the T-pose: `(sum_j w_j G_j)^-1 x - v`. */
+  /** Takes the cloth as it is back to the T-pose. */
   private shaped(pose: Pose): Displaced {
     this.joints(pose);
     for (const thread of this.threads) thread.carry();
-    const { vertices: rest } = this.deformer.avatar.mesh, out = this.displaced.displacements.view;
-    for (const { garment, carried } of this.threads) {
-      const places = carried.view;
+    this.threads.forEach(({ garment, carried }, k) => {
+      const found = this.rows[k].carried.unpose(this.still, carried), out = this.displaced.displacements.view;
       garment.vertices.forEach((v, i) => {
-        const m = this.blended(v);
-        const a = places[3 * i] - m[3], b = places[3 * i + 1] - m[7], c = places[3 * i + 2] - m[11];
-        const xx = m[5] * m[10] - m[6] * m[9], xy = m[2] * m[9] - m[1] * m[10], xz = m[1] * m[6] - m[2] * m[5];
-        const volume = m[0] * xx + m[4] * xy + m[8] * xz;
-        // Joints that turn against each other flatten a blend; such a vertex stays with skinning.
-        const sound = volume > LEAST_DETERMINANT, over = 1 / volume, at = 3 * v;
-        const yx = m[6] * m[8] - m[4] * m[10], yy = m[0] * m[10] - m[2] * m[8], yz = m[2] * m[4] - m[0] * m[6];
-        const zx = m[4] * m[9] - m[5] * m[8], zy = m[1] * m[8] - m[0] * m[9], zz = m[0] * m[5] - m[1] * m[4];
-        out[at] = sound ? (xx * a + xy * b + xz * c) * over - rest[at] : 0;
-        out[at + 1] = sound ? (yx * a + yy * b + yz * c) * over - rest[at + 1] : 0;
-        out[at + 2] = sound ? (zx * a + zy * b + zz * c) * over - rest[at + 2] : 0;
+        for (let c = 0; c < 3; ++c) out[3 * v + c] = found[3 * i + c];
       });
-    }
+    });
     return this.displaced;
   }
 }

@@ -1,7 +1,7 @@
 /** One garment through time: its particles, and where skinning had it at the last moments (`smplxpp/cloth/thread.py`). */
 
 import type { Block, Native } from "../native/memory.ts";
-import { Embedding } from "./embedding.ts";
+import { CarriedVertices } from "./carried.ts";
 import { pinned, shareOf, type Garment } from "./garment.ts";
 import { buildModel } from "./model.ts";
 
@@ -58,22 +58,17 @@ export class GarmentThread {
   /** (n, 3) metres from the driver's origin, and metres a second. */
   readonly position: Block<Float32Array>;
   readonly velocity: Block<Float32Array>;
-  /** (N, 3) where the carried vertices are, after `carry`. */
-  readonly carried: Block<Float32Array>;
   /** (N,) */
   readonly share: Float32Array;
   private readonly pins: Int32Array;
   private readonly mostSquared: Float64Array;
   private readonly edges: Int32Array;
-  private readonly embedding: Embedding;
-  private readonly normals: Block<Float32Array>;
+  private readonly fine: CarriedVertices;
   private readonly model: Block<Uint8Array>;
   private readonly forces: Block<Float64Array>;
   private readonly moments: Block<Uint8Array>;
   private readonly places: Moments;
   private readonly surfaces: Moments;
-  private readonly colliderFaces: Block<Int32Array>;
-  private readonly deepest: Block<Float32Array>;
 
   constructor(private readonly native: Native, readonly garment: Garment) {
     const { fabric, collider } = garment, n = garment.particles.length, c = collider.vertices.length;
@@ -82,15 +77,13 @@ export class GarmentThread {
     this.share = shareOf(garment);
     this.edges = model.edges;
     this.mostSquared = Float64Array.from(model.lengths, (length) => (MOST_STRETCH * length + 0.01) ** 2);
-    this.embedding = new Embedding(garment);
     [this.position, this.velocity] = [native.floats(3 * n), native.floats(3 * n)];
-    [this.carried, this.normals] = [native.floats(garment.corners.length), native.floats(garment.corners.length)];
-    this.colliderFaces = native.keep(collider.faces);
-    this.deepest = native.keep(collider.deepest);
+    const colliderFaces = native.keep(collider.faces), deepest = native.keep(collider.deepest);
+    this.fine = new CarriedVertices(native, garment, deepest, colliderFaces);
     this.model = native.struct([n, garment.faces.length / 3, model.edges.length / 2, model.bend.length, c, collider.faces.length / 3], [
       ...[model.inverseMass, garment.faces, model.edges, model.lengths, model.stretch, model.compress, model.hinges, model.curvature,
         model.restCurvature, model.bend].map((array) => native.keep<Float32Array | Int32Array>(array)),
-      null, native.keep(model.anchor), native.keep(model.tether), this.colliderFaces, native.keep(collider.margin), this.deepest,
+      null, native.keep(model.anchor), native.keep(model.tether), colliderFaces, native.keep(collider.margin), deepest,
     ]);
     this.forces = native.keep(Float64Array.of(
       GRAVITY, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, 0, MOST_SPEED));
@@ -126,13 +119,12 @@ export class GarmentThread {
 
   /** Brings what the garment carries to where the particles are, `FINE_MARGIN` outside of what it touches. */
   carry(): void {
-    const { embedding, garment: { collider, vertices } } = this;
-    embedding.carry(this.position.view);
-    this.carried.view.set(embedding.points);
-    if (!collider.vertices.length) return;
-    this.normals.view.set(embedding.normals);
-    this.native.run("cloth_push_out", BigInt(vertices.length), this.carried, this.normals, BigInt(collider.vertices.length),
-      this.surfaces.blocks[2], this.colliderFaces, BigInt(collider.faces.length / 3), FINE_MARGIN, this.deepest);
+    this.fine.carry(this.position, this.surfaces.blocks[2], FINE_MARGIN);
+  }
+
+  /** (N, 3) where the carried vertices are, after `carry`. */
+  get carried(): Block<Float32Array> {
+    return this.fine.points;
   }
 
   /** Remembers the garment as it is; what it returns brings it back to that. */

@@ -1,0 +1,157 @@
+// What particles carry: fine vertices in the frames of coarse triangles, kept out of the skin, and the way of vertices between
+// the T-pose and the pose. One thread, float, built without contraction: the same bits everywhere.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "cloth/surface.hpp"
+#include "cloth/vec3.hpp"
+#include "common/status.hpp"
+
+namespace {
+
+using smplxpp::check_indices;
+using smplxpp::Contact;
+using smplxpp::Surface;
+using smplxpp::Vec3;
+
+// N vertices in the frames of t triangles of n particles with m faces, and a collider of c vertices and d faces.
+// smplxpp/cloth/carried.py says the same.
+struct Carried {
+    int64_t vertices, triangles, particles, faces, collider_vertices, collider_faces;
+    const int32_t* triangle;       // 3 t: particles
+    const int32_t* which;          // N: the triangle that carries each
+    const float* weight;           // 3 N: barycentric
+    const float* offset;           // 3 N: metres along the first edge, the second direction, the smooth normal
+    const int32_t* face;           // 3 m
+    const int32_t* collider_face;  // 3 d
+    const float* deepest;          // c: metres; deeper cloth is on the other side
+};
+
+// Skinning weights of V vertices over J joints, and the R of them that are meant. smplxpp/cloth/carried.py says the same.
+struct Skinned {
+    int64_t rows, vertices, joints, influences;
+    const int32_t* row;    // R
+    const int32_t* joint;  // (V, influences)
+    const float* weight;   // (V, influences)
+};
+
+Vec3 unit(Vec3 a) { return a * (1.0f / std::max(smplxpp::length(a), 1e-12f)); }
+
+// To `margin` metres before the surface, along its smooth normal, where a place lies behind that and not too deep.
+Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, const Surface& surface, const int32_t* faces, const Vec3* skin, float margin,
+                const float* deepest) {
+    const int32_t near = surface.nearest(p, cloth_normal);
+    if (near < 0 || surface.clear(p, near)) return p;
+    const Contact contact = surface.find_from(near, p, cloth_normal);
+    if (contact.face < 0) return p;
+    const int32_t* q = faces + 3 * int64_t(contact.face);
+    Vec3 foot = {0, 0, 0}, normal = {0, 0, 0};
+    float most = 0;
+    for (int j = 0; j < 3; ++j) {
+        foot = foot + skin[q[j]] * contact.weight[j];
+        normal = normal + surface.normal(q[j]) * contact.weight[j];
+        most += deepest[q[j]] * contact.weight[j];
+    }
+    const float l = smplxpp::length(normal);
+    if (l < 1e-6f) return p;
+    normal = normal * (1.0f / l);
+    const float height = dot(p - foot, normal);
+    return height < margin && height > -most ? p + normal * (margin - height) : p;
+}
+
+// The transform of a vertex: its joints' (J, 3, 4), blended.
+void blend(const Skinned& in, const float* transforms, int64_t vertex, float* __restrict m) {
+    float sum[12] = {};
+    for (int64_t k = vertex * in.influences; k < (vertex + 1) * in.influences; ++k) {
+        const float w = in.weight[k];
+        if (uint32_t(in.joint[k]) >= uint32_t(in.joints)) smplxpp::throw_out_of_range("joint");
+        const float* __restrict t = transforms + 12 * int64_t(in.joint[k]);
+        for (int i = 0; i < 12; ++i) sum[i] += w * t[i];
+    }
+    std::copy(sum, sum + 12, m);
+}
+
+}  // namespace
+
+// points (3 N): where particles at x (3 n) take what they carry, `margin` metres out of the collider at `skin` (3 c).
+SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, const float* skin, float margin, float* points) {
+    return smplxpp::guarded([&] {
+        check_indices(in->triangle, 3 * in->triangles, in->particles);
+        check_indices(in->which, in->vertices, in->triangles);
+        check_indices(in->face, 3 * in->faces, in->particles);
+        check_indices(in->collider_face, 3 * in->collider_faces, in->collider_vertices);
+        const Vec3* place = (const Vec3*)x;
+        std::vector<Vec3> normal(size_t(in->particles)), tangent(2 * size_t(in->triangles));
+        smplxpp::normals(place, in->face, in->faces, normal);
+        for (int64_t t = 0; t < in->triangles; ++t) {
+            const int32_t* q = in->triangle + 3 * t;
+            const Vec3 edge = place[q[1]] - place[q[0]];
+            const Vec3 across = unit(cross(edge, place[q[2]] - place[q[0]]));
+            tangent[size_t(2 * t)] = unit(edge);
+            tangent[size_t(2 * t + 1)] = cross(across, tangent[size_t(2 * t)]);
+        }
+        Surface surface(in->collider_vertices, in->collider_face, in->collider_faces);
+        surface.look((const Vec3*)skin);
+        for (int64_t v = 0; v < in->vertices; ++v) {
+            const int64_t t = in->which[v];
+            const int32_t* q = in->triangle + 3 * t;
+            const float *w = in->weight + 3 * v, *by = in->offset + 3 * v;
+            const Vec3 up = unit(normal[size_t(q[0])] * w[0] + normal[size_t(q[1])] * w[1] + normal[size_t(q[2])] * w[2]);
+            const Vec3 there = place[q[0]] * w[0] + place[q[1]] * w[1] + place[q[2]] * w[2] + tangent[size_t(2 * t)] * by[0] +
+                               tangent[size_t(2 * t + 1)] * by[1] + up * by[2];
+            ((Vec3*)points)[v] = pushed_out(there, up, surface, in->collider_face, (const Vec3*)skin, margin, in->deepest);
+        }
+    });
+}
+
+// Moves n points (3 n metres, in place) with outward normals to `margin` metres outside a surface of c vertices and d faces,
+// where they lie less than `deepest` metres behind it.
+SMPLXPP_EXPORT int32_t smplxpp_cloth_push_out(int64_t n, float* points, const float* normals, int64_t c, const float* vertices,
+                                              const int32_t* faces, int64_t d, float margin, const float* deepest) {
+    return smplxpp::guarded([&] {
+        check_indices(faces, 3 * d, c);
+        Surface surface(c, faces, d);
+        const Vec3* skin = (const Vec3*)vertices;
+        surface.look(skin);
+        for (int64_t i = 0; i < n; ++i) {
+            Vec3& p = ((Vec3*)points)[i];
+            p = pushed_out(p, ((const Vec3*)normals)[i], surface, faces, skin, margin, deepest);
+        }
+    });
+}
+
+// places (3 R): where transforms (J, 3, 4) take rest (3 V).
+SMPLXPP_EXPORT int32_t smplxpp_cloth_posed(const Skinned* in, const float* transforms, const float* rest, float* places) {
+    return smplxpp::guarded([&] {
+        check_indices(in->row, in->rows, in->vertices);
+        for (int64_t r = 0; r < in->rows; ++r) {
+            float m[12];
+            blend(*in, transforms, in->row[r], m);
+            const float* p = rest + 3 * int64_t(in->row[r]);
+            for (int k = 0; k < 3; ++k)
+                places[3 * r + k] = m[4 * k] * p[0] + m[4 * k + 1] * p[1] + m[4 * k + 2] * p[2] + m[4 * k + 3];
+        }
+    });
+}
+
+// displacements (3 R) from rest (3 V), along the axes of the T-pose, that skinning takes to places (3 R). Joints that turn
+// against each other flatten a blend; where its determinant is not above `least` there is none.
+SMPLXPP_EXPORT int32_t smplxpp_cloth_unposed(const Skinned* in, const float* transforms, const float* rest, const float* places,
+                                             float least, float* displacements) {
+    return smplxpp::guarded([&] {
+        check_indices(in->row, in->rows, in->vertices);
+        for (int64_t r = 0; r < in->rows; ++r) {
+            float m[12];
+            blend(*in, transforms, in->row[r], m);
+            const Vec3 a = {m[0], m[4], m[8]}, b = {m[1], m[5], m[9]}, c = {m[2], m[6], m[10]};
+            const Vec3 p = ((const Vec3*)places)[r] - Vec3{m[3], m[7], m[11]};
+            const Vec3 bc = cross(b, c), ca = cross(c, a), ab = cross(a, b);  // Cramer's rule
+            const float volume = dot(a, bc);
+            const float over = 1.0f / volume;
+            const Vec3 from = ((const Vec3*)rest)[in->row[r]], back = Vec3{dot(p, bc), dot(p, ca), dot(p, ab)} * over;
+            ((Vec3*)displacements)[r] = volume > least ? back - from : Vec3{0, 0, 0};
+        }
+    });
+}

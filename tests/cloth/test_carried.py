@@ -1,0 +1,100 @@
+"""Kernels of what cloth carries, against numpy: the embedding, skin that comes through, skinning there and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smplxpp.cloth.carried import CarriedVertices, SkinnedRows
+from smplxpp.cloth.embedding import embed
+from smplxpp.cloth.solver import Collider, push_out
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from tests.cloth.persons import person, standing
+from tests.cloth.sheets import ball, bent, collider, hanging
+
+NOTHING = Collider(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32))
+NOWHERE = np.zeros((0, 3), np.float32)
+
+
+def scattered(coarse: TriangleMesh, count: int = 400) -> np.ndarray:
+    """(count, 3) places about a mesh."""
+    rng = np.random.default_rng(3)
+    corners = coarse.vertices[coarse.faces[rng.integers(coarse.face_count, size=count)]]
+    weights = rng.dirichlet(np.ones(3), size=count)
+    return np.einsum("nk,nki->ni", weights, corners) + rng.normal(scale=0.01, size=(count, 3))
+
+
+def shaken(coarse: TriangleMesh) -> TriangleMesh:
+    rng = np.random.default_rng(4)
+    return coarse.with_vertices(
+        (coarse.vertices + rng.normal(scale=0.01, size=coarse.vertices.shape)).astype("float32")
+    )
+
+
+def test_vertices_are_carried_as_numpy_carries_them():
+    coarse = bent(hanging())
+    embedding = embed(scattered(coarse), coarse)
+    moved = shaken(coarse)
+    carried = CarriedVertices(embedding, coarse.faces, NOTHING, coarse.vertex_count)
+    found = carried.at(moved.vertices.astype(np.float32), NOWHERE, margin=0.002)
+    np.testing.assert_allclose(found, embedding.carried(moved), atol=2e-6)
+    assert np.abs(found - scattered(coarse)).max() > 0.01
+
+
+def test_what_is_carried_is_pushed_out_as_points_are():
+    coarse = bent(hanging())
+    body = ball(radius=0.1)
+    body = body.with_vertices(body.vertices + coarse.vertices.mean(axis=0) - [0.0, 0.0, 0.085])
+    embedding, solid = embed(scattered(coarse), coarse), collider(body)
+    carried = CarriedVertices(embedding, coarse.faces, solid, coarse.vertex_count)
+    skin = body.vertices.astype(np.float32)
+    found = carried.at(coarse.vertices.astype(np.float32), skin, margin=0.002)
+    points, normals = embedding.carried_with_normals(coarse)
+    expected = push_out(points.astype(np.float32), normals, skin, solid, margin=0.002)
+    np.testing.assert_allclose(found, expected, atol=5e-6)
+    pushed = np.linalg.norm(found - points, axis=1) > 1e-4
+    assert 0.02 < pushed.mean() < 0.98
+
+
+def test_skinning_there_and_back_is_that_of_the_template():
+    template, params = person(), standing(at=(0.3, 0.1, -0.2), turned=0.7, lifted=0.4)
+    body, origin = template.posed_body(params), np.array([0.1, 0.2, 0.3])
+    rows = np.arange(5, template.vertex_count, 7)
+    skinned = SkinnedRows(template.weights, rows)
+    rest = template.vertices.astype(np.float32)
+    blended = np.einsum("vj,jab->vab", template.weights.dense(), body.posed_from_rest[0])
+    expected = np.einsum("vij,vj->vi", blended[:, :3, :3], template.vertices) + blended[:, :3, 3] - origin
+    places = skinned.posed(body, rest, origin=origin)
+    np.testing.assert_allclose(places, expected[rows], atol=2e-6)
+    by = np.random.default_rng(0).normal(scale=0.05, size=(len(rows), 3))
+    there = places + np.einsum("vij,vj->vi", blended[rows][:, :3, :3], by).astype(np.float32)
+    np.testing.assert_allclose(skinned.unposed(body, rest, there, origin=origin), by, atol=1e-5)
+
+
+def test_blends_that_are_flat_leave_vertices_to_skinning():
+    template = person()
+    body = template.posed_body(standing())
+    flat = body.posed_from_rest.copy()
+    flat[:, :, 0, :3] *= 0.1
+    rows = np.arange(20)
+    skinned = SkinnedRows(template.weights, rows)
+    rest = template.vertices.astype(np.float32)
+    places = np.ones((20, 3), np.float32)
+    found = skinned.unposed(replace(body, posed_from_rest=flat), rest, places, origin=np.zeros(3))
+    assert not found.any()
+
+
+def test_indices_beyond_their_arrays_are_refused():
+    template = person()
+    body = template.posed_body(standing())
+    skinned = SkinnedRows(template.weights, np.array([0, template.vertex_count]))
+    with pytest.raises(InputError, match="indices"):
+        skinned.posed(body, template.vertices.astype(np.float32), origin=np.zeros(3))
+    coarse = bent(hanging())
+    embedding = embed(scattered(coarse), coarse)
+    carried = CarriedVertices(embedding, coarse.faces + 1, NOTHING, coarse.vertex_count)
+    with pytest.raises(InputError, match="indices"):
+        carried.at(coarse.vertices.astype(np.float32), NOWHERE, margin=0.002)
