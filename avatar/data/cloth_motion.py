@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
-from smplxpp.cloth.poses import smoothed, upsampled
+from smplxpp.cloth.driver import LONGEST_STEP
+from smplxpp.cloth.poses import resampled, smoothed
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least, require_positive
@@ -27,7 +28,7 @@ class ClothMotionConfig:
 
     Attributes:
         pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
-        smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
+        smoothing: radius in time of the weights with which the motion that drives the clothes is smoothed (`smoothed`),
             seconds; trackers shake waistbands. The body that is drawn is not smoothed; the cloth hangs beside it where
             the smoothed motion has brought it, so that it does not shake along.
         mode: "simulate", or "skin": the clothes stay where skinning has them.
@@ -35,7 +36,7 @@ class ClothMotionConfig:
     """
 
     pre_roll: float = 0.7
-    smoothing: float = 0.03
+    smoothing: float = 0.1
     mode: Literal["simulate", "skin"] = "simulate"
     driver: DriverConfig = field(default_factory=DriverConfig)
 
@@ -118,22 +119,28 @@ class ClothMotions:
         return float(frame - self._frames[0]) / self._fps
 
     def _ways(self, frames: Sequence[int]) -> dict[int, list[BodyParams]]:
-        """The poses from each frame's predecessor to it, smoothed within stretches of frames that follow each other.
+        """The poses from each frame's predecessor to it, smoothed within stretches that no long gap parts.
 
-        Those follow each other whose numbers are as far apart as any two of the motion's nearest are: a capture of
-        every second number is one of half the frames a second.
-        Slow frame rates get poses in between: places that go straight from pose to pose cut the corners of limbs.
+        Frames need not be even: what is missing within a stretch is filled by poses in between, so that smoothing
+        weighs by time. Slow frame rates get poses in between: places that go straight from pose to pose cut the
+        corners of limbs.
         """
         out: dict[int, list[BodyParams]] = {}
         apart = int(np.diff(self._frames).min()) if len(self._frames) > 1 else 1
-        fps = self._fps / apart
-        times = max(1, ceil(SLOWEST / fps - 1e-6))
-        cuts = np.flatnonzero(np.diff(frames) != apart) + 1
+        cuts = np.flatnonzero(np.diff(frames) > max(apart, LONGEST_STEP * self._fps)) + 1
         for stretch in np.split(np.array(frames), cuts):
             found = [self._params(int(frame)) for frame in stretch]
             poses = BodyParams.concatenate([one for one in found if one is not None])
-            fine = upsampled(smoothed(poses, radius=self.config.smoothing * fps), times)
-            out[int(stretch[0])] = [fine.frame(0)]
-            for k, frame in enumerate(stretch.tolist()[1:]):
-                out[frame] = [fine.frame(k * times + j + 1) for j in range(times)]
+            even = int(np.gcd.reduce(np.diff(stretch))) if len(stretch) > 1 else apart
+            at = (stretch - stretch[0]) // even
+            if at[-1] + 1 > len(at):
+                poses = resampled(poses, at.astype(float), np.arange(at[-1] + 1.0))
+            poses = smoothed(poses, radius=self.config.smoothing * self._fps / even)
+            times = max(1, ceil(SLOWEST * even / self._fps - 1e-6))
+            if times > 1:
+                steps = np.arange(times * at[-1] + 1.0) / times
+                poses = resampled(poses, np.arange(at[-1] + 1.0), np.minimum(steps, at[-1]))
+            out[int(stretch[0])] = [poses.frame(0)]
+            for frame, before, now in zip(stretch.tolist()[1:], at[:-1], at[1:], strict=True):
+                out[frame] = [poses.frame(int(k)) for k in range(times * before + 1, times * now + 1)]
         return out

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from smplxpp.core.errors import InputError
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
 from smplxpp.core.validation import require_at_least
 
@@ -40,17 +41,21 @@ def reference_facing_as(reference: BodyParams, params: BodyParams) -> BodyParams
 
 
 def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
-    """Smooth a motion in time with Gaussian weights, every joint about its own rotation; what a noisy tracker shakes.
+    """Smooth a motion in time, every joint about its own rotation; what a noisy tracker shakes.
+
+    Weights are `(3 - u^2) / 2 exp(-u^2 / 2)` at `u` radii: the Gaussian kernel of fourth order (Wand and Schucany
+    1990), which has no second moment and so leaves the bends of a motion that a Gaussian as steady would cut.
 
     Args:
-        params: T frames, evenly spaced. radius: standard deviation, frames; 0 changes nothing.
+        params: T frames, evenly spaced. radius: of the weights, frames; 0 changes nothing.
     """
     require_at_least("smoothing of motion", radius, 0.0)
-    count, reach = len(params), int(np.ceil(3.0 * radius))
+    count, reach = len(params), int(np.ceil(4.0 * radius))
     if radius == 0.0 or count < 2:
         return params
     offsets = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (offsets / radius) ** 2)
+    squared = (offsets / radius) ** 2
+    weights = (3.0 - squared) * np.exp(-0.5 * squared)
     # Beyond its ends a motion goes on as its mirror image about the end's own pose: the ends stay where they are.
     changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
@@ -71,40 +76,46 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
     return replace(params, **changes)
 
 
-def upsampled(params: BodyParams, times: int) -> BodyParams:
-    """Return a motion with `times` as many steps: cubic Hermite curves through the poses, joints about themselves.
+def resampled(params: BodyParams, times: Float[np.ndarray, " T"], wanted: Float[np.ndarray, " K"]) -> BodyParams:
+    """Return a motion's poses at other times: cubic Hermite curves through the poses, joints about themselves.
 
-    Tangents are those of Catmull and Rom, taken in the space of rotation vectors about each step's first pose; at the
-    ends a motion goes on as it came.
+    Tangents are those of the parabola through a pose and its two neighbours (of Catmull and Rom, where times are even),
+    taken in the space of rotation vectors about each step's first pose; at the ends a motion goes on as it came.
 
     Args:
-        params: T frames, evenly spaced. times: poses a step; 1 changes nothing.
+        params: T frames. times: theirs, seconds, increasing. wanted: between the first and the last of them.
 
-    Returns:
-        (T - 1) times + 1 frames; every `times`-th is one of those given.
+    Raises:
+        InputError: times that do not increase, or as many as there are frames; wanted ones beyond them.
     """
-    require_at_least("poses a step", times, 1)
     count = len(params)
-    if times == 1 or count < 2:
-        return params
-    step = np.repeat(np.arange(count - 1), times)
-    t = np.tile(np.arange(times) / times, count - 1)[:, None]
+    if times.shape != (count,) or not (np.diff(times) > 0).all():
+        raise InputError("times of a motion", expected=f"{count} that increase", received=f"{times.shape}")
+    if not ((wanted >= times[0]) & (wanted <= times[-1])).all():
+        raise InputError("times of poses in between", expected="within the motion's", received="others")
+    if count < 2:
+        return params.select(np.zeros(len(wanted), dtype=np.int64))
+    step = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, count - 2)
     before, after = np.maximum(step - 1, 0), np.minimum(step + 2, count - 1)
+    long = (times[step + 1] - times[step])[:, None]
+    # Seconds of the steps before and after, as shares of this one's; at an end there is none.
+    first = (times[step] - times[before])[:, None] / long
+    last = (times[after] - times[step + 1])[:, None] / long
+    t = (wanted - times[step])[:, None] / long
     changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
         value = getattr(params, name)
         turning = _turns(name, value, value)
         way = _step(value, step, step + 1, turning)
-        start = 0.5 * (way - _step(value, step, before, turning))
-        end = 0.5 * (_step(value, step + 1, after, turning) - _step(value, step + 1, step, turning))
+        came = -_step(value, step, before, turning) / np.where(first > 0, first, 1.0)
+        goes = _step(value, step + 1, after, turning) / np.where(last > 0, last, 1.0)
         # At an end there is no pose beyond: the tangent is that of the step.
-        start = np.where((step == 0)[:, None], way, start)
-        end = np.where((step == count - 2)[:, None], way, end)
+        start = np.where(first > 0, (first * way + came) / (1.0 + first), way)
+        end = np.where(last > 0, (last * way + goes) / (1.0 + last), way)
         t2, t3 = t * t, t * t * t
         curve = (t3 - 2.0 * t2 + t) * start + (3.0 * t2 - 2.0 * t3) * way + (t3 - t2) * end
-        changes[name] = np.concatenate([_moved(value[step], curve, turning), value[-1:]])
-    rows = np.append(step, count - 1)
-    return replace(params.select(rows), **changes)
+        changes[name] = _moved(value[step], curve, turning)
+    return replace(params.select(step), **changes)
 
 
 class CausalSmoother:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.cloth.poses import CausalSmoother, pose_between, reference_facing_as, smoothed, upsampled
+from smplxpp.cloth.poses import CausalSmoother, pose_between, reference_facing_as, resampled, smoothed
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
@@ -83,10 +83,18 @@ def test_smoothing_takes_noise_away_by_as_much_as_its_weights_say():
     middle = slice(20, 180)
     before = np.std((shaken.transl - even.transl)[middle])
     after = np.std((smoothed(shaken, radius=2.0).transl - even.transl)[middle])
-    # Of independent noise a Gaussian of standard deviation r leaves 1 / sqrt(2 r sqrt(pi)).
-    assert after / before == pytest.approx(1 / np.sqrt(4.0 * np.sqrt(np.pi)), rel=0.2)
+    # Of independent noise these weights leave 27 / 16 of a Gaussian's 1 / (2 r sqrt(pi)) of the variance.
+    assert after / before == pytest.approx(np.sqrt(27 / 16 / (4.0 * np.sqrt(np.pi))), rel=0.2)
     turned = angles(smoothed(shaken, radius=2.0), even)[middle].mean() / angles(shaken, even)[middle].mean()
     assert turned == pytest.approx(after / before, rel=0.25)
+
+
+def test_smoothing_leaves_the_bends_of_a_motion():
+    t = np.arange(60) / 20.0
+    bends = replace(motion(60), transl=np.stack([0.1 * np.sin(4 * t), 0 * t, 0 * t], axis=1))
+    off = np.abs(smoothed(bends, radius=2.0).transl - bends.transl)[10:-10].max()
+    # A Gaussian of these two frames would leave a wave exp(-0.5 (4 / 10)^2) of its height, 7.7 mm less.
+    assert off < 0.0006
 
 
 def test_smoothing_does_not_see_where_motion_takes_place():
@@ -140,17 +148,23 @@ def test_a_smoother_starts_with_the_first_pose_and_after_a_restart_again():
     assert smoother(shaken.frame(2), 1 / 30).transl.tolist() == shaken.transl[2:].tolist()
 
 
+def finer(params: BodyParams, times: int) -> BodyParams:
+    """The motion with `times` as many steps."""
+    count = len(params)
+    return resampled(params, np.arange(float(count)), np.arange((count - 1) * times + 1) / times)
+
+
 @pytest.mark.parametrize("times", [2, 5])
 def test_poses_in_between_pass_through_those_given_and_go_evenly_where_they_do(times):
     for params in (motion(8), motion(8, seed=1, degrees=20.0)):
-        fine = upsampled(params, times)
+        fine = finer(params, times)
         assert len(fine) == 7 * times + 1
         assert angles(fine.select(slice(None, None, times)), params).max() < 1e-6
         np.testing.assert_allclose(fine.transl[::times], params.transl, atol=1e-12)
         # No jump: at an end of a step poses lie as near to each other as within it.
         steps = np.linalg.norm(np.diff(fine.transl, axis=0), axis=1)
         assert steps.max() < 4 * np.median(steps) + 1e-9
-    even = upsampled(motion(8), times)
+    even = finer(motion(8), times)
     np.testing.assert_allclose(
         np.diff(even.transl, axis=0), 1 / times * np.tile([0.1, 0, 0.05], (7 * times, 1)), atol=1e-9
     )
@@ -158,12 +172,23 @@ def test_poses_in_between_pass_through_those_given_and_go_evenly_where_they_do(t
     np.testing.assert_allclose(turns[:, 0], 0.25 / times, atol=1e-6)
 
 
-def test_poses_in_between_of_nothing_to_divide_are_what_was_given():
+def test_poses_in_between_of_uneven_times_go_evenly_where_the_motion_does():
+    kept = np.array([0, 1, 3, 4, 6, 9])
+    found = resampled(motion(10).select(kept), 0.1 * kept, 0.1 * np.arange(10))
+    np.testing.assert_allclose(found.transl, motion(10).transl, atol=1e-9)
+    assert angles(found, motion(10)).max() < 1e-6
+
+
+def test_a_single_pose_stays_and_times_that_cannot_be_are_refused():
     shaken = motion(5, seed=1)
-    assert upsampled(shaken, 1) is shaken
-    assert len(upsampled(shaken.frame(0), 4)) == 1
-    with pytest.raises(InputError, match="poses a step"):
-        upsampled(shaken, 0)
+    alone = resampled(shaken.frame(0), np.zeros(1), np.zeros(3))
+    np.testing.assert_array_equal(alone.transl, np.repeat(shaken.transl[:1], 3, axis=0))
+    for times in (np.array([0.0, 1.0, 1.0, 2.0, 3.0]), np.arange(4.0), np.full(5, np.nan)):
+        with pytest.raises(InputError, match="times of a motion"):
+            resampled(shaken, times, np.zeros(1))
+    for wanted in (-0.1, 4.1, np.nan):
+        with pytest.raises(InputError, match="poses in between"):
+            resampled(shaken, np.arange(5.0), np.array([wanted]))
 
 
 def test_poses_in_between_are_near_the_curve_that_was_sampled():
@@ -178,7 +203,7 @@ def test_poses_in_between_are_near_the_curve_that_was_sampled():
             pose, betas=np.zeros((count, 2)), expression=np.zeros((count, 2)), transl=transl
         )
 
-    fine, truth = upsampled(curve(t), 4), curve(np.arange(45) / 40.0)
+    fine, truth = finer(curve(t), 4), curve(np.arange(45) / 40.0)
     inner = slice(4, -4)
     assert np.abs(fine.transl - truth.transl)[inner].max() < 0.001
     assert angles(fine, truth)[inner].max() < np.radians(0.4)

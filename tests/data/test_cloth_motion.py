@@ -123,6 +123,33 @@ def test_every_second_number_is_half_the_frames_a_second():
     np.testing.assert_array_equal(skipping.shape(40).displacements, plain.shape(20).displacements)
 
 
+def test_uneven_frames_give_about_the_same_motion():
+    """Two frames of three, as a camera gives them that drops every third."""
+    made = motions(smoothing=0.03)
+    left = [frame for frame in range(60) if frame % 3 != 2]
+    config = ClothMotionConfig(smoothing=0.03, pre_roll=0.2, driver=QUICK)
+    uneven = ClothMotions(person(), [garment()], params=pose, frames=left, fps=FPS, config=config)
+    made.simulate(range(58))
+    uneven.simulate(left)
+    off = [apart(uneven.shape(frame), made.shape(frame)) for frame in left[:-2]]
+    moved = [apart(made.shape(0), made.shape(frame)) for frame in left[:-2]]
+    assert max(moved) > 0.015 and np.mean(off) < 0.1 * np.mean(moved), (off, moved)
+
+
+def test_uneven_frames_are_smoothed_by_their_times():
+    """A tracker's shaking goes out of the cloth where frames are missing as where none are."""
+    shakes = {}
+    left = [frame for frame in range(60) if frame % 3 != 2]
+    for smoothing in (0.0, 0.05):
+        config = ClothMotionConfig(smoothing=smoothing, pre_roll=0.2, driver=QUICK)
+        uneven = ClothMotions(person(), [garment()], params=shaken, frames=left, fps=FPS, config=config)
+        uneven.simulate(left)
+        free = uneven.shape(0).vertices[uneven.shape(0).share == 1]
+        places = [in_the_world(uneven.shape(frame), shaken(frame))[free] for frame in left[8:-8]]
+        shakes[smoothing] = np.abs(np.diff(places, n=2, axis=0)).mean()
+    assert shakes[0.05] < 0.6 * shakes[0.0]
+
+
 def test_frames_and_numbers_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="frames to simulate"):
         motions().simulate([59, 60])
