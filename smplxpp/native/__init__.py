@@ -19,7 +19,7 @@ from typing import Any
 LEVELS = ("avx512", "avx2", "generic")
 """Builds of the library, the best first."""
 
-INTERFACE = 7
+INTERFACE = 8
 """What `smplxpp_interface` of a library that fits these sources answers."""
 MOST_THREADS = min(256, max(16, 4 * (os.cpu_count() or 1)))
 """More threads than this are not started, whatever was asked for."""

@@ -287,10 +287,22 @@ def test_metadata_of_another_kind_is_refused_before_anything_is_made(kind, wrong
 def test_metadata_that_lacks_an_entry_is_refused(kind, rig, tmp_path):
     save_avatar(tmp_path / "good", make(kind, rig))
     about, tensors = content(tmp_path / "good")
-    for name in set(about) - {"null_code_shown", "still_body"}:  # older files lack these
+    for name in set(about) - {"null_code_shown", "still_body", "track_tells"}:  # older files lack these
         lacking = {other: value for other, value in about.items() if other != name}
         with pytest.raises(InputError, match=name if name != "topology" else "this template"):
             load_avatar(written(tmp_path / "bad", lacking, tensors), rig)
+
+
+def test_a_track_says_what_it_tells_of_its_errors_or_tells_nothing(rig, tmp_path):
+    save_avatar(tmp_path / "good", make("tracked", rig))
+    about, tensors = content(tmp_path / "good")
+    older = {name: value for name, value in about.items() if name != "track_tells"}
+    with pytest.raises(InputError, match="received track_drift, track_sigma"):
+        load_avatar(written(tmp_path / "bad", older, tensors), rig)
+    kept = {name: tensor for name, tensor in tensors.items() if name not in ("track_drift", "track_sigma")}
+    with pytest.raises(InputError, match="track_"):
+        load_avatar(written(tmp_path / "bad", about, kept), rig)
+    assert load_avatar(written(tmp_path / "older", older, kept), rig).state_dict().keys() == kept.keys()
 
 
 def test_damaged_bytes_give_a_model_or_words(rig, tmp_path):
