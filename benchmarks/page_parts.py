@@ -107,6 +107,12 @@ PARTS = (
         WOMAN + EVERY_FRAME + RECIPE,
         training_lines,
     ),
+    Part(
+        "training_woman_casual_paper-small_times_3",
+        "The paper's own recipe on the same woman, three times as long",
+        WOMAN + EVERY_FRAME + RECIPE + " Here they are about twice what the process alone would take.",
+        training_lines,
+    ),
     Part("training_person_demo", "Training of `make demo`", PERSON, training_lines),
     Part(
         "cloth_from_pose_woman_casual",
