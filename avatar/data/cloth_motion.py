@@ -28,7 +28,7 @@ class ClothMotionConfig:
 
     Attributes:
         pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
-        smoothing: radius in time of the weights with which the motion that drives the clothes is smoothed (`smoothed`),
+        smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
             seconds; trackers shake waistbands. The body that is drawn is not smoothed; the cloth hangs beside it where
             the smoothed motion has brought it, so that it does not shake along.
         mode: "simulate", or "skin": the clothes stay where skinning has them.
@@ -36,7 +36,7 @@ class ClothMotionConfig:
     """
 
     pre_roll: float = 0.7
-    smoothing: float = 0.1
+    smoothing: float = 0.03
     mode: Literal["simulate", "skin"] = "simulate"
     driver: DriverConfig = field(default_factory=DriverConfig)
 

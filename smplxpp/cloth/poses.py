@@ -41,21 +41,17 @@ def reference_facing_as(reference: BodyParams, params: BodyParams) -> BodyParams
 
 
 def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
-    """Smooth a motion in time, every joint about its own rotation; what a noisy tracker shakes.
-
-    Weights are `(3 - u^2) / 2 exp(-u^2 / 2)` at `u` radii: the Gaussian kernel of fourth order (Wand and Schucany
-    1990), which has no second moment and so leaves the bends of a motion that a Gaussian as steady would cut.
+    """Smooth a motion in time with Gaussian weights, every joint about its own rotation; what a noisy tracker shakes.
 
     Args:
-        params: T frames, evenly spaced. radius: of the weights, frames; 0 changes nothing.
+        params: T frames, evenly spaced. radius: standard deviation, frames; 0 changes nothing.
     """
     require_at_least("smoothing of motion", radius, 0.0)
-    count, reach = len(params), int(np.ceil(4.0 * radius))
+    count, reach = len(params), int(np.ceil(3.0 * radius))
     if radius == 0.0 or count < 2:
         return params
     offsets = np.arange(-reach, reach + 1)
-    squared = (offsets / radius) ** 2
-    weights = (3.0 - squared) * np.exp(-0.5 * squared)
+    weights = np.exp(-0.5 * (offsets / radius) ** 2)
     # Beyond its ends a motion goes on as its mirror image about the end's own pose: the ends stay where they are.
     changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
