@@ -123,7 +123,7 @@ def test_a_plain_skirt_is_believed_less_and_least_where_it_is_wrong(tmp_path):
     expected = []
     for frame in frames.train_frames[1:]:
         striped, plain = (found[stripes].expected_error(frame)[skirt] for stripes in (STRIPED, PLAIN))
-        assert plain.mean() > 1.1 * striped.mean()
+        assert plain.mean() > 1.2 * striped.mean()
         expected.append(plain)
         truth = torch.tensor(moved()[frame], dtype=torch.float32)
         wrong.append((found[PLAIN].displacements(frame) - truth)[skirt].norm(dim=-1))
