@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.animate_student import open_student, student_file
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
 from pipelines.commands.talking_person import person_of_bundle
 from smplxpp.core.errors import MissingExtraError
 from smplxpp.core.files.paths import read_bytes
@@ -21,9 +21,6 @@ from smplxpp.core.validation import require_at_least, require_between
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
     from pipelines.chat.conversation import Cast, Partner, Turn
-
-_LARGEST_PORT = 65535
-_MOST_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -55,11 +52,11 @@ class Chat:
 
     def run(self) -> dict[str, Any]:
         """Find every part, say which they are; then serve."""
-        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_between("option port", self.port, 1, LARGEST_PORT)
         require_at_least("seed", self.seed, 0)
         partner = self.partner()
         with student_file(self.source) as path:
-            bundle, data = open_student(path), read_bytes(path, subject="avatar", most=_MOST_BYTES)
+            bundle, data = open_student(path), read_bytes(path, subject="avatar", most=MOST_AVATAR_BYTES)
         cast = self.cast(bundle, partner)
         console = Console(stderr=self.json)
         seconds = cast.voice.say("Hello.").sound.seconds  # what is loaded late is there now

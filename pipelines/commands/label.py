@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
+from pipelines.commands.options import LARGEST_PORT
 from smplxpp.core.validation import require_between
 
 if TYPE_CHECKING:
     from pipelines.viewer.window import LabelWindow
-
-_LARGEST_PORT = 65535
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Label:
         from pipelines.viewer.run_scan import open_session
         from pipelines.viewer.window import open_window
 
-        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_between("option port", self.port, 1, LARGEST_PORT)
         window = open_window(open_session(self.run_folder), self.run_folder, host=self.host, port=self.port)
         console = Console(stderr=self.json)
         console.print(f"{window.address}  (Ctrl-C ends it)", highlight=False)

@@ -1,4 +1,4 @@
-"""What commands share: types of options that may be left out, and the check that an optional package is there."""
+"""What commands share: types of options that may be left out, bounds, the check that an optional package is there."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavio
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(optional)")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="(optional)")]
+
+LARGEST_PORT = 65535
+MOST_AVATAR_BYTES = 1 << 30
+"""Of a bundle that is read whole."""
 
 _AVATAR_PACKAGES = ("torch", "safetensors", "threadpoolctl")
 

@@ -12,11 +12,9 @@ from rich.console import Console
 
 from pipelines.commands.label import wait
 from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import OptionalPath, require_avatar
+from pipelines.commands.options import LARGEST_PORT, OptionalPath, require_avatar
 from pipelines.commands.templates import load_run_template
 from smplxpp.core.validation import require_between
-
-_LARGEST_PORT = 65535
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class View:
         from pipelines.viewer.run_session import open_run
         from pipelines.viewer.run_window import open_run_window
 
-        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_between("option port", self.port, 1, LARGEST_PORT)
         require_avatar("the viewer of a run")
         template = load_run_template(self.run_folder)
         session = open_run(

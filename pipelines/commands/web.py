@@ -13,7 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -22,9 +22,6 @@ from smplxpp.core.validation import require_between
 
 if TYPE_CHECKING:
     from pipelines.web.page import PageLight
-
-_LARGEST_PORT = 65535
-_MOST_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class Web:
         return {"written": written, "bundle_bytes": len(bundle)}
 
     def _check(self) -> None:
-        require_between("option port", self.port, 1, _LARGEST_PORT)
+        require_between("option port", self.port, 1, LARGEST_PORT)
         if self.out is None and self.single_file is None and not self.serve:
             raise InputError(
                 "options out, single-file and serve",
@@ -122,7 +119,7 @@ class Web:
                 received=f"{self.source}, which says it already",
                 remedy=f"give it to `smplxpp export RUN --out NAME{SUFFIX}`",
             )
-        data = read_bytes(self.source, subject="avatar", most=_MOST_BYTES)
+        data = read_bytes(self.source, subject="avatar", most=MOST_AVATAR_BYTES)
         return data, load_bundle(self.source).about.name
 
     def _serve(self, files: dict[str, bytes], console: Console) -> None:
