@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 
+from avatar.models.tracked_surface import ControlCage, Track
 from smplxpp.cloth import ClothDriver, Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.calibrate import with_values
 from smplxpp.core.params import BodyParams
@@ -45,12 +45,10 @@ def moved() -> np.ndarray:
     return out
 
 
-def followed(displacements: np.ndarray) -> SimpleNamespace:
-    """A surface as a teacher has followed it through the training frames."""
-    return SimpleNamespace(
-        row={frame: frame for frame in range(NOVEL_POSES[0])},
-        displacements=lambda frame: torch.tensor(displacements[frame]).float(),
-    )
+def followed(displacements: np.ndarray) -> Track:
+    """A surface as a teacher has followed it through the training frames: every vertex a control point."""
+    row = {frame: frame for frame in range(NOVEL_POSES[0])}
+    return Track(row, torch.tensor(displacements[: len(row)]).float(), cast(ControlCage, torch.nn.Identity()))
 
 
 def write_skirted(root: Path, **changes: Any) -> Path:

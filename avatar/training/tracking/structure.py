@@ -49,7 +49,9 @@ def picture_structure(
     with torch.enable_grad():
         seen = Photometer(rig.faces, background, PLAIN_SUMS).evidence(bound, vertices, views, halvings=halvings)
         table = torch.zeros(avatar.cage.count, 10, device=controls.device, requires_grad=True)
-        spread = on_triangles(avatar.cage(table)[rig.faces[bound.face_index]], bound.barycentric)
+        # Not `[...]`: its backward pass adds up in the order that threads happen to come.
+        corners = avatar.cage(table).index_select(0, rig.faces[bound.face_index].flatten()).view(-1, 3, 10)
+        spread = on_triangles(corners, bound.barycentric)
     here, rest = (triangle_frames(x, rig.faces).rotations[bound.face_index] for x in (vertices, rig.vertices))
     turned = here @ rest.transpose(1, 2)
     tensors = turned.transpose(1, 2) @ seen.curvature @ turned
