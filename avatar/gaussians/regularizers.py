@@ -8,6 +8,7 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.frames import TriangleFrames
+from avatar.gaussians.gather import gather_rows
 
 MAX_SCALE = 0.6
 """Mean edge lengths; larger standard deviations are penalised."""
@@ -25,4 +26,5 @@ def scale_penalty(bound: BoundGaussians) -> Float[Tensor, ""]:
 def offset_penalty(bound: BoundGaussians, frames: TriangleFrames) -> Float[Tensor, ""]:
     """Return 0.01 times the mean of `relu(|du + gamma [1, 0, 0]| / e - 1)`; offsets are metres, the bound an edge."""
     total = torch.cat([bound.offset[:, :1] + bound.normal_offset[:, None], bound.offset[:, 1:]], 1)
-    return OFFSET_WEIGHT * torch.relu(total.norm(dim=-1) / frames.lengths[bound.face_index] - MAX_OFFSET).mean()
+    lengths = gather_rows(frames.lengths, bound.face_index)
+    return OFFSET_WEIGHT * torch.relu(total.norm(dim=-1) / lengths - MAX_OFFSET).mean()

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
+from avatar.gaussians.gather import gather_rows
 from avatar.gaussians.native_kernels import is_native
 from avatar.render.barycentrics import barycentrics_reference, interpolate_reference
 from avatar.render.native_maps import BarycentricFunction, InterpolateFunction
@@ -127,7 +128,7 @@ def front_back_maps(
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """Return unit normals, faces weighted by their area; zero at a vertex without any. Differentiable."""
-    a, b, c = vertices[faces].unbind(1)
+    a, b, c = gather_rows(vertices, faces).unbind(1)
     cross = torch.cross(b - a, c - a, dim=-1)
     total = torch.zeros_like(vertices).index_add(0, faces.flatten(), cross.repeat_interleave(3, dim=0))
     return torch.nn.functional.normalize(total, dim=-1, eps=_tiny(vertices))

@@ -11,6 +11,7 @@ from torch import Tensor
 from avatar.data.views import View
 from avatar.gaussians.binding import on_triangles
 from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.gather import gather_rows
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.rig.rig import Motion
 from avatar.training.refinement.config import RefineConfig
@@ -49,9 +50,7 @@ def picture_structure(
     with torch.enable_grad():
         seen = Photometer(rig.faces, background, PLAIN_SUMS).evidence(bound, vertices, views, halvings=halvings)
         table = torch.zeros(avatar.cage.count, 10, device=controls.device, requires_grad=True)
-        # Not `[...]`: its backward pass adds up in the order that threads happen to come.
-        corners = avatar.cage(table).index_select(0, rig.faces[bound.face_index].flatten()).view(-1, 3, 10)
-        spread = on_triangles(corners, bound.barycentric)
+        spread = on_triangles(gather_rows(avatar.cage(table), rig.faces[bound.face_index]), bound.barycentric)
     here, rest = (triangle_frames(x, rig.faces).rotations[bound.face_index] for x in (vertices, rig.vertices))
     turned = here @ rest.transpose(1, 2)
     tensors = turned.transpose(1, 2) @ seen.curvature @ turned
