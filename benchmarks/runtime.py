@@ -58,19 +58,22 @@ class RuntimeBenchmark:
 
     def run(self) -> None:
         """Print and store the figures."""
-        template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
-        rig = Rig(template)
-        trained = load_avatar(self.run_folder / "90_compensate" / "student.safetensors", rig)
-        assert isinstance(trained, Student)
-        students = {f"trained, {len(trained.gaussians)}": trained}
-        students |= {f"sampled, {count}": sampled(trained, count) for count in SAMPLED}
         figures: dict[str, object] = {}
-        for name, student in students.items():
+        for name, student in students_of(self.run_folder).items():
             for way, parts in compare(student, self.repeats).items():
                 figures[f"{name} Gaussians, {way}"] = parts
         print(json.dumps(figures, indent=1))
         if self.store:
             store_results("runtime", f"python -m benchmarks.runtime --run {self.run_folder.name}", figures)
+
+
+def students_of(run_folder: Path) -> dict[str, Student]:
+    """Return a run's student, then students of its sizes with other numbers of Gaussians, by name."""
+    rig = Rig(Template.load(run_folder / "60_assemble" / "smplxpp.npz"))
+    trained = load_avatar(run_folder / "90_compensate" / "student.safetensors", rig)
+    assert isinstance(trained, Student)
+    students = {f"trained, {len(trained.gaussians)}": trained}
+    return students | {f"sampled, {count}": sampled(trained, count) for count in SAMPLED}
 
 
 def sampled(like: Student, count: int) -> Student:

@@ -23,19 +23,15 @@ from typing import Annotated, Any
 import tyro
 
 from avatar.export.bundle import BundleExtras, write_bundle
-from avatar.models.model_file import load_avatar
-from avatar.models.student import Student
-from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
 from benchmarks.machine import store_results
-from benchmarks.runtime import SAMPLED, from_the_front, poses_of, sampled
+from benchmarks.runtime import from_the_front, poses_of, students_of
 from pipelines.web.page import PageLight, single_page
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.camera import Camera
 from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.panoramas import STUDIO, panoramas
 from smplxpp.core.params import BodyParams
-from smplxpp.template.template import Template
 from tests.web.chromium import Page, find_chromium
 
 WEB = Path(__file__).resolve().parents[1] / "web"
@@ -110,16 +106,14 @@ class WebPlayerBenchmark:
 
     def run(self) -> None:
         """Print and store the figures."""
-        template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
-        trained = load_avatar(self.run_folder / "90_compensate" / "student.safetensors", Rig(template))
-        assert isinstance(trained, Student)
+        students = students_of(self.run_folder)
+        trained = next(iter(students.values()))
+        template = trained.rig.template
         loose = self.run_folder / "83_cloth" / "garments.npz"
         garments = load_garments(loose, template) if loose.exists() else []
         subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
         ways = {"WebAssembly": WEB / "build" / "modules.mjs"}
         ways |= {} if self.before is None else {"TypeScript": self.before.resolve()}
-        students = {f"trained, {len(trained.gaussians)}": trained}
-        students |= {f"sampled, {count}": sampled(trained, count) for count in SAMPLED}
         figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             for name, student in students.items():

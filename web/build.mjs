@@ -17,20 +17,24 @@ function digestOfSources() {
   return sha256(lines.join(""));
 }
 
+/** A script of its own, as text that others carry. */
+async function scriptOf(source, define = {}) {
+  const built = await build({ ...shared, ...files, entryPoints: [here(source)], format: "iife", write: false, define });
+  return JSON.stringify(built.outputFiles[0].text);
+}
+
+const define = { HELPER_SOURCE: await scriptOf("src/native/helper.ts") };
 if (process.argv.includes("--tests")) {
   await build({
     entryPoints: [here("test/modules.ts")], outfile: here("build/modules.mjs"), bundle: true, format: "esm",
-    target: "es2022", platform: "neutral", ...files,
+    target: "es2022", platform: "neutral", define, ...files,
   });
 } else {
   const outfile = process.argv[2] ?? here("../pipelines/web/assets/player.js");
-  const worker = await build({
-    ...shared, ...files, entryPoints: [here("src/worker/worker.ts")], format: "iife", write: false,
-  });
   const licence = `/* smplxpp player, Apache-2.0; web/ of the project has its sources ${digestOfSources()} */`;
   await build({
     ...shared, ...files, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
-    define: { WORKER_SOURCE: JSON.stringify(worker.outputFiles[0].text) },
+    define: { WORKER_SOURCE: await scriptOf("src/worker/worker.ts", define) },
   });
   console.log(`${outfile}: ${readFileSync(outfile).length} bytes`);
 }

@@ -12,16 +12,18 @@ const ZIG_VERSION = "0.17.1";
 const native = fileURLToPath(new URL("../smplxpp/native/", import.meta.url));
 /** As CMakeLists.txt has them: what must be the same on every machine, what may be reassociated, what has vectors. */
 const KINDS = [
-  { flags: ["-ffp-contract=off"], sources: ["cloth/xpbd.cpp", "cloth/carried.cpp", "web/memory.cpp"] },
+  { flags: ["-ffp-contract=off"], sources: ["cloth/xpbd.cpp", "cloth/carried.cpp", "web/memory.cpp", "web/threads.cpp"] },
   { flags: ["-ffast-math"], sources: ["runtime/surface.cpp", "runtime/gaussians.cpp", "web/splats.cpp"] },
   { flags: ["-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"], sources: ["runtime/pose.cpp", "runtime/field.cpp", "web/normals.cpp"] },
 ];
+/** What memory that threads share asks of every file, the compiler's own library among them. */
+const THREADS = ["-matomics", "-mbulk-memory"];
 const TARGET = [
-  "-target", "wasm32-wasi", "-std=c++17", "-O3", "-msimd128", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden",
+  "-target", "wasm32-wasi", "-std=c++17", "-O3", "-msimd128", ...THREADS, "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden",
   "-Wall", "-Wextra", "-Werror", "-D_LIBCPP_VERBOSE_ABORT(...)=__builtin_trap()", "-I", ".",
 ];
-/** The field's kernel has its layers on the stack. */
-const STACK = 1 << 18;
+/** Bytes: the field's kernel has its layers on the stack. Memory comes from the page, src/native/memory.ts has its pages. */
+const STACK = 1 << 18, PAGE = 1 << 16, FIRST = 16 * PAGE, MOST = 65535 * PAGE;
 
 const zig = process.env.ZIG ? [process.env.ZIG] : [process.env.PYTHON ?? "python3", "-m", "ziglang"];
 const run = (...options) => execFileSync(zig[0], [...zig.slice(1), ...options], { cwd: native, encoding: "utf8" });
@@ -62,7 +64,9 @@ try {
     for (const source of sources) run("c++", ...TARGET, ...flags, "-c", source, "-o", join(folder, `${source.replace("/", "_")}.o`));
   }
   const objects = readdirSync(folder).sort().map((name) => join(folder, name)), linked = join(folder, "kernels.wasm");
-  run("c++", "-target", "wasm32-wasi", "-mexec-model=reactor", "-s", ...objects, "-o", linked, "-Wl,-z,stack-size=" + STACK,
+  run("c++", "-target", "wasm32-wasi", "-mexec-model=reactor", ...THREADS, "-s", ...objects, "-o", linked,
+    `-Wl,-z,stack-size=${STACK},--import-memory,--shared-memory,--initial-memory=${FIRST},--max-memory=${MOST}`,
+    "-Wl,--export=__stack_pointer",
     ...exported().map((name) => `-Wl,--export=${name}`));
   const sha256 = (data) => createHash("sha256").update(data).digest("hex");
   const lines = sources().map((name) => `${name} ${sha256(readFileSync(join(native, name)))}\n`);

@@ -28,26 +28,12 @@ from tests.web.avatars import (
     camera,
     decibels,
     drawn,
-    write_avatar,
     write_dressed,
 )
 from tests.web.chromium import Page, find_chromium
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
 RENDERERS = {"webgpu": "WebGPU", "webgl2": "WebGL2"}
-
-
-@pytest.fixture(scope="module")
-def avatar(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("avatar") / "doll.avatar"
-    write_avatar(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory) -> Iterator[Page]:
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        yield page
 
 
 @pytest.fixture(scope="module", params=RENDERERS)

@@ -7,7 +7,7 @@ import { LONGEST_FOLLOWED } from "./cloth/driver.ts";
 import { matrices, type Light } from "./light/irradiance.ts";
 import { orbitCamera, type Camera, type Orbit } from "./render/camera.ts";
 import type { Renderer } from "./render/renderer.ts";
-import type { Reply, Request, Summary } from "./worker/protocol.ts";
+import type { Reply, Request, Summary, Threads } from "./worker/protocol.ts";
 
 declare const WORKER_SOURCE: string;
 
@@ -68,6 +68,7 @@ export class Player {
   /** How many have been drawn. */
   pictures = 0;
   readonly rates: Rates = { fps: 0, deform: 0, cloth: 0, sort: 0, draw: null };
+  threads: Threads = { count: 1, helped: 0, lost: null };
   /** Loose clothes are simulated. */
   simulating = true;
   /** Another light than the capture's, and whether the avatar is shown in it; null: there is none. */
@@ -241,6 +242,7 @@ export class Player {
     // What leaves out the hidden, where the GPU sorts, is told by the GPU's own time.
     rates.sort = this.renderer.sorting ?? mean(rates.sort, frame.sort);
     rates.draw = this.renderer.milliseconds;
+    this.threads = frame.threads;
     ++this.pictures;
     this.onpicture();
   }

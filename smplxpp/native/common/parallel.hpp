@@ -1,12 +1,16 @@
-// Running a function on several threads; in WebAssembly, which is built without any, on the caller's.
+// Running a function on several threads; in WebAssembly on the workers that a page has (web/threads.cpp), where work may
+// not allocate: its malloc is of one thread.
 #pragma once
 #if defined(__wasm__)
+#include <type_traits>
 
 namespace smplxpp {
 
+void deal_slices(int slices, void (*run)(void* work, int slice), void* work);
+
 template <class Work>
 void run_threads(int threads, Work&& work) {
-    for (int t = 0; t < threads; ++t) work(t);
+    deal_slices(threads, [](void* own, int slice) { (*(std::remove_reference_t<Work>*)own)(slice); }, &work);
 }
 
 }  // namespace smplxpp

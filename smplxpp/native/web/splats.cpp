@@ -6,6 +6,7 @@
 #include <cstring>
 #include <vector>
 
+#include "common/parallel.hpp"
 #include "common/status.hpp"
 #include "gaussians/harmonics.hpp"
 
@@ -53,10 +54,11 @@ float folded(Vec n) {
     return 4096.0f * (std::round(HALF * u) + HALF + 1.0f) + std::round(HALF * v) + HALF + 1.0f;
 }
 
+// Those of the Gaussians from `i` to `end`.
 template <int K>
-void write(const Splats& in, Vec eye, const float* normals, float* out) {
+void write(const Splats& in, Vec eye, const float* normals, int64_t i, int64_t end, float* all) {
     [[maybe_unused]] float basis[15];
-    for (int64_t i = 0; i < in.count; ++i, out += RECORD) {
+    for (float* out = all + RECORD * i; i < end; ++i, out += RECORD) {
         const Vec mean = load(in.means + 3 * i);
         Vec color = load(in.dc + 3 * i);
         if constexpr (K > 0) {
@@ -79,22 +81,29 @@ void write(const Splats& in, Vec eye, const float* normals, float* out) {
 }  // namespace
 
 // Centre, opacity, covariance, colour and normal of `rows` Gaussians in an order, as an eye (3, metres) sees them: records
-// (rows, 14). normals (N, 3) or null: nobody asks for them.
+// (rows, 14). normals (N, 3) or null: nobody asks for them. scratch (N, 14).
 SMPLXPP_EXPORT int32_t smplxpp_web_records(const Splats* in, const float* eye, const float* normals, const uint32_t* order, int64_t rows,
-                                           float* records) {
+                                           float* scratch, float* records, int32_t threads) {
     return smplxpp::guarded([&] {
         smplxpp::check_indices(order, rows, in->count);
-        // All of them as they lie in memory, then into the order: one jump in memory for each instead of eight.
-        std::vector<float> all(RECORD * in->count);
         const Vec from = load(eye);
-        switch (in->harmonics) {
-            case 0: write<0>(*in, from, normals, all.data()); break;
-            case 3: write<3>(*in, from, normals, all.data()); break;
-            case 8: write<8>(*in, from, normals, all.data()); break;
-            case 15: write<15>(*in, from, normals, all.data()); break;
-            default: smplxpp::throw_out_of_range("harmonics");
-        }
-        for (int64_t r = 0; r < rows; ++r) std::memcpy(records + RECORD * r, all.data() + RECORD * order[r], RECORD * sizeof(float));
+        const auto writer = [&]() -> decltype(&write<0>) {
+            switch (in->harmonics) {
+                case 0: return write<0>;
+                case 3: return write<3>;
+                case 8: return write<8>;
+                case 15: return write<15>;
+                default: smplxpp::throw_out_of_range("harmonics");
+            }
+        }();
+        // All of them as they lie in memory, then into the order: one jump in memory for each instead of eight.
+        smplxpp::run_threads(threads, [&](int t) {
+            writer(*in, from, normals, in->count * t / threads, in->count * (t + 1) / threads, scratch);
+        });
+        smplxpp::run_threads(threads, [&](int t) {
+            for (int64_t r = rows * t / threads, end = rows * (t + 1) / threads; r < end; ++r)
+                std::memcpy(records + RECORD * r, scratch + RECORD * order[r], RECORD * sizeof(float));
+        });
     });
 }
 

@@ -52,7 +52,7 @@ export class BlendAdder {
         view[NUMBERS * k + c] = share * coefficients[k] * (step ? step[NUMBERS * (k % side.shapes) + c] : 1);
       }
     }
-    this.native.run("runtime_blend", shapes, scaled, keep, this.added, 1);
+    this.native.run("runtime_blend", shapes, scaled, keep, this.added, this.native.slices);
   }
 
   private side(side: BlendSide): Side {

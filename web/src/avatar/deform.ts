@@ -29,7 +29,6 @@ interface Basis {
 
 /** Poses an avatar; holds the working memory. */
 export class Deformer {
-  readonly native = new Native();
   /** Milliseconds of the last pose by part. */
   readonly milliseconds: Record<(typeof PARTS)[number], number> = { pose: 0, field: 0, blend: 0, world: 0 };
   /** (J, 3, 4) of the last pose: the posed body from the T-pose. */
@@ -53,12 +52,13 @@ export class Deformer {
     range: Block<Float32Array>; count: Block<Int32Array>;
   };
   private readonly eye: Block<Float32Array>;
+  private readonly scratch: Block<Float32Array>;
   private readonly records: Block<Float32Array>;
   /** What normals are made of and written to; null: they were never asked for. */
   private shading: Record<"first" | "faces" | "barycentric" | "corners" | "normals", Block<Float32Array | Int32Array>> | null = null;
 
-  constructor(readonly avatar: Avatar, private readonly clock = () => performance.now()) {
-    const { native } = this, { mesh, skeleton, gaussians: g, field } = avatar;
+  constructor(readonly avatar: Avatar, private readonly clock = () => performance.now(), readonly native = new Native()) {
+    const { mesh, skeleton, gaussians: g, field } = avatar;
     const J = skeleton.parents.length, V = mesh.vertices.length / 3, F = mesh.faces.length / 3, N = g.count;
     this.skeleton = {
       parents: native.keep(skeleton.parents), turns: native.room(Float64Array, 3 * J), rest: native.room(Float64Array, 3 * J),
@@ -97,6 +97,7 @@ export class Deformer {
       range: native.floats(2), count: native.room(Int32Array, 1),
     };
     this.eye = native.floats(3);
+    this.scratch = native.floats(RECORD * N);
     this.records = native.floats(RECORD * N);
   }
 
@@ -141,9 +142,9 @@ export class Deformer {
     blend?.pose(pose, theta, cloth && cloth.keep);
     lap();
     native.run("runtime_surface", this.surface, rest, field && field.moved, cloth && cloth.displacements, cloth && cloth.share,
-      transforms, posed, 1);
+      transforms, posed, native.slices);
     native.run("runtime_world", this.bound, posed, blend && blend.added, world.means, world.quats, world.scales, world.colors,
-      world.rotations, 1);
+      world.rotations, native.slices);
     lap();
     PARTS.forEach((part, k) => (this.milliseconds[part] = times[k + 1] - times[k]));
   }
@@ -174,7 +175,8 @@ export class Deformer {
    */
   recordsFor(eye: ArrayLike<number>, count: number, lit = false): Float32Array {
     this.eye.view.set(eye);
-    this.native.run("web_records", this.splats, this.eye, lit ? this.normals() : null, this.sorting.order, BigInt(count), this.records);
+    const { native, splats, sorting, scratch, records } = this;
+    native.run("web_records", splats, this.eye, lit ? this.normals() : null, sorting.order, BigInt(count), scratch, records, native.slices);
     return this.records.view.subarray(0, RECORD * count);
   }
 

@@ -40,7 +40,7 @@ export class FieldEvaluator {
     }
     for (const { network, member, at } of this.networks) {
       if (!member.count) continue;
-      native.run("runtime_field", network, BigInt(sets), this.frames, member, at, BigInt(moved.count / 3), moved, 1);
+      native.run("runtime_field", network, BigInt(sets), this.frames, member, at, BigInt(moved.count / 3), moved, native.slices);
     }
   }
 

@@ -192,11 +192,13 @@ export class App {
     if (now - this.lastRates < RATES_EVERY) return;
     this.lastRates = now;
     const { fps, deform, cloth, sort, draw } = player.rates;
-    const parts = [`pose ${deform.toFixed(1)}`];
+    const { count, lost } = player.threads, shared = lost ? " (1 thread, the others failed)" : count > 1 ? ` (${count} threads)` : "";
+    const parts = [`pose ${deform.toFixed(1)}${shared}`];
     if (player.summary!.garments.length && player.simulating) parts.push(`cloth ${cloth.toFixed(1)}`);
     if (!player.renderer.sorts || player.renderer.sorting !== null) parts.push(`sort ${sort.toFixed(1)}`);
     if (draw !== null) parts.push(`draw ${draw.toFixed(1)}`);
     const size = `${(player.summary!.bytes / 1e6).toFixed(1)} MB`;
+    this.rates.title = lost ?? "";
     this.rates.replaceChildren(element("b", {}, `${fps.toFixed(fps < 10 ? 1 : 0)} fps`),
       ` · ${parts.join(" · ")} ms · ${player.renderer.name} · ${size}`);
   }

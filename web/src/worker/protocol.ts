@@ -40,6 +40,15 @@ export interface Summary {
   reach: number;
 }
 
+/** Threads that share a pose. */
+export interface Threads {
+  count: number;
+  /** Slices of the work that others than the worker itself have done. */
+  helped: number;
+  /** Why there are no others any more; null: they were never lost. */
+  lost: string | null;
+}
+
 /** From the worker. */
 export type Reply =
   | { kind: "opened"; summary: Summary }
@@ -50,5 +59,6 @@ export type Reply =
       deform: number; cloth: number; sort: number;
       /** Of the fastest particle of the clothes, metres a second. */
       speed: number;
+      threads: Threads;
     }
   | { kind: "failed"; message: string };

@@ -6,6 +6,7 @@ import { poseAt, restPose } from "../avatar/motion.ts";
 import { ClothDriver } from "../cloth/driver.ts";
 import { BundleError } from "../bundle/errors.ts";
 import { readBundle } from "../bundle/read.ts";
+import { Native } from "../native/memory.ts";
 import { eye, NEAR } from "../render/camera.ts";
 import type { Reply, Request, Summary } from "./protocol.ts";
 
@@ -15,6 +16,11 @@ const thread = self as unknown as {
   postMessage(message: Reply, moved: Transferable[]): void;
 };
 
+/** Threads that share a pose where the page may share memory; more would wait for what one of them does by itself. */
+const MOST_THREADS = 4;
+let threads = self.crossOriginIsolated ? Math.min(MOST_THREADS, navigator.hardwareConcurrency) : 1;
+/** Why there are no others any more; null: they were never lost. */
+let lost: string | null = null;
 let deformer: Deformer | null = null;
 let clothes: ClothDriver | null = null;
 
@@ -30,9 +36,30 @@ thread.onmessage = async (event) => {
 
 async function open(data: ArrayBuffer): Promise<[Reply, Transferable[]]> {
   const avatar = await readBundle(new Uint8Array(data));
-  deformer = new Deformer(avatar);
-  clothes = avatar.garments.length ? new ClothDriver(deformer, avatar.garments) : null;
-  return [{ kind: "opened", summary: summary(avatar, deformer) }, []];
+  return [{ kind: "opened", summary: steadily(avatar, (it) => summary(avatar, it)) }, []];
+}
+
+/** Does some work; should threads that help have failed, in memory of its own and without any, now and from now on. */
+function steadily<T>(avatar: Avatar, work: (deformer: Deformer) => T): T {
+  try {
+    const it = prepared(avatar);
+    if (it.native.lost) throw new Error(it.native.lost);
+    return work(it);
+  } catch (error) {
+    if (threads === 1) throw error;
+    threads = 1;
+    lost = (error as Error).message;
+    return work(prepared(avatar));
+  }
+}
+
+/** What poses an avatar, with as many threads as there are to be. */
+function prepared(avatar: Avatar): Deformer {
+  if (deformer?.avatar === avatar && deformer.native.threads === threads) return deformer;
+  const made = new Deformer(avatar, undefined, new Native(threads));
+  clothes = avatar.garments.length ? new ClothDriver(made, avatar.garments) : null;
+  deformer?.native.close();
+  return (deformer = made);
 }
 
 function summary(avatar: Avatar, first: Deformer): Summary {
@@ -61,6 +88,10 @@ function summary(avatar: Avatar, first: Deformer): Summary {
 
 function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferable[]] {
   if (!deformer) throw new Error("no avatar is open");
+  return steadily(deformer.avatar, (it) => posed(request, it));
+}
+
+function posed(request: Extract<Request, { kind: "frame" }>, deformer: Deformer): [Reply, Transferable[]] {
   const { camera } = request;
   const started = performance.now();
   const simulated = request.seconds === null ? null : clothes;
@@ -76,5 +107,6 @@ function frame(request: Extract<Request, { kind: "frame" }>): [Reply, Transferab
   new Float32Array(records).set(deformer.recordsFor(eye(camera), count, request.lit));
   const packed = performance.now();
   const times = { cloth: moved - started, deform: posed - moved + (packed - sorted), sort: sorted - posed };
-  return [{ kind: "frame", records, count, camera, depths, lit: request.lit, speed: simulated ? simulated.speed : 0, ...times }, [records]];
+  const speed = simulated ? simulated.speed : 0, used = { count: threads, helped: deformer.native.helped, lost };
+  return [{ kind: "frame", records, count, camera, depths, lit: request.lit, speed, threads: used, ...times }, [records]];
 }
