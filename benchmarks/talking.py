@@ -165,11 +165,12 @@ def _viseme(speech: Speech, time: float) -> str:
 
 
 def milliseconds(apart: Sequence[float] | Float[np.ndarray, " N"]) -> dict[str, Any]:
-    """Return bias, mean and 95th percentile of the sizes of some times."""
+    """Return bias, and the sizes' mean, median and 95th percentile, of some times."""
     ms = 1e3 * np.asarray(apart)
     return {
         "bias": round(float(ms.mean())),
         "mean": round(float(np.abs(ms).mean())),
+        "median": round(float(np.median(np.abs(ms)))),
         "p95": round(float(np.percentile(np.abs(ms), 95))),
     }
 

@@ -8,12 +8,17 @@ from typing import Any
 import numpy as np
 
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
+from avatar.speech.rests import find_rests, without_rests
 from avatar.speech.text import EXTRA, checked_text, phones_of, words_of
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.wave_file import Sound
 
 _RATE = 16_000
 _FRAME = 0.01  # seconds
+_WINDOW = 0.025625  # seconds of sound that the recogniser sees for a frame, from the frame's time on
+# A frame stands for the sound about its window's middle: half a frame ahead of it, it begins.
+_OFFSET = 0.5 * (_WINDOW - _FRAME)
+_LEADS = (0.0, 0.1, 0.005)  # seconds of silence put ahead of a sound in which the search lost its way
 _QUIET = 1e-3  # of full scale: nobody speaks
 _LONGEST = 1200.0  # seconds
 _LOUD = 0.1  # root mean square that the recogniser is given
@@ -46,7 +51,8 @@ def align(sound: Sound, text: str | None = None) -> Speech:
     for word in dict.fromkeys(words):
         if decoder.lookup_word(word) is None:
             decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_of(word)[0]), True)
-    found = _aligned(decoder, data, words)
+    tries = (_aligned(decoder, data, words, lead=lead) for lead in _LEADS)
+    found = next((one for one in tries if one is not None), None)
     if found is None:
         raise InputError(
             "sound",
@@ -54,7 +60,7 @@ def align(sound: Sound, text: str | None = None) -> Speech:
             received="something else",
             remedy="give what is said in it as --text" if text is None else "leave --text away: it is recognised then",
         )
-    return Speech(tuple(_clipped(found, seconds)), seconds)
+    return Speech(tuple(without_rests(_clipped(found, seconds), find_rests(sound))), seconds)
 
 
 def _recognised(decoder: Any, data: bytes) -> list[str]:
@@ -77,8 +83,13 @@ def _heard(decoder: Any, data: bytes) -> None:
     decoder.end_utt()
 
 
-def _aligned(decoder: Any, data: bytes, words: list[str]) -> list[Phoneme] | None:
-    """Two passes: the words' times, then those of the phones within; None where they do not fit the sound."""
+def _aligned(decoder: Any, data: bytes, words: list[str], *, lead: float) -> list[Phoneme] | None:
+    """Two passes: the words' times, then those of the phones within; None where they do not fit the sound.
+
+    The search prunes, and now and then loses a sentence that it finds with its frames laid elsewhere: with so many
+    seconds of silence in front.
+    """
+    data = bytes(2 * round(lead * _RATE)) + data
     try:
         decoder.set_align_text(" ".join(words))
         _heard(decoder, data)
@@ -96,7 +107,7 @@ def _aligned(decoder: Any, data: bytes, words: list[str]) -> list[Phoneme] | Non
         stresses = iter(_stresses(word.name.split("(")[0], len(vowels)))
         for phone in phones:
             known = phone.name in VOWELS | CONSONANTS
-            start = phone.start * _FRAME
+            start = phone.start * _FRAME + _OFFSET - lead
             stress = next(stresses) if phone.name in VOWELS else 0
             out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * _FRAME, stress))
     return out
@@ -109,6 +120,6 @@ def _stresses(word: str, count: int) -> list[int]:
 
 
 def _clipped(phonemes: list[Phoneme], seconds: float) -> list[Phoneme]:
-    """Phonemes within the sound: the last frame may end behind it."""
-    held = [replace(one, end=min(one.end, seconds)) for one in phonemes]
+    """Phonemes within the sound: the first and the last frame may leave it."""
+    held = [replace(one, start=max(one.start, 0.0), end=min(one.end, seconds)) for one in phonemes]
     return [one for one in held if one.end > one.start]

@@ -92,14 +92,15 @@ class PiperVoice:
     def _sentence(self, ipa: str, slower: float) -> tuple[np.ndarray, list[Phoneme]]:
         """Samples of a sentence, and its phonemes by the voice's own durations."""
         sounds = _symbols(ipa)
+        owners = _owners([name for _, name in sounds])
         ids, owner = [*self._ids[_BEGIN]], [-1]
         for k, (symbols, _) in enumerate(sounds):
             for symbol in symbols:
                 for one in self._ids.get(symbol, ()):
                     ids += [*self._ids[_PAD], one]
-                    owner += [owner[-1], k]  # a pad lengthens what stands before it
+                    owner += [owners[k]] * 2  # a sound begins with the pad ahead of it
         ids += [*self._ids[_PAD], *self._ids[_END]]
-        owner += [owner[-1], len(sounds)]
+        owner += [len(sounds)] * 2
         scales = np.array([0.0, self._scales[1] * slower, 0.0], np.float32)
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         samples, frames = self._model.run(feed)[:2]
@@ -111,13 +112,24 @@ class PiperVoice:
             if not mine:
                 continue  # symbols that the voice does not have
             start, end = float(ends[mine[0] - 1]), min(float(ends[mine[-1]]), len(samples) / self.rate)
-            if end <= start:
-                continue
-            if name:
+            if name and end > start:
                 out.append(Phoneme(name, start, end, _STRESS.get(symbols[0], 0)))
-            elif out and out[-1].end == start:  # a word's end: no sound of its own
-                out[-1] = replace(out[-1], end=end)
         return samples, out
+
+
+def _owners(names: list[str]) -> list[int]:
+    """Which sound each symbol's time belongs to: a space's to the sound behind it, or to the pause ahead of it.
+
+    A word that begins with a fricative is heard from the start of the space's pad on, one within a word from the start
+    of the pad ahead of it.
+    """
+    out = list(range(len(names)))
+    for k, name in enumerate(names):
+        if not name:
+            paused = k > 0 and names[out[k - 1]] == SILENCE
+            behind = next((j for j in range(k + 1, len(names)) if names[j]), k)
+            out[k] = out[k - 1] if paused else behind
+    return out
 
 
 def _symbols(ipa: str) -> list[tuple[str, str]]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 import wave
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from avatar.speech import articulate
 from avatar.speech.aligner import align
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
 from avatar.speech.text import pronounce
@@ -74,6 +76,38 @@ def test_what_a_voice_said_is_aligned_at_any_rate_and_in_stereo(spoken, recognis
         file.setparams((2, 2, 44_100, len(both), "NONE", ""))
         file.writeframes(both.tobytes())
     assert np.abs(closures(align(read_wave(tmp_path / "b.wav"), TEXT)) - truth).mean() < 0.06
+
+
+@pytest.mark.parametrize("snr", [60.0, 20.0])
+def test_lips_rest_in_a_pause_of_a_recording_with_noise(spoken, recogniser, snr):
+    """A pause of .8 s between two words: no phone lies in it, and what comes behind it is found again."""
+    rate, samples = spoken.sound.rate, spoken.sound.samples
+    words = [k for k, one in enumerate(spoken.speech.spoken) if one.name == "B"]
+    pause = spoken.speech.spoken[words[-2]].start  # ahead of "before"
+    cut = round(pause * rate)
+    whole = np.concatenate([samples[:cut], np.zeros(round(0.8 * rate), np.float32), samples[cut:]])
+    noise = np.random.default_rng(1).normal(size=len(whole)) * np.sqrt(np.mean(samples**2)) * 10.0 ** (-snr / 20.0)
+    found = align(Sound((whole + noise).astype(np.float32), rate), TEXT)
+    times = np.arange(pause + 0.15, pause + 0.45, 0.02)
+    assert articulate(found, times).max() < 0.05
+    truth = closures(spoken.speech)
+    truth[truth > pause] += 0.8
+    assert len(closures(found)) == len(truth) and np.abs(closures(found) - truth).mean() < 0.05
+
+
+def test_a_sound_of_the_voice_begins_with_the_pad_ahead_of_it(spoken):
+    """Pads were given to the sound ahead of them: words began 75 ms behind their sound. Hisses have clear edges."""
+    said = PiperVoice(threads=1).say("She saw a ship, and I see a sofa.")
+    rate = said.sound.rate
+    high = np.abs(np.diff(said.sound.samples, 3)).astype(np.float64)
+    loud = np.convolve(high, np.ones(rate // 100) / (rate // 100), "same")
+    late = []
+    for before, hiss in pairwise(said.speech.spoken):
+        if hiss.name in ("S", "SH") and before.name in VOWELS:
+            within = loud[round((hiss.start - 0.1) * rate) : round(hiss.end * rate)]
+            begins = np.flatnonzero(within[: within.argmax()] < 0.4 * within.max())[-1] / rate - 0.1
+            late.append(-begins)
+    assert len(late) == 4 and np.abs(late).max() < 0.03, late
 
 
 def test_words_are_recognised_and_other_words_refused(spoken, recogniser):
