@@ -21,14 +21,19 @@ KNOWN = 1e-3
 """Metres that the surface is known to where the template was built."""
 
 
-def held_directions(structure: Float[Tensor, "K 3 3"]) -> Float[Tensor, "K 3 3"]:
-    """Return how much of a forecast stands in every direction, `(I + (G / CONTRAST^2)^2)^-2` of the structure G.
+def held_directions(structure: Float[Tensor, "K 3 3"], normals: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3 3"]:
+    """Return how much of a forecast stands in every direction, `P (I + (G / CONTRAST^2)^2)^-2 P` of the structure G.
 
-    1 where nothing else tells, 0 where patterns do.
+    1 where nothing else tells, 0 where patterns do, and 0 across the surface, `P = I - n n^T`: there outlines tell,
+    those of other cameras and of the next moment, and a simulated fold is as wrong as a carried one.
+
+    Args:
+        normals: n, unit, of the surface in the T-pose; 0 where there is none.
     """
     scaled = structure / CONTRAST**2
     share = torch.linalg.inv(_unit(structure) + scaled @ scaled)
-    return share @ share
+    in_plane = _unit(structure) - normals[:, :, None] * normals[:, None, :]
+    return in_plane @ share @ share @ in_plane
 
 
 def expected_distances(

@@ -35,7 +35,7 @@ class TrackConfig:
         smoothness: weight of the mean squared difference of neighbouring control points' displacements from the shape
             that is foreseen, a square metre.
         held: weight of the mean squared distance of simulated clothes from where they were foreseen, a square metre, in
-            the directions in which pictures do not tell: along stripes, and anywhere on plain cloth.
+            the directions along the surface in which pictures do not tell: along stripes, and any on plain cloth.
         body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
             parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
             clothes.

@@ -19,6 +19,7 @@ from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
+from avatar.render.mesh_maps import vertex_normals
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
@@ -100,6 +101,8 @@ class TrackTask(PhotometricTask):
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
         self.structure = torch.zeros(len(frames), avatar.cage.count, 3, 3, device=sequence.device)
         self._unit = torch.eye(3, device=sequence.device)
+        rig = sequence.rig
+        self._normals = vertex_normals(rig.vertices, rig.faces)[avatar.cage.vertices]
         for row in (self.row[frame] for frame in self.ends):
             assert ahead is not None
             self.solved[row], self.structure[row] = ahead.solved[row], ahead.structure[row]
@@ -184,14 +187,14 @@ class TrackTask(PhotometricTask):
         done = {}
         for other in (*self.ends, *self.order[: self.order.index(frame)]):
             row = self.row[other]
-            done[other] = (self.solved[row], self._unit - held_directions(self.structure[row]))
+            done[other] = (self.solved[row], self._unit - held_directions(self.structure[row], self._normals))
         start = self.foresight.start(frame, done) if done else torch.zeros_like(self.avatar.controls)
         own = self.structure[self.row[frame]]
         own.copy_(self._structure(frame, start))
         if not done:
             return Begin(start, start, start, torch.zeros_like(own))
         # What is not simulated has nothing to be held to: plain cloth would stay where it was.
-        held, anchor = self.foresight.share * held_directions(own), self.foresight.anchor(frame, done)
+        held, anchor = self.foresight.share * held_directions(own, self._normals), self.foresight.anchor(frame, done)
         start = start + torch.einsum("kij,kj->ki", held, anchor - start)
         return Begin(start, self.foresight.shape(frame, done), anchor, held)
 

@@ -69,8 +69,15 @@ def structure(frames: AvatarSequence, stripes: float, cameras: tuple[str, ...]) 
 
 def test_what_has_contrast_is_let_go_and_what_has_none_is_held():
     told = torch.diag(torch.tensor([0.0, CONTRAST**2, 100.0 * CONTRAST**2]))[None]
-    held = torch.linalg.eigvalsh(held_directions(told))[0].flip(0)
+    held = held_directions(told, torch.zeros(1, 3))[0].diagonal()
     torch.testing.assert_close(held, torch.tensor([1.0, 0.25, 1e-8]), rtol=1e-3, atol=1e-8)
+
+
+def test_a_point_is_held_along_the_surface_alone():
+    normal = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, -2.0]]), dim=-1)
+    held = held_directions(torch.zeros(1, 3, 3), normal)[0]
+    torch.testing.assert_close(held @ normal[0], torch.zeros(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.eigvalsh(held), torch.tensor([0.0, 1.0, 1.0]), atol=1e-6, rtol=0)
 
 
 def test_what_is_expected_of_points_that_nothing_tells_of_and_of_others():
