@@ -137,17 +137,17 @@ PARTS = (
         "The same, by the skirt's pattern",
         FOLLOWED
         + "Every second training frame, ten a second; the skirt repainted with the help of the truth. Points of "
-        "plain cloth, and of stripes along them, slide where photographs do not show it. Made, as the rows before, "
-        "ahead of `held`: nothing kept what pictures do not tell where it was foreseen.",
+        "plain cloth, and of stripes along them, slide where photographs do not show it.",
     ),
     Part(
         "followed_surface_start_every_2",
-        "The same with what pictures do not tell held to where it was foreseen, and the way back",
+        "The first half second, and the way back",
         FOLLOWED
         + "Every second training frame of the first half second, quarter-size and half-size images alone; the skirt "
         "repainted with the help of the truth. `expected`: the distance from the truth that the tracking tells of "
         "itself, mm, its rank correlation with the true ones over points and frames; `drift`: how far, mm, the "
-        "way back (quarter-size images alone) ends from its start, its rank correlation with the points' mean error.",
+        "way back (quarter-size images alone) ends from its start, its rank correlation with the points' mean error. "
+        "Made when what is held was held across the surface, too.",
     ),
     Part(
         "loose_cloth_woman_casual",
