@@ -19,8 +19,8 @@ from smplxpp.core.light import Irradiance, Relighting, panorama_directions
 from tests.core.files.radiance import write_radiance
 from tests.dolls.dancing import dance
 from tests.runtime.bundles import student, write
-from tests.web.avatars import BACKGROUND, NAME, asked, camera, decibels, motion, write_avatar
-from tests.web.chromium import Page, find_chromium
+from tests.web.avatars import BACKGROUND, NAME, asked, camera, decibels, motion
+from tests.web.chromium import find_chromium
 from tests.web.modules import NEEDS_BUILD, node
 
 NEEDS_BROWSER = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
@@ -108,19 +108,6 @@ def test_normals_are_those_of_the_runtime(tmp_path):
     truth = facing_normals(player.normals, splats, np.array(eye))
     assert (truth != player.normals).any()
     np.testing.assert_allclose(found, truth, atol=1.5e-3)
-
-
-@pytest.fixture(scope="module")
-def avatar(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("lit") / "doll.avatar"
-    write_avatar(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        yield page
 
 
 def relit(avatar: Path, frame: int, relighting: Relighting | None) -> tuple[np.ndarray, np.ndarray]:

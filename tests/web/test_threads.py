@@ -23,6 +23,8 @@ from tests.web.modules import NEEDS_BUILD, node
 
 IN_BROWSER = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
 THREADS = 3
+PATIENCE = 900
+"""Seconds until a page that does nothing is given up."""
 # Before a script of a worker: any machine has three cores here. A worker's own workers have scripts, too.
 _BEFORE = """(() => {
   const Whole = Blob;
@@ -108,7 +110,7 @@ def test_an_isolated_page_shares_its_poses_among_threads(browser, server, alone)
     for frame, expected in zip((0, 4), alone, strict=True):
         np.testing.assert_array_equal(browser.picture(asked(camera(), frame)), expected)
     # Threads that were started late, on a busy machine, help as well.
-    end = time.monotonic() + 300
+    end = time.monotonic() + PATIENCE
     while threads(browser)["helped"] == 0:
         assert time.monotonic() < end, "no thread helps"
         np.testing.assert_array_equal(browser.picture(asked(camera(), 4)), alone[1])
@@ -124,7 +126,7 @@ def test_an_isolated_page_shares_its_poses_among_threads(browser, server, alone)
 @pytest.mark.parametrize("kind", _LOST)
 def test_without_its_threads_a_page_goes_on_alone_and_says_so(browser, server, alone, kind):
     opened(browser, server, _LOST[kind])
-    end = time.monotonic() + 300
+    end = time.monotonic() + PATIENCE
     while threads(browser)["lost"] is None:
         assert time.monotonic() < end, "nobody has missed the threads"
         for frame, expected in zip((0, 4), alone, strict=True):
