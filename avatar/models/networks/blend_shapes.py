@@ -174,16 +174,27 @@ class BlendShapes(nn.Module):
 
     def _blend(self, basis: Tensor, z: Tensor) -> Tensor:
         B, M = len(z), len(basis)
-        if self.part is None and self.head_weight is None:
-            out = (basis.flatten(0, 1) @ z[:, 0].T).view(M, 3, B).permute(2, 0, 1)
-        else:
-            of_gaussian = z[:, self.part[self.active]] if self.part is not None else z.expand(-1, M, -1)
+        if self.part is not None:
+            of_gaussian = z[:, self.part[self.active]]
             if self.head_weight is not None:
                 of_gaussian = of_gaussian * self._gate(self.head_weight)
             out = torch.einsum("mck,bmk->bmc", basis, of_gaussian)
+        elif self.head_weight is not None:
+            # What head and body shapes come to apart, weighted after: one product that walks the basis once.
+            head = torch.arange(self.config.shapes, device=z.device) < self.config.head_shapes
+            both = torch.where(torch.stack([head, ~head])[:, None], z[:, 0], 0.0)
+            of_head, of_body = self._product(basis, both.flatten(0, 1)).unflatten(0, (2, B))
+            w = self.head_weight[self.active][:, None]
+            out = w * of_head + (1 - w) * of_body
+        else:
+            out = self._product(basis, z[:, 0])
         if M == self.count:
             return out
         return out.new_zeros(B, self.count, 3).index_copy(1, self.active, out)
+
+    @staticmethod
+    def _product(basis: Float[Tensor, "M 3 n"], z: Float[Tensor, "B n"]) -> Float[Tensor, "B M 3"]:
+        return (z @ basis.flatten(0, 1).T).unflatten(1, (-1, 3))
 
     def _gate(self, head_weight: Tensor) -> Tensor:
         """Return what the active Gaussians' shapes are multiplied by, (M, n)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from torch import Tensor, nn
 
 from avatar.data.sequence import FrameSequence
@@ -36,17 +36,24 @@ def hold_unseen_mouth(sequence: FrameSequence, gaussians: LearnedGaussians, shap
     Behind closed lips gradients are tiny, and Adam takes full steps along them: teeth would drift to the colours of
     lips and into places where an open mouth shows them.
     """
-    learns = ~unseen_mouth(sequence, gaussians)
-    if bool(learns.all()):
+    hidden = unseen_mouth(sequence, gaussians)
+    if not bool(hidden.any()):
         return
+    held = hidden.nonzero()[:, 0]
     for name in LEARNED:
-        _hold(getattr(gaussians, name), learns)
+        _hold(getattr(gaussians, name), held)
     if shapes is not None:
+        held = hidden[shapes.active].nonzero()[:, 0]
         for basis in (shapes.U, shapes.C):
-            _hold(basis, learns[shapes.active])
+            _hold(basis, held)
 
 
-def _hold(parameter: nn.Parameter, learns: Bool[Tensor, " N"]) -> None:
+def _hold(parameter: nn.Parameter, held: Int64[Tensor, " K"]) -> None:
+    """Clear these rows of a gradient when it is there: a product with a mask would write all of it once more."""
+
+    def clear(learned: Tensor) -> None:
+        if learned.grad is not None:
+            learned.grad.index_fill_(0, held, 0.0)
+
     if parameter.requires_grad and parameter.numel():
-        factor = learns.to(parameter.dtype).view(-1, *[1] * (parameter.ndim - 1))
-        parameter.register_hook(lambda gradient: gradient * factor)
+        parameter.register_post_accumulate_grad_hook(clear)
