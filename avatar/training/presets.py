@@ -240,7 +240,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             rates=LearningRates(),
             teacher=_Steps(500, 2e-3),
             bake=_Steps(900, 1e-3),
-            compensate=2000,
+            compensate=4000,
         ),
     ),
     "demo": _lean(
