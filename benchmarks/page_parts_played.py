@@ -80,6 +80,15 @@ PLAYED = (
         "like the one that was found, late or early ones being wrong.",
     ),
     Part(
+        "live_lips",
+        "Lips from sound alone",
+        "Twenty sentences that were not trained on, a voice a row. The first five rows are the Piper voice that the"
+        " network learned from; nothing was trained on flite's and espeak-ng's, whose times are their own. Weights "
+        "of an earlier training were measured on them before. No person was recorded. Shapes: share of hundredths "
+        "of a second in which something is said. A closure belongs to a bilabial whose middle is within 0.1 s of "
+        "it. The jaw's delay is behind the network's own, which the page adds for a microphone and not for a file.",
+    ),
+    Part(
         "gestures",
         "Gestures of somebody who talks",
         "The embedded body, seen in an A-pose alone, and four minutes of the voice's sentences; a figure for each of "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,11 @@ _QUIET = 1e-3  # of full scale: nobody speaks
 _LONGEST = 1200.0  # seconds
 _LOUD = 0.1  # root mean square that the recogniser is given
 _SHORTEST = 0.1  # seconds
+
+
+def aligns() -> bool:
+    """Whether the recogniser is installed."""
+    return find_spec("pocketsphinx") is not None
 
 
 def align(sound: Sound, text: str | None = None) -> Speech:
@@ -72,7 +78,7 @@ def _recognised(decoder: Any, data: bytes) -> list[str]:
             "sound",
             expected="words of English",
             received="none that the recogniser knows (music, noise or another language)",
-            remedy="give what is said in it as --text",
+            remedy="give what is said in it as --text, or --hear sounds, which follows any language",
         )
     return words
 

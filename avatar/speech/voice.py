@@ -78,18 +78,28 @@ class PiperVoice:
             slower: factor of the durations.
         """
         said = pronounce(text, language=self.language)
+        spoken = self.read(said.ipa, slower=slower)
+        return replace(spoken, guessed=said.guessed)
+
+    def read(self, ipa: str, *, slower: float = 1.0, noise: float = 0.0) -> Spoken:
+        """Speak sounds that are written in IPA as espeak-ng writes them.
+
+        Args:
+            slower: factor of the durations.
+            noise: of the voice and of its durations, which differ every time then; Piper's own is about 0.7.
+        """
         sounds, phonemes, at = [], [], 0.0
-        for sentence in re.findall(r"[^.!?]+[.!?]*", said.ipa):
+        for sentence in re.findall(r"[^.!?]+[.!?]*", ipa):
             if not sentence.strip(f" {PAUSES}"):
                 continue
-            samples, own = self._sentence(sentence.strip(), slower)
+            samples, own = self._sentence(sentence.strip(), slower, noise)
             phonemes += [replace(one, start=one.start + at, end=one.end + at) for one in own]
             sounds.append(samples)
             at += len(samples) / self.rate
         sound = Sound(np.concatenate(sounds), self.rate)
-        return Spoken(sound, Speech(tuple(phonemes), sound.seconds), said.guessed)
+        return Spoken(sound, Speech(tuple(phonemes), sound.seconds), [])
 
-    def _sentence(self, ipa: str, slower: float) -> tuple[np.ndarray, list[Phoneme]]:
+    def _sentence(self, ipa: str, slower: float, noise: float) -> tuple[np.ndarray, list[Phoneme]]:
         """Samples of a sentence, and its phonemes by the voice's own durations."""
         sounds = _symbols(ipa)
         owners = _owners([name for _, name in sounds])
@@ -101,7 +111,7 @@ class PiperVoice:
                     owner += [owners[k]] * 2  # a sound begins with the pad ahead of it
         ids += [*self._ids[_PAD], *self._ids[_END]]
         owner += [len(sounds)] * 2
-        scales = np.array([0.0, self._scales[1] * slower, 0.0], np.float32)
+        scales = np.array([noise, self._scales[1] * slower, noise], np.float32)
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         samples, frames = self._model.run(feed)[:2]
         ends = np.cumsum(np.ravel(frames)) * _HOP / self.rate

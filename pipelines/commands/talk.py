@@ -49,7 +49,9 @@ class Talk:
     text: OptionalText = None
     """What is said. With --audio: what the recording says, so that it need not be recognised."""
     audio: OptionalPath = None
-    """A recording of English (WAV) in the place of a voice."""
+    """A recording (WAV) in the place of a voice."""
+    hear: Literal["auto", "words", "sounds"] = "auto"
+    """How a recording is followed: words of English, or sounds alone in any language; auto: words where it can."""
     curves: OptionalPath = None
     """The face as another engine moves it (.csv, .json, .npz: docs/talking.md), heard with --audio or in silence."""
     face_model: OptionalPath = None
@@ -138,6 +140,12 @@ class Talk:
             raise InputError(f"option {other}", expected="none beside --curves, which move the face", received="both")
         if self.voice is not None and self.audio is not None:
             raise InputError("option voice", expected="none where --audio is heard", received=str(self.voice))
+        if self.hear == "sounds" and (self.audio is None or self.text is not None or self.face_model is not None):
+            raise InputError(
+                "option hear",
+                expected="auto, or --audio without --text and --face-model to hear sounds in",
+                received=self.hear,
+            )
         if self.sound_out is not None and self.sound_out.suffix.lower() != ".wav":
             raise InputError(f"output {self.sound_out}", expected=".wav", received=self.sound_out.suffix or "no suffix")
         require_at_least("height", self.height, _SMALLEST)
@@ -163,12 +171,19 @@ class Talk:
 
             model = FaceModel(self.face_model)
         if self.audio is not None:
+            from avatar.speech.aligner import align, aligns
+
             sound = read_wave(self.audio)
             if model is not None and self.text is None:
                 curves = model(sound)
                 return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
-            from avatar.speech.aligner import align
+            if self.text is None and self.hear != "words" and (self.hear == "sounds" or not aligns()):
+                from avatar.speech.lips import sounds_of
 
+                said = (
+                    [] if self.hear == "sounds" else ["heard by its sounds: pocketsphinx, for words, is not installed"]
+                )
+                return _Heard(sound, sounds_of(sound), said)
             return _Heard(sound, align(sound, self.text), curves=None if model is None else model(sound))
         from avatar.speech.voice import PiperVoice
 

@@ -21,22 +21,32 @@ if TYPE_CHECKING:
 
 def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, Stance]:
     """Return the face of a bundle's person and how the body stands, of what training saw."""
-    from avatar.runtime.skeleton import clothed_template, skeleton_body
-    from avatar.speech import Face, Stance
-    from avatar.speech.arkit import ARKIT
+    from avatar.runtime.skeleton import skeleton_body
+    from avatar.speech import Stance
 
-    seen = _motion_of(bundle)
-    about = bundle.about
-    # Only of numbered expressions is the surface asked what they do.
-    body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
-    face = Face.of(about.expression_names, about.joint_names, seen, body=body)
     stance = Stance.of(
         Skeleton.of(skeleton_body(bundle)),
-        _whole(seen, len(about.expression_names)),
+        _whole(_motion_of(bundle), len(bundle.about.expression_names)),
         known=bundle.tensors.get("poses.known"),
         surface=bundle.tensors["surface.vertices"].astype(np.float64),
     )
-    return face, stance
+    return face_of_bundle(bundle), stance
+
+
+def face_of_bundle(bundle: AvatarBundle) -> Face:
+    """Return the face of a bundle's person, of what training saw.
+
+    Raises:
+        InputError: expressions by which no mouth can be moved.
+    """
+    from avatar.runtime.skeleton import clothed_template
+    from avatar.speech import Face
+    from avatar.speech.arkit import ARKIT
+
+    about = bundle.about
+    # Only of numbered expressions is the surface asked what they do.
+    body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
+    return Face.of(about.expression_names, about.joint_names, _motion_of(bundle), body=body)
 
 
 def person_of_run(run: Path) -> tuple[Face, Stance]:

@@ -15,12 +15,14 @@ from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES
+from pipelines.commands.talking_person import face_of_bundle
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.validation import require_between
 
 if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
     from pipelines.web.page import PageLight
 
 
@@ -55,23 +57,24 @@ class Web:
         """Write what was asked for, each file whole or not at all; then serve."""
         self._check()
         light = self._light()
-        bundle, name = self._bundle()
+        bundle, name, lips = self._bundle()
         from pipelines.web.page import page_files, single_page, write_page_folder
 
         console = Console(stderr=self.json)
         written: dict[str, int] = {}
         if self.out is not None:
             written |= {
-                str(path): path.stat().st_size for path in write_page_folder(self.out, bundle, name=name, light=light)
+                str(path): path.stat().st_size
+                for path in write_page_folder(self.out, bundle, name=name, light=light, lips=lips)
             }
         if self.single_file is not None:
-            page = single_page(bundle, name=name, light=light)
+            page = single_page(bundle, name=name, light=light, lips=lips)
             atomic_write_bytes(self.single_file, page)
             written[str(self.single_file)] = len(page)
         for path, size in written.items():
             console.print(f"{path}: {size / 1e6:.2f} MB", markup=False, soft_wrap=True)
         if self.serve:
-            self._serve(page_files(bundle, name=name, light=light), console)
+            self._serve(page_files(bundle, name=name, light=light, lips=lips), console)
         return {"written": written, "bundle_bytes": len(bundle)}
 
     def _check(self) -> None:
@@ -102,15 +105,16 @@ class Web:
             return None
         return PageLight(asked.environment.stem, relighting, asked.environment_turn)
 
-    def _bundle(self) -> tuple[bytes, str]:
-        """The bytes of the bundle, one that can be opened, and the avatar's name."""
+    def _bundle(self) -> tuple[bytes, str, bytes | None]:
+        """The bytes of the bundle, one that can be opened, the avatar's name, and how its lips move."""
         from avatar.runtime import load_bundle
 
         if self.source.is_dir():
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"me{SUFFIX}"
                 export_bundle(self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False)
-                return read_bytes(path, subject="avatar"), self.name or self.source.resolve().name
+                name = self.name or self.source.resolve().name
+                return read_bytes(path, subject="avatar"), name, _lips(load_bundle(path))
         given = [option for option in ("params", "name", "licence") if getattr(self, option)]
         if given:
             raise InputError(
@@ -120,7 +124,8 @@ class Web:
                 remedy=f"give it to `smplxpp export RUN --out NAME{SUFFIX}`",
             )
         data = read_bytes(self.source, subject="avatar", most=MOST_AVATAR_BYTES)
-        return data, load_bundle(self.source).about.name
+        bundle = load_bundle(self.source)
+        return data, bundle.about.name, _lips(bundle)
 
     def _serve(self, files: dict[str, bytes], console: Console) -> None:
         from pipelines.web.server import PageServer
@@ -133,3 +138,13 @@ class Web:
                 server.serve_forever()
             except KeyboardInterrupt:
                 pass
+
+
+def _lips(bundle: AvatarBundle) -> bytes | None:
+    """What moves the mouth by live sound; None for a face without a mouth that speaks."""
+    from pipelines.web.lips import lips_of
+
+    try:
+        return lips_of(face_of_bundle(bundle))
+    except InputError:
+        return None

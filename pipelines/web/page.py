@@ -15,7 +15,7 @@ from smplxpp.core.light import Relighting
 
 PLAYER = Path(__file__).parent / "assets" / "player.js"
 """Built of `web/` by `npm run build`; a test holds it against its sources."""
-INDEX, SCRIPT, AVATAR, SOUND = "index.html", "player.js", "me.avatar", "sound.wav"
+INDEX, SCRIPT, AVATAR, SOUND, LIPS = "index.html", "player.js", "me.avatar", "sound.wav", "lips.safetensors"
 # The page needs its script, a worker made of it and the WebAssembly in that, styles made by it, and avatars; it loads
 # nothing else from anywhere.
 _POLICY = (
@@ -62,22 +62,32 @@ class PageLight:
 
 
 def page_files(
-    bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None
+    bundle: bytes,
+    *,
+    name: str,
+    sound: bytes | None = None,
+    light: PageLight | None = None,
+    lips: bytes | None = None,
 ) -> dict[str, bytes]:
     """Return the files of a folder that plays a bundle, by name.
 
     Args:
         name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
         light: that the avatar is shown in; None: the capture's.
+        lips: of `pipelines.web.lips.lips_of`, by which live sound moves the mouth; None: it does not.
     """
+    beside = {kind: content for kind, content in (("sound", sound), ("lips", lips)) if content is not None}
+    names = {"sound": SOUND, "lips": LIPS}
     page = _PAGE.format(
         policy=_POLICY.format(script="'self' blob:", connect="connect-src *"),
         title=html.escape(name),
-        attributes=f' data-avatar="{AVATAR}"' + ("" if sound is None else f' data-sound="{SOUND}"') + _lit(light),
+        attributes=f' data-avatar="{AVATAR}"'
+        + "".join(f' data-{kind}="{names[kind]}"' for kind in beside)
+        + _lit(light),
         body=f'<script src="{SCRIPT}"></script>',
     )
     files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
-    return files if sound is None else {**files, SOUND: sound}
+    return {**files, **{names[kind]: content for kind, content in beside.items()}}
 
 
 def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str]) -> dict[str, bytes]:
@@ -96,7 +106,13 @@ def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str])
 
 
 def write_page_folder(
-    folder: str | Path, bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None
+    folder: str | Path,
+    bundle: bytes,
+    *,
+    name: str,
+    sound: bytes | None = None,
+    light: PageLight | None = None,
+    lips: bytes | None = None,
 ) -> list[Path]:
     """Write `page_files` into a folder, each whole or not at all; other files in it stay.
 
@@ -104,20 +120,28 @@ def write_page_folder(
         The files.
     """
     paths = []
-    for file, content in page_files(bundle, name=name, sound=sound, light=light).items():
+    for file, content in page_files(bundle, name=name, sound=sound, light=light, lips=lips).items():
         paths.append(Path(folder) / file)
         atomic_write_bytes(paths[-1], content)
     return paths
 
 
-def single_page(bundle: bytes, *, name: str, sound: bytes | None = None, light: PageLight | None = None) -> bytes:
-    """Return one page with player, bundle and sound in it, which opens from disk and asks no network for anything."""
+def single_page(
+    bundle: bytes,
+    *,
+    name: str,
+    sound: bytes | None = None,
+    light: PageLight | None = None,
+    lips: bytes | None = None,
+) -> bytes:
+    """Return one page with everything in it, which opens from disk and asks no network for anything."""
     # Neither may end the element that it stands in.
     script = _script().replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    inlined = {"avatar": bundle} if sound is None else {"avatar": bundle, "sound": sound}
+    inlined = {"avatar": bundle, "sound": sound, "lips": lips}
     data = [
         f'<script type="text/plain" id="{kind}-data">{base64.b64encode(content).decode()}</script>\n'
         for kind, content in inlined.items()
+        if content is not None
     ]
     page = _PAGE.format(
         policy=_POLICY.format(script="'unsafe-inline' blob:", connect="connect-src 'none'"),

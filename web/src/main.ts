@@ -5,11 +5,11 @@ import { Conversation } from "./chat/conversation.ts";
 import { Player, type View } from "./player.ts";
 import { makeRenderer } from "./render/choose.ts";
 import type { Light } from "./light/irradiance.ts";
-import { App } from "./ui/app.ts";
+import { App, type Data } from "./ui/app.ts";
 import { element } from "./ui/elements.ts";
 import { shine } from "./ui/light.ts";
 
-/** Where a page has its bundle and its sound: in it, in base64, or beside it, named by an attribute. */
+/** Where a page has its bundle, its sound and its lips: in it, in base64, or beside it, named by an attribute. */
 const INLINED = "-data", BESIDE = "data-";
 /** The light that a page comes with, as JSON, in an attribute. */
 const LIGHT = "data-light";
@@ -35,7 +35,7 @@ async function start(): Promise<void> {
   }
   const named = new URLSearchParams(location.search).get("avatar");
   const data = named ? download(named) : find("avatar");
-  const ready = data ? app.open(data, named ? null : find("sound")) : Promise.resolve(app.invite());
+  const ready = data ? app.open(data, named ? {} : { sound: find("sound"), lips: find("lips") }) : Promise.resolve(app.invite());
   const secret = document.body.getAttribute("data-chat");
   const talking = ready.then(() => secret && player.summary ? new Conversation(player, secret) : null);
   window.smplxppPlayer = {
@@ -45,7 +45,7 @@ async function start(): Promise<void> {
   };
 }
 
-function find(kind: "avatar" | "sound"): Promise<ArrayBuffer> | ArrayBuffer | null {
+function find(kind: "avatar" | "sound" | "lips"): Data | null {
   const inlined = document.getElementById(kind + INLINED);
   if (inlined) {
     const bytes = bytesOf(inlined.textContent ?? "");

@@ -4,6 +4,7 @@ import type { Pose } from "./avatar/avatar.ts";
 import { RECORD } from "./avatar/deform.ts";
 import { duration, poseAt, restPose, turned } from "./avatar/motion.ts";
 import { LONGEST_FOLLOWED } from "./cloth/driver.ts";
+import type { LiveLips } from "./lips/lips.ts";
 import { matrices, type Light } from "./light/irradiance.ts";
 import { orbitCamera, type Camera, type Orbit } from "./render/camera.ts";
 import type { Renderer } from "./render/renderer.ts";
@@ -81,6 +82,8 @@ export class Player {
   /** Of a sound that the motion goes with: it plays once, not in a loop. */
   clock: Clock | null = null;
   performer: Performer | null = null;
+  /** What moves the mouth by live sound; null: this page cannot. */
+  lips: LiveLips | null = null;
   /** Called after each picture. */
   onpicture: () => void = () => {};
   /** Called after another light was set. */
@@ -169,7 +172,8 @@ export class Player {
   /** The pose at a time, with what was set by hand. */
   pose(time: number): Pose {
     const { motion, jointNames, expressionNames } = this.summary!, acted = this.performer?.pose();
-    const pose = acted ? { ...acted, expression: acted.expression.slice() } : motion ? poseAt(motion, time) : restPose(jointNames.length, expressionNames.length);
+    let pose = acted ? { ...acted, expression: acted.expression.slice() } : motion ? poseAt(motion, time) : restPose(jointNames.length, expressionNames.length);
+    if (this.lips?.on) pose = this.lips.pose(pose);
     for (const [k, value] of this.expressions) pose.expression[k] = value;
     return this.turns.size ? turned(pose, this.turns) : pose;
   }
@@ -206,7 +210,7 @@ export class Player {
       if (this.clock && next >= this.duration) this.playing = false;
       this.update();
     }
-    if (this.performer) this.update();
+    if (this.performer || this.lips?.on) this.update();
   }
 
   /** What the worker has made ready, null: nothing new; the worker goes on, with what the camera sees, in the meantime. */

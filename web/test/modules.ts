@@ -2,6 +2,11 @@
 export { Deformer, RECORD } from "../src/avatar/deform.ts";
 export { poseAt, restPose, turned } from "../src/avatar/motion.ts";
 export { Resampler } from "../src/chat/resample.ts";
+export { SpeakingFace } from "../src/lips/face.ts";
+export { Ear } from "../src/lips/features.ts";
+export { LipNetwork } from "../src/lips/network.ts";
+export { Steady } from "../src/lips/steady.ts";
+export { unpackTensors } from "../src/bundle/tensors.ts";
 export { BundleError } from "../src/bundle/errors.ts";
 export { readBundle } from "../src/bundle/read.ts";
 export { sha256Here } from "../src/bundle/sha256.ts";

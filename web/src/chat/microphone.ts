@@ -3,14 +3,15 @@
 import { Resampler } from "./resample.ts";
 
 export const RATE = 16000;
-/** Samples of a piece: 64 ms. */
-const PIECE = 1024;
 /** The thread of the audio hands on what it gets; it runs beside the page. */
 const WORKLET = `registerProcessor("tap", class extends AudioWorkletProcessor {
   process([[samples]]) { if (samples) this.port.postMessage(samples.slice()); return true; }
 });`;
 
 export class Microphone {
+  /** @param piece samples that are handed on at once: 64 ms. */
+  constructor(private readonly piece = 1024) {}
+
   private stream: MediaStream | null = null;
   private context: AudioContext | null = null;
 
@@ -28,11 +29,11 @@ export class Microphone {
     await this.context.audioWorklet.addModule(url);
     URL.revokeObjectURL(url);
     const tap = new AudioWorkletNode(this.context, "tap", { numberOfInputs: 1, numberOfOutputs: 1, channelCount: 1 });
-    const resampler = new Resampler(this.context.sampleRate, RATE), piece: number[] = [];
+    const resampler = new Resampler(this.context.sampleRate, RATE), left: number[] = [];
     tap.port.onmessage = ({ data }: MessageEvent<Float32Array>) => {
-      piece.push(...resampler.push(data));
-      while (piece.length >= PIECE) {
-        hear(Int16Array.from(piece.splice(0, PIECE), (value) => Math.round(32767 * Math.min(1, Math.max(-1, value)))));
+      left.push(...resampler.push(data));
+      while (left.length >= this.piece) {
+        hear(Int16Array.from(left.splice(0, this.piece), (value) => Math.round(32767 * Math.min(1, Math.max(-1, value)))));
       }
     };
     this.context.createMediaStreamSource(this.stream).connect(tap);

@@ -3,6 +3,7 @@
 import { BundleError } from "../bundle/errors.ts";
 import type { Player } from "../player.ts";
 import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
+import { LiveLips } from "../lips/lips.ts";
 import { Soundtrack } from "../sound/soundtrack.ts";
 import { enterStereo, offersStereo } from "../xr/stereo.ts";
 import { isRadiance } from "../light/radiance.ts";
@@ -13,6 +14,9 @@ import { makePanel } from "./panel.ts";
 const SPEEDS = [1, 0.5, 0.25, 2];
 /** Milliseconds between changes of the numbers on the page. */
 const RATES_EVERY = 400;
+
+/** Bytes that are there or on their way. */
+export type Data = Promise<ArrayBuffer> | ArrayBuffer;
 
 export class App {
   private readonly title = element("header", { class: "title" });
@@ -42,13 +46,15 @@ export class App {
     player.onerror = (message) => this.fail(message);
   }
 
-  /** Opens a bundle's bytes, and the sound of its motion, and shows it; what is wrong with it is said on the page. */
-  async open(data: Promise<ArrayBuffer> | ArrayBuffer, sound: Promise<ArrayBuffer> | ArrayBuffer | null = null): Promise<void> {
+  /** Opens a bundle's bytes, the sound of its motion and its lips, and shows it; what is wrong is said on the page. */
+  async open(data: Data, { sound = null, lips = null }: { sound?: Data | null; lips?: Data | null } = {}): Promise<void> {
     this.say(element("div", { class: "spinner" }), element("h2", {}, "Opening the avatar"));
     try {
       const about = await this.player.open(await data);
-      await this.takeSound(sound);
       this.welcome.replaceChildren();
+      await this.takeSound(sound);
+      this.player.lips?.stop();
+      this.player.lips = lips && this.speaking(await lips);
       document.title = about.name;
       this.title.replaceChildren(element("h1", {}, about.name), element("p", {}, "SMPLX++ avatar"));
       this.panel?.remove();
@@ -63,13 +69,24 @@ export class App {
   }
 
   /** Plays the motion with this sound from now on; without one, by itself. */
-  private async takeSound(data: Promise<ArrayBuffer> | ArrayBuffer | null): Promise<void> {
+  private async takeSound(data: Data | null): Promise<void> {
     const { player } = this;
     player.clock?.at(false, 0, 1);
     this.soundtrack = data && new Soundtrack(await data, (message) => this.fail(message, "There is no sound"));
     player.clock = this.soundtrack;
     player.playing = !this.soundtrack;
     this.speak.hidden = !this.soundtrack;
+  }
+
+  /** What moves the mouth by live sound; null: it cannot, which is said. */
+  private speaking(data: ArrayBuffer): LiveLips | null {
+    const { expressionNames, jointNames } = this.player.summary!;
+    try {
+      return new LiveLips(data, expressionNames.length, jointNames);
+    } catch (error) {
+      this.fail((error as Error).message, "The mouth cannot follow live sound");
+      return null;
+    }
   }
 
   /** Says what went wrong, and offers another file. */

@@ -3,6 +3,7 @@
 import type { Player } from "../player.ts";
 import { element, slider, toggle } from "./elements.ts";
 import { lightPage } from "./light.ts";
+import { lipsPage } from "./lips.ts";
 
 const TURN = { least: -90, most: 90, start: 0, step: 1 };
 const AXES = ["Bend", "Twist", "Tilt"];
@@ -13,6 +14,7 @@ export function makePanel(player: Player, fail: (message: string, title: string)
   const pages: [string, HTMLElement][] = [];
   if (about.partNames.length > 1) pages.push(["Parts", parts(player)]);
   if (about.expressionNames.length) pages.push(["Face", face(player)]);
+  if (player.lips) pages.push(["Voice", page(lipsPage(player))]);
   const light = lightPage(player, (message) => fail(message, "This light cannot be shown"));
   pages.push(["Pose", pose(player)], ["Light", page(light)], ["About", details(player)]);
 

@@ -1,0 +1,211 @@
+/** The mouth moved by live sound: of the microphone, or of a file that is played. All of it in the page. */
+
+import type { Pose } from "../avatar/avatar.ts";
+import { unpackTensors, type Piece } from "../bundle/tensors.ts";
+import { Microphone } from "../chat/microphone.ts";
+import { Resampler } from "../chat/resample.ts";
+import { SpeakingFace } from "./face.ts";
+import { Ear, HOP, RATE } from "./features.ts";
+import { ARTICULATORS, LipNetwork } from "./network.ts";
+import { Steady } from "./steady.ts";
+
+/** Samples of a piece of the microphone: a row's. */
+const PIECE = HOP;
+/** Seconds of a file that are heard ahead of what is played, and at most in one go. */
+const AHEAD = 0.3, AT_ONCE = 2;
+/** Seconds until a file begins. */
+const SOON = 0.1;
+/** Seconds of the mouth that are kept. */
+const KEPT = 10;
+/** Of full scale: what is louder is no silence; seconds of silence after which it is said. */
+const LOUD = 3e-3, PATIENCE = 4;
+/** Seconds in which the mouth closes when the sound is over. */
+const CLOSES = 0.15;
+const AT_REST = new Float32Array(ARTICULATORS);
+
+/** Ear, network and smoothing of one sound, from its beginning on. */
+class Hearing {
+  readonly rows: Float32Array[] = [];
+  /** How many have been forgotten before them. */
+  private gone = 0;
+  private readonly ear = new Ear();
+  private readonly steady = new Steady();
+
+  constructor(private readonly network: LipNetwork) {}
+
+  push(samples: Float32Array): void {
+    this.ear.push(samples, (row) => this.rows.push(this.steady.push(this.network.push(row).mouth)));
+    for (; this.rows.length > (KEPT * RATE) / HOP; ++this.gone) this.rows.shift();
+  }
+
+  /** The mouth of a time of the sound, as far as it is known. */
+  at(time: number): Float32Array {
+    const at = Math.max(((time + this.network.delay) * RATE) / HOP - 1 - this.gone, 0), first = Math.floor(at), share = at - first;
+    const low = this.rows[Math.min(first, this.rows.length - 1)] ?? AT_REST, high = this.rows[Math.min(first + 1, this.rows.length - 1)] ?? AT_REST;
+    return low.map((value, k) => (1 - share) * value + share * high[k]);
+  }
+}
+
+/** A file that is played. */
+interface Playing {
+  mono: Float32Array;
+  rate: number;
+  resampler: Resampler;
+  /** Samples that have been heard. */
+  given: number;
+  /** The context's time of its beginning. */
+  begun: number;
+  node: AudioBufferSourceNode;
+}
+
+export class LiveLips {
+  /** What is listened to; "" for nothing. */
+  source = "";
+  /** Told what is to be said on the page. */
+  onsaid: (message: string) => void = () => {};
+  context: AudioContext | null = null;
+  /** What a file is heard through, for who wants to look at it. */
+  output: GainNode | null = null;
+  private readonly network: Piece;
+  private readonly face: SpeakingFace;
+  private microphone: Microphone | null = null;
+  private hearing: Hearing | null = null;
+  private file: Playing | null = null;
+  private lastLoud = 0;
+  private quiet = false;
+  /** Counts what was started: an answer that comes late is for nobody. */
+  private turn = 0;
+  private ended = -Infinity;
+  private last: Float32Array = AT_REST;
+
+  /** @throws BundleError another network than this version's, or a face of another body. */
+  constructor(data: ArrayBuffer, expressions: number, jointNames: string[]) {
+    this.network = unpackTensors(new Uint8Array(data), "the lips");
+    new LipNetwork(this.network);
+    this.face = new SpeakingFace(this.network, expressions, jointNames.indexOf("jaw"));
+  }
+
+  /** Whether the mouth is moved by it. */
+  get on(): boolean {
+    return this.source !== "" || performance.now() / 1000 - this.ended < CLOSES;
+  }
+
+  /** A pose with the mouth of what is heard now. */
+  pose(pose: Pose): Pose {
+    return this.face.pose(this.mouth(), pose);
+  }
+
+  /** The articulators now. */
+  mouth(): Float32Array {
+    const share = 1 - (performance.now() / 1000 - this.ended) / CLOSES;
+    const { hearing, file } = this;
+    if (!hearing) return share > 0 ? this.last.map((value) => value * share) : AT_REST;
+    if (file) this.follow(file, hearing);
+    else this.listened();
+    return (this.last = file ? hearing.at(this.played) : hearing.rows.at(-1) ?? AT_REST);
+  }
+
+  /** Seconds of the file that have been heard. */
+  get played(): number {
+    return this.file && this.context ? Math.max(0, this.context.currentTime - (this.context.outputLatency || 0) - this.file.begun) : 0;
+  }
+
+  /** Listens to the microphone; why it cannot is said. To be called by a click. */
+  async listen(): Promise<void> {
+    this.stop();
+    const turn = ++this.turn, hearing = new Hearing(new LipNetwork(this.network)), microphone = new Microphone(PIECE);
+    this.onsaid("The browser asks for the microphone");
+    try {
+      await microphone.start((samples) => this.hear(hearing, Float32Array.from(samples, (value) => value / 32767)));
+    } catch (error) {
+      microphone.stop();
+      if (turn === this.turn) this.onsaid(`The microphone cannot be used: ${(error as Error).message}`);
+      return;
+    }
+    if (turn !== this.turn) {
+      microphone.stop();
+      return;
+    }
+    this.microphone = microphone;
+    this.hearing = hearing;
+    this.source = "microphone";
+    this.lastLoud = performance.now() / 1000;
+    this.quiet = false;
+    this.onsaid("Listening: speak");
+  }
+
+  /** Plays a sound's file and moves the mouth by it; why it cannot is said. To be called by a click. */
+  async play(data: ArrayBuffer, name: string): Promise<void> {
+    this.stop();
+    const turn = ++this.turn;
+    this.onsaid(`Opening ${name}`);
+    try {
+      this.context ??= new AudioContext();
+      void this.context.resume();
+    } catch (error) {
+      this.onsaid(`This browser plays no sound: ${(error as Error).message}`);
+      return;
+    }
+    const { context } = this;
+    const buffer = await context.decodeAudioData(data).catch(() => null);
+    if (turn !== this.turn) return;
+    if (!buffer || !buffer.length) {
+      this.onsaid(`${name} is damaged, or no sound that this browser plays`);
+      return;
+    }
+    const mono = new Float32Array(buffer.length);
+    for (let c = 0; c < buffer.numberOfChannels; ++c) {
+      buffer.getChannelData(c).forEach((value, k) => (mono[k] += value / buffer.numberOfChannels));
+    }
+    if (!mono.some((value) => Math.abs(value) > LOUD)) {
+      this.onsaid(`${name} is silent`);
+      return;
+    }
+    this.output ??= context.createGain();
+    this.output.connect(context.destination);
+    const node = context.createBufferSource();
+    node.buffer = buffer;
+    node.connect(this.output);
+    node.onended = () => this.file?.node === node && this.stop(`${name} is over`);
+    const begun = context.currentTime + SOON;
+    this.hearing = new Hearing(new LipNetwork(this.network));
+    this.file = { mono, rate: buffer.sampleRate, resampler: new Resampler(buffer.sampleRate, RATE), given: 0, begun, node };
+    node.start(begun);
+    this.source = "file";
+    this.onsaid(`Playing ${name}`);
+  }
+
+  /** Listens no more: the mouth closes. */
+  stop(said = ""): void {
+    ++this.turn;
+    this.microphone?.stop();
+    this.file?.node.stop();
+    this.microphone = this.file = this.hearing = null;
+    if (this.source) this.ended = performance.now() / 1000;
+    this.source = "";
+    this.onsaid(said);
+  }
+
+  /** Hears so much of the file that the mouth of what is played is known. */
+  private follow(file: Playing, hearing: Hearing): void {
+    const { mono, rate, resampler, given } = file;
+    file.given = Math.max(given, Math.min(Math.round((this.played + AHEAD) * rate), given + AT_ONCE * rate));
+    // Behind its end it is silent.
+    const piece = new Float32Array(file.given - given);
+    piece.set(mono.subarray(given, file.given));
+    hearing.push(resampler.push(piece));
+  }
+
+  private hear(hearing: Hearing, samples: Float32Array): void {
+    hearing.push(samples);
+    if (samples.some((value) => Math.abs(value) > LOUD)) this.lastLoud = performance.now() / 1000;
+  }
+
+  /** Says when nobody is heard, and when somebody is again. */
+  private listened(): void {
+    const quiet = performance.now() / 1000 - this.lastLoud > PATIENCE;
+    if (quiet === this.quiet) return;
+    this.quiet = quiet;
+    this.onsaid(quiet ? "Nothing is heard: is the microphone muted?" : "Listening: speak");
+  }
+}
