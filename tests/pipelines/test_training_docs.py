@@ -61,6 +61,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
         "blend shapes start from": "the surface" if compensate.init_from_track else "zero",
+        "blend shapes hold neighbours together, weight": f"{compensate.coherence:,g}" if compensate.coherence else "-",
         "jaw drives the head": "yes" if preset.blend_shapes.jaw else "no",
     }
 

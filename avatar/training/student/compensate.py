@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
+from avatar.gaussians.coherence import Coherence
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
@@ -26,7 +27,7 @@ from avatar.training.engine.session import Session
 from avatar.training.student.init_blend_shapes import init_blend_shapes
 from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_between
+from smplxpp.core.validation import require_at_least, require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +48,12 @@ class CompensateConfig(PhotometricConfig):
     color_lr: float = 1e-3
     null_share: float = 0.0
     init_from_track: bool = False
+    coherence: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_between("compensation: null_share", self.null_share, 0.0, 1.0)
+        require_at_least("compensation: coherence", self.coherence, 0.0)
 
 
 class CompensateTask(PhotometricTask):
@@ -83,6 +86,9 @@ class CompensateTask(PhotometricTask):
         ]
         super().__init__(sequence, student, config, groups, context)
         self.student = student
+        self.shapes, self.coherence = shapes, None
+        if config.coherence:
+            self.coherence = Coherence(student.rig, student.gaussians().select(shapes.active), shapes.U)
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame and its terms."""
@@ -92,6 +98,10 @@ class CompensateTask(PhotometricTask):
             motion = self.sequence.as_new_motion(item.frame)
         posed = self.student(motion, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
+        if self.coherence is not None:
+            apart = self.coherence(self.shapes.U, self.generator(item.frame, 1))
+            total = total + self.config.coherence * apart
+            terms["coherence"] = float(apart.detach())
         return total, {"loss": float(total.detach()), **terms}
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from avatar.data.sequence import camera_centers_of
+from avatar.gaussians.coherence import Coherence
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.learned_gaussians import LEARNED
 from avatar.models.networks.blend_shapes import BlendShapeConfig
@@ -316,6 +317,19 @@ def test_the_functions_train_from_the_seed_and_hand_the_avatar_on(frames, tmp_pa
         assert done.finished and torch.equal(before, torch.random.get_rng_state())
         found.append({**teacher.state_dict(), **{f"s.{n}": v for n, v in student.state_dict().items()}})
     assert same_state(*found) and not student.training
+
+
+def test_coherent_blend_shapes_learn_to_move_neighbours_alike(frames):
+    left = []
+    for weight in (0.0, 1e4):
+        task = make("compensate", frames, coherence=weight, iterations=40)
+        measure = Coherence(frames.rig, task.student.gaussians(), task.shapes.U)
+        figures = [task.step(k) for k in range(40)]
+        assert ("coherence" in figures[-1]) == bool(weight)
+        left.append(float(measure(task.shapes.U.detach(), np.random.default_rng(0))))
+    assert 0 < left[1] < 0.5 * left[0]
+    with pytest.raises(InputError, match="compensation: coherence"):
+        replace(COMPENSATE, coherence=-1.0)
 
 
 def test_a_held_out_view_of_nobody_measures_nothing(frames, monkeypatch):
