@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.gaussians import coherence
 from avatar.gaussians.binding import world_from_local
-from avatar.gaussians.coherence import NEIGHBOURS, Coherence, _neighbours
 from avatar.gaussians.frames import triangle_frames
+from avatar.losses import coherence
+from avatar.losses.coherence import NEIGHBOURS, Coherence, _neighbours
 from tests.dolls.dancing import gaussians, sequence, varied, write_dance
 
 WAY = torch.tensor([[0.01, 0.0], [-0.02, 0.03], [0.03, 0.01]])
