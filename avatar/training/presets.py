@@ -178,7 +178,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             null_share=0.2,
             attributes=size.late,
             init_from_track=True,
-            coherence=1000.0,
+            coherence=200.0,
             weights=_LEAN_WEIGHTS,
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
