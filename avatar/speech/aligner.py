@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
-from avatar.speech.rests import find_rests, without_rests
+from avatar.speech.rests import find_rests, spoken_level, without_rests
 from avatar.speech.text import EXTRA, checked_text, phones_of, words_of
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.wave_file import Sound
@@ -20,10 +20,7 @@ _WINDOW = 0.025625  # seconds of sound that the recogniser sees for a frame, fro
 # A frame stands for the sound about its window's middle: half a frame ahead of it, it begins.
 _OFFSET = 0.5 * (_WINDOW - _FRAME)
 _LEADS = (0.0, 0.1, 0.005)  # seconds of silence put ahead of a sound in which the search lost its way
-_QUIET = 1e-3  # of full scale: nobody speaks
-_LONGEST = 1200.0  # seconds
 _LOUD = 0.1  # root mean square that the recogniser is given
-_SHORTEST = 0.1  # seconds
 
 
 def aligns() -> bool:
@@ -41,11 +38,7 @@ def align(sound: Sound, text: str | None = None) -> Speech:
         MissingExtraError: pocketsphinx is not installed.
         InputError: silence, no words in it, a text that it does not say, more than 20 minutes.
     """
-    seconds, level = sound.seconds, float(np.sqrt(np.mean(np.square(sound.samples)))) if len(sound.samples) else 0.0
-    if not _SHORTEST <= seconds <= _LONGEST:
-        raise InputError("sound", expected=f"{_SHORTEST:g} to {_LONGEST:g} seconds", received=f"{seconds:.2f}")
-    if level < _QUIET:
-        raise InputError("sound", expected="somebody who speaks", received="silence")
+    seconds, level = sound.seconds, spoken_level(sound)
     try:
         import pocketsphinx
     except ImportError:

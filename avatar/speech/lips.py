@@ -21,6 +21,7 @@ from jaxtyping import Float, Float32, Float64
 
 from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
+from avatar.speech.rests import spoken_level
 from avatar.speech.sound_features import BANDS, FRAME, HOP, RATE, hear
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
@@ -32,9 +33,6 @@ WEIGHTS = Path(__file__).parent / "lips.safetensors"
 PHONES = (SILENCE, *sorted(VOWELS | CONSONANTS))
 """What the first head tells apart."""
 VERSION = 1
-_LONGEST = 1200.0  # seconds
-_SHORTEST = 0.1  # seconds
-_QUIET = 1e-3  # of full scale: nobody speaks
 _JAW, _PRESS = (ARTICULATORS.index(name) for name in ("jaw", "press"))
 _FOLLOWS = 0.5  # of what is new, a row
 _OPEN, _CLOSED = 0.3, 0.6  # of the lips' pressing: from which they begin to close; from which they are closed
@@ -136,12 +134,8 @@ def sounds_of(sound: Sound) -> Speech:
     Raises:
         InputError: silence, or more than 20 minutes.
     """
+    spoken_level(sound)
     seconds = sound.seconds
-    level = float(np.sqrt(np.mean(np.square(sound.samples)))) if len(sound.samples) else 0.0
-    if not _SHORTEST <= seconds <= _LONGEST:
-        raise InputError("sound", expected=f"{_SHORTEST:g} to {_LONGEST:g} seconds", received=f"{seconds:.2f}")
-    if level < _QUIET:
-        raise InputError("sound", expected="somebody who speaks", received="silence")
     heard = LipNetwork.shipped()(sound)
     path = _best_path(np.log(heard.phones + 1e-9), _CHANGE)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])

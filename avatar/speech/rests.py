@@ -1,4 +1,4 @@
-"""Rests in a recording: where it is as quiet as its own background, so that nobody moves the mouth."""
+"""Whether a recording has speech to follow, and its rests: where it is as quiet as its own background."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
 
 from avatar.speech.phonemes import SILENCE, Phoneme
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.wave_file import Sound
 
 SHORTEST = 0.16
@@ -22,7 +23,23 @@ _BELOW = 40.0  # dB below speech at which nobody speaks, however quiet the backg
 _CLEAR = 12.0  # dB that speech has to be above the background: else nothing tells rests from it
 _CLOSURE = 0.08  # seconds that a stop is silent for
 _LEFT = 0.02  # seconds: what is left of a sound may not be shorter
+_QUIET = 1e-3  # of full scale: nobody speaks in all of the sound
+_AT_LEAST, _AT_MOST = 0.1, 1200.0  # seconds of a sound
 _STOPS = frozenset(("P", "B", "T", "D", "K", "G", "CH", "JH"))
+
+
+def spoken_level(sound: Sound) -> float:
+    """Return the root mean square of a recording that somebody may speak in.
+
+    Raises:
+        InputError: silence, less than a tenth of a second, more than 20 minutes.
+    """
+    if not _AT_LEAST <= sound.seconds <= _AT_MOST:
+        raise InputError("sound", expected=f"{_AT_LEAST:g} to {_AT_MOST:g} seconds", received=f"{sound.seconds:.2f}")
+    level = float(np.sqrt(np.mean(np.square(sound.samples))))
+    if level < _QUIET:
+        raise InputError("sound", expected="somebody who speaks", received="silence")
+    return level
 
 
 def find_rests(sound: Sound) -> Float64[np.ndarray, "N 2"]:

@@ -99,6 +99,8 @@ def write_student(
     stored = load_avatar(folder / compact, sequence.rig)
     assert isinstance(stored, Student)
     quiet = replace(context, preview=lambda images: None)
-    figures = CompensateTask(sequence, stored, config, quiet).evaluate(config.iterations)
+    # Measured alone: what holds neighbours in training is not made.
+    task = CompensateTask(sequence, stored, replace(config, coherence=0.0), quiet)
+    figures = task.evaluate(config.iterations)
     measured = {kind: figures[kind] for kind in KINDS if kind in figures}
     return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}

@@ -59,6 +59,8 @@ class CompensateConfig(PhotometricConfig):
 class CompensateTask(PhotometricTask):
     """U, C and the mapping networks H and B learn from photographs by `L_rec`; field and codes are frozen.
 
+    With `coherence`, U is held to what it is when the task is made, up to ways that neighbours share.
+
     Args:
         student: with blend shapes.
     """

@@ -35,7 +35,7 @@ WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 STEPS = {"iterations": 6, "views": 2, "weights": WEIGHTS, "evaluations": 2, "evaluated": 1}
 TEACHER = FitTeacherConfig(pretrain=None, lr=1e-2, attributes=0.5, **STEPS)
 BAKE = BakeConfig(lr=1e-2, null_share=0.3, pose_noise=0.01, **STEPS)
-COMPENSATE = CompensateConfig(poses_per_step=2, lr=1e-2, null_share=0.3, attributes=0.2, **STEPS)
+COMPENSATE = CompensateConfig(poses_per_step=2, lr=1e-2, null_share=0.3, attributes=0.2, coherence=100.0, **STEPS)
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8, jaw=True)
 STUDENT = StudentConfig(field=TINY_FIELD)
 STAGES = ("teacher", "bake", "bake alone", "compensate")
