@@ -10,7 +10,7 @@ import numpy as np
 
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
 from avatar.speech.rests import find_rests, spoken_level, without_rests
-from avatar.speech.text import EXTRA, checked_text, phones_of, words_of
+from avatar.speech.text import EXTRA, checked_text, no_words, phones_of, words_of
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.wave_file import Sound
 
@@ -36,7 +36,8 @@ def align(sound: Sound, text: str | None = None) -> Speech:
 
     Raises:
         MissingExtraError: pocketsphinx is not installed.
-        InputError: silence, no words in it, a text that it does not say, more than 20 minutes.
+        InputError: silence, no words in it, a text without English words or one that cannot be laid over the sound,
+            more than 20 minutes.
     """
     seconds, level = sound.seconds, spoken_level(sound)
     try:
@@ -46,7 +47,7 @@ def align(sound: Sound, text: str | None = None) -> Speech:
     samples = sound.at_rate(_RATE)
     data = Sound(samples.samples * np.float32(_LOUD / level), _RATE).integers().tobytes()
     decoder = pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
-    words = _recognised(decoder, data) if text is None else words_of(checked_text(text))
+    words = _recognised(decoder, data) if text is None else _words(text)
     for word in dict.fromkeys(words):
         if decoder.lookup_word(word) is None:
             decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_of(word)[0]), True)
@@ -59,7 +60,10 @@ def align(sound: Sound, text: str | None = None) -> Speech:
             received="something else",
             remedy="give what is said in it as --text" if text is None else "leave --text away: it is recognised then",
         )
-    return Speech(tuple(without_rests(_clipped(found, seconds), find_rests(sound))), seconds)
+    speech = Speech(tuple(without_rests(_clipped(found, seconds), find_rests(sound))), seconds)
+    if not speech.spoken:  # words that are noises
+        raise _nobody()
+    return speech
 
 
 def _recognised(decoder: Any, data: bytes) -> list[str]:
@@ -67,13 +71,24 @@ def _recognised(decoder: Any, data: bytes) -> list[str]:
     words = [one.word.split("(")[0] for one in decoder.seg() or ()]
     words = [word for word in words if word[0] not in "<["]
     if not words:
-        raise InputError(
-            "sound",
-            expected="words of English",
-            received="none that the recogniser knows (music, noise or another language)",
-            remedy="give what is said in it as --text, or --hear sounds, which follows any language",
-        )
+        raise _nobody()
     return words
+
+
+def _words(text: str) -> list[str]:
+    words = words_of(checked_text(text))
+    if not words:
+        raise no_words(text)
+    return words
+
+
+def _nobody() -> InputError:
+    return InputError(
+        "sound",
+        expected="words of English",
+        received="none that the recogniser knows (music, noise or another language)",
+        remedy="give what is said in it as --text, or --hear sounds, which follows any language",
+    )
 
 
 def _heard(decoder: Any, data: bytes) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass, field
+import unicodedata
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
@@ -54,10 +55,12 @@ class Pronunciation:
 
     Attributes:
         ipa: in espeak-ng's manner, words apart, with the text's pauses. guessed: words spelled out by rules.
+        foreign: words left out, whose letters the language does not have.
     """
 
     ipa: str
     guessed: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
 
 
 def checked_text(text: str) -> str:
@@ -89,10 +92,10 @@ def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
         InputError: nothing to say, a language that cannot be pronounced, an espeak-ng that fails.
         MissingExtraError: neither the program nor the dictionary is installed.
     """
-    text = checked_text(text)
+    text, foreign = _legible(checked_text(text), language)
     program = shutil.which("espeak-ng")
     if program is not None:
-        return Pronunciation(_by_espeak(program, text, language))
+        return Pronunciation(_by_espeak(program, text, language), foreign=foreign)
     if not language.startswith("en"):
         raise InputError(
             f"language {language}",
@@ -100,7 +103,17 @@ def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
             received="no program espeak-ng on this machine for others",
             remedy="apt-get install espeak-ng",
         )
-    return _by_dictionary(text)
+    return replace(_by_dictionary(text), foreign=foreign)
+
+
+def no_words(text: str) -> InputError:
+    """What to say of a text in which nothing can be pronounced."""
+    return InputError(
+        "text",
+        expected="words that the voice's language has",
+        received=repr(text[:40]),
+        remedy="a recording in any language is followed by its sounds (--audio), and --voice names another voice",
+    )
 
 
 def words_of(text: str) -> list[str]:
@@ -149,6 +162,31 @@ def cmu_dictionary() -> dict[str, str]:
     return {row[0]: row[1].strip() for row in rows if len(row) == 2}
 
 
+def _legible(text: str, language: str) -> tuple[str, list[str]]:
+    """The text without words in letters that English does not have, and these; others' letters are not known here.
+
+    espeak-ng would say the names of such letters.
+
+    Raises:
+        InputError: no other word.
+    """
+    if not language.startswith("en"):
+        return text, []
+    words = text.split()
+    foreign = [word for word in words if _is_foreign(word)]
+    left = " ".join(word for word in words if word not in foreign)
+    if foreign and not any(one.isalnum() for one in left):
+        raise no_words(text)
+    return left, [word.strip(PAUSES) for word in foreign]
+
+
+def _is_foreign(word: str) -> bool:
+    """Whether letters are of another script; one Greek letter alone is a sign, whose name is said."""
+    letters = [unicodedata.name(one, "") for one in word if unicodedata.category(one) in ("Lu", "Ll", "Lt", "Lo")]
+    strange = [name for name in letters if not name.startswith(("LATIN", "MICRO", "FEMININE", "MASCULINE"))]
+    return bool(strange) and not (len(letters) == 1 and strange[0].startswith("GREEK"))
+
+
 def _stressed(phones: str) -> list[str]:
     """Give a word its likely stress, which the dictionary leaves out: on its first full vowel, or its first.
 
@@ -190,13 +228,16 @@ def _by_dictionary(text: str) -> Pronunciation:
         phones, guessed = phones_of(token)
         it.guessed += [token] if guessed and token not in it.guessed else []
         it.ipa += (" " if it.ipa else "") + ipa_from_arpabet(phones)
+    if not it.ipa.strip(f" {PAUSES}"):
+        raise no_words(text)
     return it
 
 
 def _tokens(text: str) -> list[str]:
-    """Words in lower case and pauses, numbers in words."""
+    """Words in lower case without accents, and pauses; numbers in words."""
     out: list[str] = []
-    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", text.lower().replace("’", "'")):
+    plain = "".join(one for one in unicodedata.normalize("NFKD", text) if not unicodedata.combining(one))
+    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", plain.lower().replace("’", "'")):
         out += _in_words(token) if token.isdigit() else [token]
     return out
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.speech.phonemes import SILENCE, Phoneme, Speech, arpabet_from_ipa
-from avatar.speech.text import EXTRA, PAUSES, pronounce
+from avatar.speech.text import EXTRA, PAUSES, no_words, pronounce
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.onnx_file import OnnxModel
@@ -30,11 +30,24 @@ class Spoken:
 
     Attributes:
         sound, speech: heard, and its phonemes in time. guessed: words that were spelled out by rules.
+        foreign: words that were left out.
     """
 
     sound: Sound
     speech: Speech
-    guessed: list[str]
+    guessed: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+
+    @property
+    def said(self) -> list[str]:
+        """What a listener may wonder at, a sentence each."""
+        out = []
+        if self.guessed:
+            words = ", ".join(self.guessed)
+            out.append(f"no dictionary has {words}: pronounced by spelling; espeak-ng knows more")
+        if self.foreign:
+            out.append(f"left out, since the voice's language does not have its letters: {', '.join(self.foreign)}")
+        return out
 
 
 class PiperVoice:
@@ -79,7 +92,7 @@ class PiperVoice:
         """
         said = pronounce(text, language=self.language)
         spoken = self.read(said.ipa, slower=slower)
-        return replace(spoken, guessed=said.guessed)
+        return replace(spoken, guessed=said.guessed, foreign=said.foreign)
 
     def read(self, ipa: str, *, slower: float = 1.0, noise: float = 0.0) -> Spoken:
         """Speak sounds that are written in IPA as espeak-ng writes them.
@@ -87,6 +100,9 @@ class PiperVoice:
         Args:
             slower: factor of the durations.
             noise: of the voice and of its durations, which differ every time then; Piper's own is about 0.7.
+
+        Raises:
+            InputError: no sound that the voice has.
         """
         sounds, phonemes, at = [], [], 0.0
         for sentence in re.findall(r"[^.!?]+[.!?]*", ipa):
@@ -96,8 +112,10 @@ class PiperVoice:
             phonemes += [replace(one, start=one.start + at, end=one.end + at) for one in own]
             sounds.append(samples)
             at += len(samples) / self.rate
+        if not phonemes:
+            raise no_words(ipa)
         sound = Sound(np.concatenate(sounds), self.rate)
-        return Spoken(sound, Speech(tuple(phonemes), sound.seconds), [])
+        return Spoken(sound, Speech(tuple(phonemes), sound.seconds))
 
     def _sentence(self, ipa: str, slower: float, noise: float) -> tuple[np.ndarray, list[Phoneme]]:
         """Samples of a sentence, and its phonemes by the voice's own durations."""

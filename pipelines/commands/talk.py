@@ -188,9 +188,7 @@ class Talk:
         from avatar.speech.voice import PiperVoice
 
         spoken = PiperVoice(self.voice).say(self.text or "")
-        guessed = ", ".join(spoken.guessed)
-        said = [f"no dictionary has {guessed}: pronounced by spelling; espeak-ng knows more"] if guessed else []
-        return _Heard(spoken.sound, spoken.speech, said, None if model is None else model(spoken.sound))
+        return _Heard(spoken.sound, spoken.speech, spoken.said, None if model is None else model(spoken.sound))
 
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"

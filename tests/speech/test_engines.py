@@ -114,6 +114,26 @@ def test_silence_and_a_blip_are_refused(recogniser):
         align(Sound(np.ones(100, np.float32), 16_000))
 
 
+def test_a_text_without_an_english_word_is_not_laid_over_a_recording(spoken, recogniser):
+    with pytest.raises(InputError, match="text: expected words"):
+        align(spoken.sound, "Привет")
+
+
+def test_tones_that_are_taken_for_noises_alone_are_no_speech(recogniser):
+    """They gave a motion with a still mouth, and nothing was said."""
+    t = np.arange(4 * 16_000) / 16_000
+    swell = 1 + 0.2 * np.sign(np.sin(4 * np.pi * t))
+    chord = sum(0.2 * np.sin(2 * np.pi * hertz * t * swell) for hertz in (220, 277, 330, 440))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
+    with pytest.raises(InputError, match="words of English"):
+        align(Sound(np.clip(chord + noise, -1.0, 1.0).astype(np.float32), 16_000))
+
+
+def test_sounds_that_a_voice_does_not_have_are_refused(spoken):
+    with pytest.raises(InputError, match="voice's language"):
+        PiperVoice(threads=1).read("¤ ¤")
+
+
 def test_music_is_refused_or_heard_as_few_words(recogniser):
     """Chords with a beat: no words, or as few as a recogniser takes for them; in the sound's bounds at any rate."""
     t = np.arange(6 * 16_000) / 16_000

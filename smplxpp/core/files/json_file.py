@@ -117,8 +117,12 @@ def as_numbers(
     """
     array = _number_array(value)
     wanted = "" if shape is None else f" of shape ({', '.join('any' if n is None else str(n) for n in shape)})"
-    if array is None or (finite and not np.isfinite(array).all()):
+    if array is None:
         raise InputError(subject, expected=f"{'finite ' if finite else ''}numbers{wanted}", received=shown(value))
+    if finite and not np.isfinite(array).all():
+        bad = ~np.isfinite(array)
+        received = f"NaN or infinity, {int(bad.sum())} of {bad.size}, the first at {np.argwhere(bad)[0].tolist()}"
+        raise InputError(subject, expected=f"finite numbers{wanted}", received=received)
     if shape is not None and not (
         array.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
     ):
