@@ -26,7 +26,7 @@ from avatar.export.bundle import BundleExtras, write_bundle
 from avatar.runtime import AvatarPlayer
 from benchmarks.machine import store_results
 from benchmarks.runtime import from_the_front, poses_of, students_of
-from pipelines.web.page import PageLight, single_page
+from pipelines.web.page import PageContent, PageLight, single_page
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.camera import Camera
 from smplxpp.core.light import Irradiance, Relighting
@@ -171,7 +171,7 @@ def drawn(path: Path, camera: Camera, pictures: int) -> dict[str, dict[str, floa
         file = Path(folder) / "player.html"
         studio = Irradiance.of_environment(panoramas()[STUDIO]).exposed()
         light = PageLight(STUDIO, Relighting(studio, Irradiance.uniform()))
-        file.write_bytes(single_page(path.read_bytes(), name="benchmark", light=light))
+        file.write_bytes(single_page(path.read_bytes(), PageContent(name="benchmark", light=light)))
         for renderer in ("webgl2", "webgpu"):
             page.go(f"{file.as_uri()}?renderer={renderer}")
             page.evaluate("smplxppPlayer.player.playing = false")

@@ -16,7 +16,7 @@ from pipelines.commands.animate_student import StudentFilm, open_student, studen
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.talking_page import check_page_path, write_talking_page
-from pipelines.commands.talking_person import person_of_bundle, person_of_run
+from pipelines.commands.talking_person import live_lips, person_of_bundle, person_of_run
 from pipelines.figures.film import write_film
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -106,7 +106,8 @@ class Talk:
                 self._film(self.out, bundle, motion, sound, said)
             if self.web is not None:
                 assert file is not None and bundle is not None
-                write_talking_page(self.web, file, motion, sound, name=bundle.about.name)
+                name, lips = bundle.about.name, live_lips(bundle)
+                write_talking_page(self.web, file, motion, sound, name=name, lips=lips)
         answer = {
             "out": None if self.out is None else str(self.out),
             "web": None if self.web is None else str(self.web),

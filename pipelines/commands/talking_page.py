@@ -27,20 +27,24 @@ def check_page_path(path: Path) -> None:
         raise InputError(f"output {path}", expected="a folder, or nothing yet", received="a file")
 
 
-def write_talking_page(path: Path, bundle: Path, motion: BodyParams, sound: Sound, *, name: str) -> None:
+def write_talking_page(
+    path: Path, bundle: Path, motion: BodyParams, sound: Sound, *, name: str, lips: bytes | None
+) -> None:
     """Write the page, each file of it whole or not at all.
 
     Args:
         bundle: file of the avatar; what it plays is the motion. sound: from the motion's first frame on.
+        lips: of the avatar, for live sound.
     """
     from avatar.runtime.bundle import SUFFIX, save_with_motion
-    from pipelines.web.page import single_page, write_page_folder
+    from pipelines.web.page import PageContent, single_page, write_page_folder
 
     with tempfile.TemporaryDirectory() as folder:
         talking = Path(folder) / f"me{SUFFIX}"
         save_with_motion(talking, bundle, motion)
         data = read_bytes(talking, subject="avatar")
+    content = PageContent(name=name, sound=wave_bytes(sound), lips=lips)
     if path.suffix:
-        atomic_write_bytes(path, single_page(data, name=name, sound=wave_bytes(sound)))
+        atomic_write_bytes(path, single_page(data, content))
     else:
-        write_page_folder(path, data, name=name, sound=wave_bytes(sound))
+        write_page_folder(path, data, content)

@@ -12,6 +12,7 @@ from pipelines.commands.templates import load_run_template
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import PARAMS
 from smplxpp.body.retarget import Skeleton
+from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
@@ -47,6 +48,16 @@ def face_of_bundle(bundle: AvatarBundle) -> Face:
     # Only of numbered expressions is the surface asked what they do.
     body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
     return Face.of(about.expression_names, about.joint_names, _motion_of(bundle), body=body)
+
+
+def live_lips(bundle: AvatarBundle) -> bytes | None:
+    """Return what moves a bundle's mouth by live sound in a page; None for a face without a mouth that speaks."""
+    from pipelines.web.lips import lips_of
+
+    try:
+        return lips_of(face_of_bundle(bundle))
+    except InputError:
+        return None
 
 
 def person_of_run(run: Path) -> tuple[Face, Stance]:

@@ -15,14 +15,13 @@ from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES
-from pipelines.commands.talking_person import face_of_bundle
+from pipelines.commands.talking_person import live_lips
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.validation import require_between
 
 if TYPE_CHECKING:
-    from avatar.runtime import AvatarBundle
     from pipelines.web.page import PageLight
 
 
@@ -58,23 +57,21 @@ class Web:
         self._check()
         light = self._light()
         bundle, name, lips = self._bundle()
-        from pipelines.web.page import page_files, single_page, write_page_folder
+        from pipelines.web.page import PageContent, page_files, single_page, write_page_folder
 
+        content = PageContent(name=name, light=light, lips=lips)
         console = Console(stderr=self.json)
         written: dict[str, int] = {}
         if self.out is not None:
-            written |= {
-                str(path): path.stat().st_size
-                for path in write_page_folder(self.out, bundle, name=name, light=light, lips=lips)
-            }
+            written |= {str(path): path.stat().st_size for path in write_page_folder(self.out, bundle, content)}
         if self.single_file is not None:
-            page = single_page(bundle, name=name, light=light, lips=lips)
+            page = single_page(bundle, content)
             atomic_write_bytes(self.single_file, page)
             written[str(self.single_file)] = len(page)
         for path, size in written.items():
             console.print(f"{path}: {size / 1e6:.2f} MB", markup=False, soft_wrap=True)
         if self.serve:
-            self._serve(page_files(bundle, name=name, light=light, lips=lips), console)
+            self._serve(page_files(bundle, content), console)
         return {"written": written, "bundle_bytes": len(bundle)}
 
     def _check(self) -> None:
@@ -114,7 +111,7 @@ class Web:
                 path = Path(folder) / f"me{SUFFIX}"
                 export_bundle(self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False)
                 name = self.name or self.source.resolve().name
-                return read_bytes(path, subject="avatar"), name, _lips(load_bundle(path))
+                return read_bytes(path, subject="avatar"), name, live_lips(load_bundle(path))
         given = [option for option in ("params", "name", "licence") if getattr(self, option)]
         if given:
             raise InputError(
@@ -125,7 +122,7 @@ class Web:
             )
         data = read_bytes(self.source, subject="avatar", most=MOST_AVATAR_BYTES)
         bundle = load_bundle(self.source)
-        return data, bundle.about.name, _lips(bundle)
+        return data, bundle.about.name, live_lips(bundle)
 
     def _serve(self, files: dict[str, bytes], console: Console) -> None:
         from pipelines.web.server import PageServer
@@ -138,13 +135,3 @@ class Web:
                 server.serve_forever()
             except KeyboardInterrupt:
                 pass
-
-
-def _lips(bundle: AvatarBundle) -> bytes | None:
-    """What moves the mouth by live sound; None for a face without a mouth that speaks."""
-    from pipelines.web.lips import lips_of
-
-    try:
-        return lips_of(face_of_bundle(bundle))
-    except InputError:
-        return None

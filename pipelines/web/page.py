@@ -61,33 +61,46 @@ class PageLight:
         return json.dumps({"name": self.name, "turn": self.turn, **numbers})
 
 
-def page_files(
-    bundle: bytes,
-    *,
-    name: str,
-    sound: bytes | None = None,
-    light: PageLight | None = None,
-    lips: bytes | None = None,
-) -> dict[str, bytes]:
-    """Return the files of a folder that plays a bundle, by name.
+@dataclass(frozen=True, kw_only=True)
+class PageContent:
+    """What a page has beside its avatar.
 
-    Args:
+    Attributes:
         name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
         light: that the avatar is shown in; None: the capture's.
         lips: of `pipelines.web.lips.lips_of`, by which live sound moves the mouth; None: it does not.
     """
-    beside = {kind: content for kind, content in (("sound", sound), ("lips", lips)) if content is not None}
+
+    name: str
+    sound: bytes | None = None
+    light: PageLight | None = None
+    lips: bytes | None = None
+
+    @property
+    def beside(self) -> dict[str, bytes]:
+        """What the page's script takes beside the avatar, by kind."""
+        given = {"sound": self.sound, "lips": self.lips}
+        return {kind: data for kind, data in given.items() if data is not None}
+
+    @property
+    def lit(self) -> str:
+        """The attribute of the page's light."""
+        return "" if self.light is None else f' data-light="{html.escape(self.light.text)}"'
+
+
+def page_files(bundle: bytes, content: PageContent) -> dict[str, bytes]:
+    """Return the files of a folder that plays a bundle, by name."""
     names = {"sound": SOUND, "lips": LIPS}
     page = _PAGE.format(
         policy=_POLICY.format(script="'self' blob:", connect="connect-src *"),
-        title=html.escape(name),
+        title=html.escape(content.name),
         attributes=f' data-avatar="{AVATAR}"'
-        + "".join(f' data-{kind}="{names[kind]}"' for kind in beside)
-        + _lit(light),
+        + "".join(f' data-{kind}="{names[kind]}"' for kind in content.beside)
+        + content.lit,
         body=f'<script src="{SCRIPT}"></script>',
     )
     files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
-    return {**files, **{names[kind]: content for kind, content in beside.items()}}
+    return {**files, **{names[kind]: data for kind, data in content.beside.items()}}
 
 
 def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str]) -> dict[str, bytes]:
@@ -105,55 +118,34 @@ def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str])
     return {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
 
 
-def write_page_folder(
-    folder: str | Path,
-    bundle: bytes,
-    *,
-    name: str,
-    sound: bytes | None = None,
-    light: PageLight | None = None,
-    lips: bytes | None = None,
-) -> list[Path]:
+def write_page_folder(folder: str | Path, bundle: bytes, content: PageContent) -> list[Path]:
     """Write `page_files` into a folder, each whole or not at all; other files in it stay.
 
     Returns:
         The files.
     """
     paths = []
-    for file, content in page_files(bundle, name=name, sound=sound, light=light, lips=lips).items():
+    for file, data in page_files(bundle, content).items():
         paths.append(Path(folder) / file)
-        atomic_write_bytes(paths[-1], content)
+        atomic_write_bytes(paths[-1], data)
     return paths
 
 
-def single_page(
-    bundle: bytes,
-    *,
-    name: str,
-    sound: bytes | None = None,
-    light: PageLight | None = None,
-    lips: bytes | None = None,
-) -> bytes:
+def single_page(bundle: bytes, content: PageContent) -> bytes:
     """Return one page with everything in it, which opens from disk and asks no network for anything."""
     # Neither may end the element that it stands in.
     script = _script().replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    inlined = {"avatar": bundle, "sound": sound, "lips": lips}
-    data = [
-        f'<script type="text/plain" id="{kind}-data">{base64.b64encode(content).decode()}</script>\n'
-        for kind, content in inlined.items()
-        if content is not None
-    ]
+    inlined = "".join(
+        f'<script type="text/plain" id="{kind}-data">{base64.b64encode(data).decode()}</script>\n'
+        for kind, data in {"avatar": bundle, **content.beside}.items()
+    )
     page = _PAGE.format(
         policy=_POLICY.format(script="'unsafe-inline' blob:", connect="connect-src 'none'"),
-        title=html.escape(name),
-        attributes=_lit(light),
-        body=f"{''.join(data)}<script>{script}</script>",
+        title=html.escape(content.name),
+        attributes=content.lit,
+        body=f"{inlined}<script>{script}</script>",
     )
     return page.encode()
-
-
-def _lit(light: PageLight | None) -> str:
-    return "" if light is None else f' data-light="{html.escape(light.text)}"'
 
 
 def _script() -> str:

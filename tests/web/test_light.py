@@ -13,7 +13,7 @@ from avatar.runtime import AvatarPlayer
 from avatar.runtime.relighting import facing_normals
 from pipelines.cli import main
 from pipelines.commands.lighting import read_light
-from pipelines.web.page import PageLight, page_files
+from pipelines.web.page import PageContent, PageLight, page_files
 from pipelines.web.server import PageServer
 from smplxpp.core.light import Irradiance, Relighting, panorama_directions
 from tests.core.files.radiance import write_radiance
@@ -124,7 +124,7 @@ def test_pictures_in_another_light_are_those_of_the_runtime(browser, avatar, pan
     """A page that comes with a light, one that is dropped on it, turned and switched off."""
     captured = Irradiance.of_environment(np.linspace(0.2, 1.0, 8)[:, None, None] * np.ones((8, 16, 3))).exposed()
     light = PageLight("evening <b>", Relighting(read_light(panorama).exposed(), captured), turn=30.0)
-    files = page_files(avatar.read_bytes(), name=NAME, light=light)
+    files = page_files(avatar.read_bytes(), PageContent(name=NAME, light=light))
     with PageServer(files) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser.errors.clear()

@@ -13,12 +13,14 @@ import pytest
 from avatar.speech import ARTICULATORS, Face
 from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, steady
 from avatar.speech.sound_features import FRAME, RATE, hear
+from pipelines.commands.talking_page import write_talking_page
 from pipelines.web.lips import lips_of
-from pipelines.web.page import page_files, single_page
+from pipelines.web.page import PageContent, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.body import load_body
 from smplxpp.core.files.wave_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
+from tests.dolls.dancing import dance
 from tests.web.avatars import NAME
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
@@ -151,7 +153,7 @@ def deaf(tmp_path_factory) -> Iterator[Page]:
 
 def opened(browser: Page, avatar: Path) -> PageServer:
     browser.errors.clear()
-    server = PageServer(page_files(avatar.read_bytes(), name=NAME, lips=dolls_lips(avatar)))
+    server = PageServer(page_files(avatar.read_bytes(), PageContent(name=NAME, lips=dolls_lips(avatar))))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     browser.go(server.address)
     browser.click("h1")
@@ -239,8 +241,8 @@ def test_what_goes_wrong_is_said(deaf, avatar):
 
 def test_one_file_has_it_and_a_page_without_lips_has_no_voice(deaf, avatar, tmp_path):
     whole, bare = tmp_path / "whole.html", tmp_path / "bare.html"
-    whole.write_bytes(single_page(avatar.read_bytes(), name=NAME, lips=dolls_lips(avatar)))
-    bare.write_bytes(single_page(avatar.read_bytes(), name=NAME))
+    whole.write_bytes(single_page(avatar.read_bytes(), PageContent(name=NAME, lips=dolls_lips(avatar))))
+    bare.write_bytes(single_page(avatar.read_bytes(), PageContent(name=NAME)))
     deaf.go(whole.as_uri())
     assert deaf.evaluate(f"!!{LIPS} && !!{VOICE_TAB}")
     assert deaf.evaluate(f"{LIPS}.mouth().every(value => value === 0)")
@@ -248,8 +250,21 @@ def test_one_file_has_it_and_a_page_without_lips_has_no_voice(deaf, avatar, tmp_
     assert deaf.evaluate(f"{LIPS} === null && !{VOICE_TAB}")
 
 
+def test_a_page_that_talks_has_live_lips_too(deaf, avatar, tmp_path):
+    """It had the sound alone, and no Voice among its settings."""
+    sound, lips = babble(1.0, 16_000), dolls_lips(avatar)
+    for path in (tmp_path / "page.html", tmp_path / "folder"):
+        write_talking_page(path, avatar, dance(), sound, name=NAME, lips=lips)
+    deaf.go((tmp_path / "page.html").as_uri())
+    assert deaf.evaluate(f"!!{LIPS} && !!{VOICE_TAB} && !!smplxppPlayer.player.clock")
+    assert (tmp_path / "folder" / "lips.safetensors").read_bytes() == lips
+    assert (tmp_path / "folder" / "sound.wav").read_bytes() == wave_bytes(sound)
+
+
 def test_damaged_lips_are_said(deaf, avatar, tmp_path):
-    (tmp_path / "page.html").write_bytes(single_page(avatar.read_bytes(), name=NAME, lips=dolls_lips(avatar)[:5000]))
+    (tmp_path / "page.html").write_bytes(
+        single_page(avatar.read_bytes(), PageContent(name=NAME, lips=dolls_lips(avatar)[:5000]))
+    )
     deaf.go((tmp_path / "page.html").as_uri())
     deaf.until("document.querySelector('.card.failed')")
     assert "lips" in deaf.evaluate("document.querySelector('.card.failed').innerText")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from pipelines.cli import main
-from pipelines.web.page import page_files, single_page, write_page_folder
+from pipelines.web.page import PageContent, page_files, single_page, write_page_folder
 from pipelines.web.server import PageServer
 from smplxpp.core.errors import InputError
 from tests.web.avatars import write_avatar
@@ -66,18 +66,18 @@ def test_a_taken_port_gives_way_to_the_next(server):
 
 def test_a_folder_keeps_what_else_is_in_it(tmp_path):
     (tmp_path / "mine.txt").write_text("kept")
-    paths = write_page_folder(tmp_path, b"bundle", name="A & B")
+    paths = write_page_folder(tmp_path, b"bundle", PageContent(name="A & B"))
     assert sorted(path.name for path in paths) == ["index.html", "me.avatar", "player.js"]
     assert (tmp_path / "mine.txt").read_text() == "kept"
     assert "<title>A &amp; B</title>" in (tmp_path / "index.html").read_text()
 
 
 def test_a_single_page_refers_to_nothing_outside():
-    page = single_page(b"\0\1bundle", name="</title><script>").decode()
+    page = single_page(b"\0\1bundle", PageContent(name="</title><script>")).decode()
     assert "</title><script>" not in page
     assert not re.search(r"""(?:src|href)=["'](?!data:)""", page.split("<script>")[0])
     assert page.count("</script>") == 2
-    assert page_files(b"", name="x").keys() == {"index.html", "player.js", "me.avatar"}
+    assert page_files(b"", PageContent(name="x")).keys() == {"index.html", "player.js", "me.avatar"}
 
 
 def test_the_command_writes_a_folder_and_a_file(tmp_path):

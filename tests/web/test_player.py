@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime import AvatarPlayer
-from pipelines.web.page import page_files, single_page
+from pipelines.web.page import PageContent, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.core.params import BodyParams
 from tests.cloth.test_driver import swaying
@@ -39,7 +39,7 @@ RENDERERS = {"webgpu": "WebGPU", "webgl2": "WebGL2"}
 @pytest.fixture(scope="module", params=RENDERERS)
 def player(request, browser, avatar) -> Iterator[Page]:
     """The page that a server gives, with either renderer."""
-    with PageServer(page_files(avatar.read_bytes(), name=NAME)) as server:
+    with PageServer(page_files(avatar.read_bytes(), PageContent(name=NAME))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser.errors.clear()
         browser.go(f"{server.address}?renderer={request.param}")
@@ -114,7 +114,7 @@ def test_a_lost_context_comes_back(player):
 
 def test_one_file_opens_from_disk_and_asks_no_network(browser, avatar, tmp_path):
     page = tmp_path / "player.html"
-    page.write_bytes(single_page(avatar.read_bytes(), name=NAME))
+    page.write_bytes(single_page(avatar.read_bytes(), PageContent(name=NAME)))
     browser.errors.clear()
     browser.go(page.as_uri())
     assert browser.evaluate("document.querySelector('h1').textContent") == NAME
@@ -132,7 +132,7 @@ def test_loose_clothes_are_simulated(browser, tmp_path):
     path = tmp_path / "dressed.avatar"
     write_dressed(path, BodyParams.concatenate([swaying(k / SWAY_FPS) for k in range(16)]))
     page = tmp_path / "player.html"
-    page.write_bytes(single_page(path.read_bytes(), name=NAME))
+    page.write_bytes(single_page(path.read_bytes(), PageContent(name=NAME)))
     browser.go(page.as_uri())
     browser.errors.clear()
     # What the page shows by itself between the pictures leaves the clothes alone.
@@ -195,7 +195,7 @@ def test_what_is_wrong_with_a_file_is_said(browser, avatar, tmp_path, kind):
     data, word = damaged(avatar)[kind]
     page = tmp_path / "player.html"
     if not browser.evaluate("!!window.smplxppPlayer"):
-        page.write_bytes(single_page(avatar.read_bytes(), name=NAME))
+        page.write_bytes(single_page(avatar.read_bytes(), PageContent(name=NAME)))
         browser.go(page.as_uri())
     browser.errors.clear()
     text = base64.b64encode(data).decode()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime.bundle import load_bundle, save_with_motion
-from pipelines.web.page import page_files, single_page
+from pipelines.web.page import PageContent, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.core.files.wave_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
@@ -64,11 +64,11 @@ def test_a_bundle_takes_another_motion_and_keeps_the_rest(talking):
 
 def test_pages_carry_the_sound(talking):
     sound = wave_bytes(clicks())
-    files = page_files(b"bundle", name=NAME, sound=sound)
+    files = page_files(b"bundle", PageContent(name=NAME, sound=sound))
     assert files["sound.wav"] == sound and b'data-sound="sound.wav"' in files["index.html"]
-    page = single_page(b"bundle", name=NAME, sound=sound).decode()
+    page = single_page(b"bundle", PageContent(name=NAME, sound=sound)).decode()
     assert page.count("</script>") == 3 and "connect-src 'none'" in page
-    assert b"data-sound" not in page_files(b"bundle", name=NAME)["index.html"]
+    assert b"data-sound" not in page_files(b"bundle", PageContent(name=NAME))["index.html"]
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def browser(tmp_path_factory) -> Iterator[Page]:
 @pytest.fixture
 def page(browser, talking) -> Iterator[Page]:
     browser.errors.clear()
-    with PageServer(page_files(talking.read_bytes(), name=NAME, sound=wave_bytes(clicks()))) as server:
+    with PageServer(page_files(talking.read_bytes(), PageContent(name=NAME, sound=wave_bytes(clicks())))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser.go(server.address)
         yield browser
@@ -130,7 +130,9 @@ def test_a_seek_and_a_speed_take_the_sound_along(page):
 
 
 def test_one_file_plays_its_sound_from_disk(browser, talking, tmp_path):
-    (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), name=NAME, sound=wave_bytes(clicks())))
+    (tmp_path / "player.html").write_bytes(
+        single_page(talking.read_bytes(), PageContent(name=NAME, sound=wave_bytes(clicks())))
+    )
     browser.errors.clear()
     browser.go((tmp_path / "player.html").as_uri())
     assert browser.evaluate("smplxppPlayer.player.playing") is False
@@ -142,7 +144,7 @@ def test_one_file_plays_its_sound_from_disk(browser, talking, tmp_path):
 
 
 def test_a_damaged_sound_is_said_and_the_motion_plays(browser, talking, tmp_path):
-    (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), name=NAME, sound=b"no sound"))
+    (tmp_path / "player.html").write_bytes(single_page(talking.read_bytes(), PageContent(name=NAME, sound=b"no sound")))
     browser.errors.clear()
     browser.go((tmp_path / "player.html").as_uri())
     browser.click(PLAY)

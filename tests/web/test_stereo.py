@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.web.page import single_page
+from pipelines.web.page import PageContent, single_page
 from tests.web.avatars import NAME, asked, camera, decibels, write_avatar
 from tests.web.chromium import Page, find_chromium
 
@@ -84,7 +84,7 @@ HEADSET = """
 def page(tmp_path_factory) -> Iterator[Page]:
     folder: Path = tmp_path_factory.mktemp("stereo")
     file = folder / "player.html"
-    file.write_bytes(single_page(write_avatar(folder / "doll.avatar"), name=NAME))
+    file.write_bytes(single_page(write_avatar(folder / "doll.avatar"), PageContent(name=NAME)))
     words = {"side": SIDE, "head": json.dumps(HEAD), "eyes": json.dumps(EYES), "tangents": json.dumps(TANGENTS)}
     with Page(folder / "browser") as it:
         it.send("Page.addScriptToEvaluateOnNewDocument", source=HEADSET % words)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.web.page import page_files, single_page
+from pipelines.web.page import PageContent, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.core.params import BodyParams
 from tests.cloth.test_driver import swaying
@@ -85,7 +85,7 @@ def threads(page: Page) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def server(avatar) -> Iterator[PageServer]:
-    with PageServer(page_files(avatar.read_bytes(), name=NAME)) as it:
+    with PageServer(page_files(avatar.read_bytes(), PageContent(name=NAME))) as it:
         threading.Thread(target=it.serve_forever, daemon=True).start()
         yield it
         it.shutdown()
@@ -95,7 +95,7 @@ def server(avatar) -> Iterator[PageServer]:
 def alone(browser, avatar, tmp_path_factory) -> list[np.ndarray]:
     """Pictures of two frames by a page from disk, which has one thread."""
     file = tmp_path_factory.mktemp("page") / "player.html"
-    file.write_bytes(single_page(avatar.read_bytes(), name=NAME))
+    file.write_bytes(single_page(avatar.read_bytes(), PageContent(name=NAME)))
     browser.go(f"{file.as_uri()}?renderer=webgl2")
     assert not browser.evaluate("crossOriginIsolated")
     browser.evaluate("smplxppPlayer.player.playing = false")
@@ -147,7 +147,7 @@ def test_simulated_clothes_take_no_harm(browser, tmp_path):
     path = tmp_path / "dressed.avatar"
     write_dressed(path, BodyParams.concatenate([swaying(k / SWAY_FPS) for k in range(6)]))
     view, file = place_camera("view", 30.0, size=(192, 256), height=0.7, target=0.7), tmp_path / "player.html"
-    file.write_bytes(single_page(path.read_bytes(), name=NAME))
+    file.write_bytes(single_page(path.read_bytes(), PageContent(name=NAME)))
 
     def pictures() -> list[np.ndarray]:
         browser.evaluate("smplxppPlayer.player.playing = smplxppPlayer.player.simulating = false")
@@ -159,7 +159,7 @@ def test_simulated_clothes_take_no_harm(browser, tmp_path):
     browser.go(f"{file.as_uri()}?renderer=webgl2")
     expected = pictures()
     assert np.abs(expected[3].astype(int) - expected[0]).max() > 20
-    with PageServer(page_files(path.read_bytes(), name=NAME)) as server:
+    with PageServer(page_files(path.read_bytes(), PageContent(name=NAME))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         opened(browser, server, "")
         # What a page shows before it is told to halt differs, and the cloth begins there: bits are not the same.
