@@ -87,6 +87,8 @@ class Build:
     """`mediapipe` (extra detect) or a pose model in ONNX: asked which way the person faces whose scan comes alone."""
     keep_webs: bool = False
     """Keep the scan's surface where it bridges two limbs, as under the arms; it tears when the pose opens them."""
+    keep_holes: bool = False
+    """Leave open what the cut of such bridges opens, instead of closing it with a patch of the least area."""
     method: Literal["ours", "paper"] = "ours"
     """Skin-weight transfer: ours, or robust transfer exactly as published."""
     budgets: Annotated[
@@ -209,6 +211,7 @@ class Build:
             "up": self.up if alone or self.up != "auto" else "y",
             "budgets": default.budgets | self.budgets,
             "webs": replace(default.webs, rounds=0) if self.keep_webs else default.webs,
+            "darning": replace(default.darning, width=0.0) if self.keep_holes else default.darning,
         }
         names = {f.name for f in dataclasses.fields(BuildConfig)} - set(changed)
         return BuildConfig(**{n: getattr(self, n) for n in names}, **changed)

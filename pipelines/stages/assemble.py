@@ -1,4 +1,4 @@
-"""Stage 60: body and parts as one template, layers apart; npz, GLB and OBJ."""
+"""Stage 60: body and parts as one template, holes of cut webs closed, layers apart; npz, GLB and OBJ."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from pipelines.runs.artefacts import (
     load_canonical,
+    load_cleaned_parts,
     load_params_of_run,
     load_parts,
     load_posed_body,
@@ -21,7 +22,14 @@ from pipelines.runs.layout import PARTS_WITHOUT_WEBS
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
-from smplxpp.assemble import AssemblyConfig, CanonicalPart, assemble_template, body_colors_from_scan
+from smplxpp.assemble import (
+    AssemblyConfig,
+    CanonicalPart,
+    assemble_template,
+    body_colors_from_scan,
+    cut_holes,
+    darn,
+)
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.labels import SKIN
 from smplxpp.export import write_glb, write_obj
@@ -33,19 +41,22 @@ from smplxpp.template.template import Template
 def run(folder: Path, build: BuildContext) -> StageOutput:
     """Write body and parts as one `Template`, layers apart; npz, GLB and OBJ."""
     body = load_body(build.inputs.body)
-    cleaned, parts = load_parts(build.run), {}
-    canonical, weights = load_canonical(build.run, cleaned), load_weights(build.run, cleaned)
+    cut, parts, darned = load_parts(build.run), {}, {}
+    canonical, weights = load_canonical(build.run, cut), load_weights(build.run, cut)
     _, _, source_vertex = load_scan(build.run)
-    for name, (_, arrays) in cleaned.items():
+    for name, (cleaned, before) in load_cleaned_parts(build.run).items():
+        mesh, arrays = cut[name]
         with values_of(build.run / PARTS_WITHOUT_WEBS):
             scan_index = source_vertex[arrays["source_vertex"]]
-        parts[name] = CanonicalPart(
+        part = CanonicalPart(
             mesh=canonical[name],
             weights=weights[name],
             label=int(arrays["label"]),
             vertex_colors=arrays["colors"],
             scan_index=scan_index,
         )
+        holes = cut_holes(cleaned, before["source_vertex"], mesh, arrays["source_vertex"])
+        parts[name], darned[name] = darn(part, holes, config=build.config.darning)
     template, report = assemble_template(
         body, load_params_of_run(build.run), parts, config=AssemblyConfig(clearance=build.config.clearance_mm / MM)
     )
@@ -82,7 +93,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
             "(10 to 30 mm) and the clearance",
         ),
     ]
-    return StageOutput(checks, report.as_dict())
+    return StageOutput(checks, report.as_dict() | {"darned": {name: one.as_dict() for name, one in darned.items()}})
 
 
 def _colored_body(template: Template, run: Path, body: BodyModel) -> Template:

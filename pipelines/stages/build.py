@@ -96,8 +96,8 @@ PARTS: dict[str, _Part] = {
     UNPOSE_STAGE: _Part(unpose, (POSE_BODY_STAGE, TRANSFER_STAGE), files=("body",)),
     ASSEMBLE_STAGE: _Part(
         assemble,
-        (CAPTURE_STAGE, POSE_BODY_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
-        settings=("clearance_mm",),
+        (CAPTURE_STAGE, POSE_BODY_STAGE, SEGMENT_STAGE, CLEAN_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+        settings=("clearance_mm", "darning"),
         files=("body",),
     ),
     VALIDATE_STAGE: _Part(

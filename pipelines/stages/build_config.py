@@ -13,6 +13,7 @@ from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, RECONSTRUCT_STAGE, R
 from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.places import absolute
 from pipelines.runs.reading import values_of
+from smplxpp.assemble import DarnConfig
 from smplxpp.clean import WebConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
@@ -91,6 +92,7 @@ class BuildConfig:
         clearance_mm: how far outer layers are kept from inner ones.
         max_influences: joints a vertex.
         webs: what of a part is cut because it bridges two limbs; no `rounds`: nothing is.
+        darning: which of the holes that this leaves are closed.
         method: "ours", or "paper" for robust transfer exactly as published.
         samples: surface samples of the validation.
         seed: of the samples.
@@ -104,6 +106,7 @@ class BuildConfig:
     clearance_mm: float = 1.0
     max_influences: int = 8
     webs: WebConfig = field(default_factory=WebConfig)
+    darning: DarnConfig = field(default_factory=DarnConfig)
     method: str = "ours"
     samples: int = 100_000
     seed: int = 0
@@ -158,9 +161,10 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
 
 def _config(values: Mapping[str, Any]) -> BuildConfig:
     require_plain_fields(BuildConfig, values, subject=BUILD_FILE)
-    webs = values.get("webs", {})
+    webs, darning = values.get("webs", {}), values.get("darning", {})
     require_plain_fields(WebConfig, webs, subject=BUILD_FILE)
-    return BuildConfig(**{**values, "webs": WebConfig(**webs)})
+    require_plain_fields(DarnConfig, darning, subject=BUILD_FILE)
+    return BuildConfig(**{**values, "webs": WebConfig(**webs), "darning": DarnConfig(**darning)})
 
 
 def _inputs(written: Mapping[str, Any]) -> BuildInputs:

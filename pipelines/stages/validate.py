@@ -146,7 +146,9 @@ def _flips(template: Template, posed: TriangleMesh, run: Path) -> int:
     turned = 0
     for name, (mesh, _) in load_parts(run).items():
         there = posed.submesh(part_of_face == template.part_names.index(name))[0]
-        turned += int((np.einsum("ij,ij->i", mesh.face_cross, there.face_cross) < 0).sum())
+        # What was darned comes behind the scan's faces.
+        scanned = there.face_cross[: mesh.face_count]
+        turned += int((np.einsum("ij,ij->i", mesh.face_cross, scanned) < 0).sum())
     return turned
 
 

@@ -2,6 +2,7 @@
 
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
+from smplxpp.assemble.darn import DarnConfig, Darning, cut_holes, darn
 from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
 from smplxpp.assemble.left_inside import LeftInside
 from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
@@ -10,6 +11,8 @@ __all__ = [
     "AssemblyConfig",
     "AssemblyReport",
     "CanonicalPart",
+    "DarnConfig",
+    "Darning",
     "LayerReport",
     "LeftInside",
     "Obstacle",
@@ -17,6 +20,8 @@ __all__ = [
     "PushConfig",
     "assemble_template",
     "body_colors_from_scan",
+    "cut_holes",
+    "darn",
     "measure_penetration",
     "push_out",
     "stand_off",

@@ -100,7 +100,13 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         ),
         readable(kept, "Parts", lambda: parts_section(run, kept, cameras, by_stage["30_clean"])),
         readable(moved, "Skin weights", lambda: weights_section(run, moved, cameras, by_stage["40_transfer"])),
-        template_section(template, by_stage["50_unpose"] + by_stage["60_assemble"]),
+        readable(
+            records[ASSEMBLE_STAGE],
+            "Template in the T-pose",
+            lambda: template_section(
+                records[ASSEMBLE_STAGE], template, by_stage["50_unpose"] + by_stage[ASSEMBLE_STAGE]
+            ),
+        ),
         readable(
             checked,
             "Back in the reference pose",

@@ -174,18 +174,23 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
     )
 
 
-def template_section(template: Template, checks: tuple[CheckRow, ...]) -> Section:
+def template_section(record: StageRecord, template: Template, checks: tuple[CheckRow, ...]) -> Section:
     """Show the template in the T-pose."""
+    # Runs from before there was any darning have none.
+    darned = record.manifest["numbers"].get("darned", {})
+    rows = tuple((name, one["holes"], one["closed"], 1e4 * one["area"]) for name, one in darned.items() if one["holes"])
     cameras = body_cameras(template.mesh, views=("front", "back"), height=POSE_HEIGHT)
     return Section(
         title="Template in the T-pose",
         text=(
-            "The parts taken back by the inverse of the skinning that drives them, on the naked body, layers apart.",
+            "The parts taken back by the inverse of the skinning that drives them, on the naked body, layers apart. "
+            "Holes that the cut of webs has left are closed by the least surface over them: nobody saw that cloth.",
         ),
         pictures=(
             Picture("colours of the scan", _sheet(template.mesh, cameras, vertex_colors=template.vertex_colors)),
             Picture("semantic colours", _sheet(template.mesh, cameras, vertex_colors=template.semantic_colors)),
         ),
+        tables=(Table(("part", "holes of cuts", "closed", "patches, cm2"), rows, "darned"),) if rows else (),
         checks=checks,
     )
 
