@@ -48,8 +48,8 @@ PARTS = (
         "Armpits that nobody saw",
         "Shirts and a jacket of synthetic people in their authored T-pose, and driven by their authored weights with "
         "arms overhead; `person_dots` is `smplxpp synth --skirt-pattern dots --frames 30 --seed 3`. Distances in mm, "
-        "mean and 95th percentile: of all points of the true garment, of those whose nearest face is a patch, and back. "
-        "The width of 8 cm up to which a hole is closed was chosen on these four.",
+        "mean and 95th percentile: of all points of the true garment, of those whose nearest face is a patch, and "
+        "back. The width of 8 cm up to which a hole is closed was chosen on these four.",
     ),
     Part("registration_woman_casual", "Registration of a woman in a wide skirt", REGISTRATION, registration_lines),
     Part("registration_man_casual", "Registration of a man", REGISTRATION + "One frame.", registration_lines),

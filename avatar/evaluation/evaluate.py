@@ -165,7 +165,7 @@ class _Run:
                 for index, (view, head) in enumerate(zip(views, heads, strict=True)):
                     pictures[index][name] = self._see(name, posed, index, view=view, frame=frame, head=head)
             if truth is not None and alone is not None:
-                if model.rig is sequence.rig and torch.equal(posed.vertices, skinned):
+                if model.rig.template is sequence.rig.template and torch.equal(posed.vertices, skinned):
                     self.surfaces[name][frame] = alone
                     continue
                 mesh = _mesh(posed.vertices, model.rig)
@@ -273,7 +273,7 @@ def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
 def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
     """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
     motion = sequence.motion(frame)
-    if model.rig is sequence.rig:
+    if model.rig.template is sequence.rig.template:
         return motion if simulates(model) else motion.without_cloth()
     return model.rig.motion(_params(sequence, frame), frame=motion.frame)
 

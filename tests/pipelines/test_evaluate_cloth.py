@@ -7,9 +7,11 @@ import shutil
 
 import pytest
 
-from pipelines.runs.layout import GARMENTS
+from pipelines.runs.layout import GARMENTS, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.stage import read_manifest
+from smplxpp.body import load_params
 from smplxpp.cloth.garment_file import save_garments
+from smplxpp.core.params import BodyParams
 from tests.cloth.persons import PART, person
 from tests.dolls.skirted import garment, write_skirted
 from tests.pipelines.test_evaluate import evaluate, refused, write_models
@@ -51,6 +53,19 @@ def test_a_simulated_skirt_is_nearer_to_the_true_one_than_a_skinned_one(trained,
     assert skinned["ran"] and moved_by_field["ran"]
     assert simulated["p2s"] < 0.6 * skinned["p2s"]
     assert moved_by_field["p2s"] not in (simulated["p2s"], skinned["p2s"])
+
+
+def test_poses_that_were_refined_have_their_skirt_simulated_too(trained, capture, tmp_path, capsys):
+    """Held-out poses "refined" to what they are give the same pictures and surfaces."""
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / REFINED_HELD_OUT_PARAMS).parent.mkdir()
+    BodyParams.concatenate([load_params(path) for path in sorted((capture / "params").glob("*.npz"))]).save(
+        run / REFINED_HELD_OUT_PARAMS
+    )
+    assert evaluate(run, capture, *FEW) == 0
+    answer = json.loads(capsys.readouterr().out)
+    own, refined = answer["models"]["student"], answer["refined_poses"]["student"]
+    assert refined["views"] == own["views"] and refined["surfaces"]["held_out"] == own["surfaces"]["held_out"]
 
 
 def test_other_garments_are_measured_anew_and_none_are_the_field(trained, capture, tmp_path, capsys):
