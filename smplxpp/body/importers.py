@@ -12,7 +12,7 @@ import numpy as np
 
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise
+from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import safe_load, safe_npz
@@ -43,6 +43,7 @@ def load_params(
     up: UpAxis | None = None,
     flat_hand_mean: bool | None = None,
     max_betas: int | None = None,
+    holes: list[int] | None = None,
 ) -> BodyParams:
     """Read body parameters of any known layout.
 
@@ -62,6 +63,8 @@ def load_params(
             and y for all others (AMASS has z up, its layout's other users have not).
         flat_hand_mean: overrides what the layout implies (see `BodyParams`).
         max_betas: keep the first so many betas, for a body that has no more.
+        holes: takes the frames of a file of several that hold NaN or infinity; another frame stands in each of them.
+            None: they are refused.
 
     Raises:
         InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes, or
@@ -79,7 +82,11 @@ def load_params(
     parts: list[Frames] = []
     absent: list[str] = []
     for file in files:
-        frames = _read_content(_content(file), name, person, f"file {file}")
+        content = _content(file)
+        if holes is not None and len(files) == 1:
+            content, empty = without_holes(content)
+            holes += empty
+        frames = _read_content(content, name, person, f"file {file}")
         if frames:
             parts.append(frames)
         else:

@@ -22,6 +22,8 @@ _JOINTS = dict(POSE_BLOCKS)
 _EASYMOCAP_HAND_PCA = 6
 # Radians and metres: nobody turns or goes farther.
 _FARTHEST = 1e6
+# Arrays that have a row a frame, one of which every layout of stacked frames has.
+_STACKED = ("global_orient", "body_pose", "poses")
 # Poses with all fingers: of SMPL-H and of SMPL-X. VPoser's numbers, which some of its models write instead.
 _EASYMOCAP_COMPLETE, _EASYMOCAP_EMBEDDING = (156, 165), 32
 
@@ -38,6 +40,26 @@ class Frames:
 
     params: BodyParams
     outer: tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]] | None = None
+
+
+def without_holes(content: Any) -> tuple[Any, list[int]]:
+    """Return a file of stacked frames whose frames with NaN or infinity are the last good ones before, and which.
+
+    Those at the start are the first good one. Files of other kinds, and without a good frame, stay as they are.
+    """
+    if not isinstance(content, Mapping):
+        return content, []
+    arrays = {name: value for name, value in content.items() if isinstance(value, np.ndarray) and value.ndim > 1}
+    counts = [len(arrays[name]) for name in _STACKED if name in arrays]
+    count = counts[0] if counts else 0
+    arrays = {name: value for name, value in arrays.items() if len(value) == count and value.dtype.kind == "f"}
+    good = np.ones(count, bool)
+    for value in arrays.values():
+        good &= (np.abs(value.reshape(count, -1)) <= _FARTHEST).all(axis=1)
+    if count < 2 or good.all() or not good.any():
+        return content, []
+    held = np.maximum.accumulate(np.where(good, np.arange(count), np.argmax(good)))
+    return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~good).tolist()
 
 
 @dataclass(frozen=True)

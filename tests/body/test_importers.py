@@ -361,8 +361,24 @@ def test_unreadable_inputs_are_named(tmp_path, params):
         load_params(tmp_path)
     bad = params.as_dict() | {"body_pose": np.full((FRAMES, 63), np.nan)}
     np.savez(tmp_path / "bad.npz", **bad)
-    with pytest.raises(InputError, match=r"bad\.npz: parameter body_pose"):
-        load_params(tmp_path / "bad.npz")
+    for holes in (None, []):  # nothing can stand in for all of them
+        with pytest.raises(InputError, match=r"bad\.npz: parameter body_pose"):
+            load_params(tmp_path / "bad.npz", holes=holes)
+
+
+def test_frames_without_a_pose_are_told_where_that_is_asked_for(params, tmp_path):
+    assert FRAMES == 3
+    for bad, stand in (((0,), (1, 1, 2)), ((1, 2), (0, 0, 0)), ((), (0, 1, 2))):
+        arrays = {name: np.array(value) for name, value in params.as_dict().items()}
+        for row in bad:
+            arrays["body_pose"][row, 5] = np.nan
+        np.savez(tmp_path / "holes.npz", **arrays)
+        holes: list[int] = []
+        assert_same(load_params(tmp_path / "holes.npz", holes=holes), params.select(list(stand)))
+        assert tuple(holes) == bad
+        if bad:
+            with pytest.raises(InputError, match="body_pose"):
+                load_params(tmp_path / "holes.npz")
 
 
 def test_the_capture_s_frames_equal_its_stacked_file(captures):
