@@ -5,21 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import ceil
 from typing import Literal
 
 import numpy as np
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
 from smplxpp.cloth.driver import LONGEST_STEP
-from smplxpp.cloth.poses import resampled, smoothed
+from smplxpp.cloth.following import SMOOTHING, followed
+from smplxpp.cloth.poses import resampled
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.template.template import Template
-
-SLOWEST = 40.0
-"""Poses a second at least that clothes follow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +33,7 @@ class ClothMotionConfig:
     """
 
     pre_roll: float = 0.7
-    smoothing: float = 0.03
+    smoothing: float = SMOOTHING
     mode: Literal["simulate", "skin"] = "simulate"
     driver: DriverConfig = field(default_factory=DriverConfig)
 
@@ -96,12 +93,11 @@ class ClothMotions:
         wanted = set(run)
         for frame in known:
             seconds = 1.0 if last is None else (frame - last) / self._fps
-            for pose in ways[frame]:
-                driver.step(pose, seconds / len(ways[frame]))
-            last = frame
             pose_drawn = self._params(frame)
-            if frame in wanted and pose_drawn is not None:
-                self._shapes[frame] = driver.over(pose_drawn)
+            shape = driver.follow(ways[frame], seconds, pose_drawn if frame in wanted else None)
+            last = frame
+            if frame in wanted:
+                self._shapes[frame] = shape
         for said in driver.said:
             warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
 
@@ -135,11 +131,7 @@ class ClothMotions:
             at = (stretch - stretch[0]) // even
             if at[-1] + 1 > len(at):
                 poses = resampled(poses, at.astype(float), np.arange(at[-1] + 1.0))
-            poses = smoothed(poses, radius=self.config.smoothing * self._fps / even)
-            times = max(1, ceil(SLOWEST * even / self._fps - 1e-6))
-            if times > 1:
-                steps = np.arange(times * at[-1] + 1.0) / times
-                poses = resampled(poses, np.arange(at[-1] + 1.0), np.minimum(steps, at[-1]))
+            poses, times = followed(poses, self._fps / even, smoothing=self.config.smoothing)
             out[int(stretch[0])] = [poses.frame(0)]
             for frame, before, now in zip(stretch.tolist()[1:], at[:-1], at[1:], strict=True):
                 out[frame] = [poses.frame(int(k)) for k in range(times * before + 1, times * now + 1)]

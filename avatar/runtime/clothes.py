@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,10 +37,19 @@ class Clothes:
         """What went otherwise than asked for."""
         return self._driver.said
 
-    def step(self, params: BodyParams, seconds: float) -> ClothShape:
-        """Go on to a pose; see `ClothDriver.step`."""
-        shape = self._driver.step(params, seconds)
+    def step(self, params: BodyParams, seconds: float, way: Sequence[BodyParams] = ()) -> ClothShape:
+        """Go on to a pose, along a way to it if there is one; see `ClothDriver.step` and `follow`."""
+        driver = self._driver
+        shape = driver.follow(way, seconds, params) if way else driver.step(params, seconds)
         return replace(shape, vertices=self._place[shape.vertices])
+
+    @property
+    def skinned(self) -> ClothShape:
+        """The clothes where the joints alone have them."""
+        garments = self._driver.garments
+        vertices = self._place[np.concatenate([one.vertices for one in garments])]
+        share = np.concatenate([one.share() for one in garments])
+        return ClothShape(vertices, np.zeros((len(vertices), 3), np.float32), share)
 
     def restart(self) -> None:
         """Forget the state: the next step starts cold."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
 
@@ -125,18 +125,25 @@ class AvatarPlayer:
         """What went otherwise than asked for with the loose clothes, a sentence each."""
         return [] if self._clothes is None else self._clothes.said
 
-    def step(self, params: BodyParams, seconds: float) -> WorldSplats:
+    @property
+    def skinned_clothes(self) -> ClothShape | None:
+        """The loose clothes where the joints alone have them, for `pose`; None where there are none."""
+        return None if self._clothes is None else self._clothes.skinned
+
+    def step(self, params: BodyParams, seconds: float, *, way: Sequence[BodyParams] = ()) -> WorldSplats:
         """Go on to a pose, the loose clothes simulated; as `pose` where the avatar has none.
 
         Args:
             params: one frame. seconds: since the last step; of the first one it does not matter.
+            way: poses, even in time, that the clothes follow to it instead: those of `smplxpp.cloth.following.ways`
+                for a motion that is known whole, or what a `smplxpp.cloth.poses.CausalSmoother` makes of it.
 
         Raises:
             InputError: several frames, no positive time, parameters of another body.
         """
         if self._clothes is None:
             return self.pose(params)
-        return self.pose(params, cloth=self._clothes.step(params, seconds))
+        return self.pose(params, cloth=self._clothes.step(params, seconds, way))
 
     def restart(self) -> None:
         """Forget how the clothes moved: the next step starts anew."""

@@ -18,7 +18,7 @@ from pipelines.commands.animate_student import StudentFilm, open_student, studen
 from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import OptionalFloat, OptionalInt
+from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
@@ -60,7 +60,7 @@ class Animate:
     """Poses of a student beyond what its training saw: said and shown as they are, or held back joint by joint."""
     codes: Literal["null", "trained"] = "null"
     """Codes of a student's field: the null code, as for any new motion, or those of its training, for a motion whose
-    rows are the frames of the training by their numbers (with --cloth skin, without --interpolate)."""
+    rows are the frames of the training by their numbers (with --cloth field, without --interpolate)."""
     interpolate: OptionalFloat = None
     """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""
     fps: OptionalFloat = None
@@ -69,9 +69,9 @@ class Animate:
     """Where the camera stands; turntable: once around over the whole film."""
     colors: Literal["scan", "labels", "semantic", "weights", "none"] = "scan"
     """Colours of the surface (pictures only; a GLB has those of the scan)."""
-    cloth: Literal["simulate", "skin"] = "simulate"
-    """What moves the loose clothes that the run has found (83_cloth), or that --loose-parts names: a simulation, or the
-    joints alone. A GLB's clothes always follow the joints."""
+    cloth: ClothMode = "simulate"
+    """What moves the loose clothes that the run has found (83_cloth), or that --loose-parts names: a simulation, the
+    joints alone, or (students) their own field. A GLB's clothes always follow the joints."""
     loose_parts: tuple[str, ...] = ()
     """Simulate these parts of the template, in the place of those that training found."""
     height: int = 720
@@ -137,17 +137,18 @@ class Animate:
             motion = resampled(motion, self.interpolate)
             shown = range(round(first / (fps * self.step) * self.interpolate), len(motion))
             fps = self.interpolate
-        simulated = [] if self.cloth == "skin" else [row["part"] for row in bundle.garments_about.get("garments", [])]
+        loose = bundle.garments_about.get("garments", [])
+        simulated = [row["part"] for row in loose] if self.cloth == "simulate" else []
         if simulated and self.codes == "trained":
             received = f"simulated: {', '.join(simulated)}"
             raise InputError(
-                "option codes trained", expected="clothes as training had them (--cloth skin)", received=received
+                "option codes trained", expected="clothes as training had them (--cloth field)", received=received
             )
         film = StudentFilm(
             view=self.view,
             height=self.height,
             width=self.width,
-            simulate=bool(simulated),
+            cloth=self.cloth,
             clamp=self.outside == "clamp",
             numbered_from=begin if self.codes == "trained" else None,
             relighting=self.lighting.relighting(),
@@ -178,6 +179,12 @@ class Animate:
             raise InputError(f"output {self.out}", expected=".mp4, .gif or a folder for a student", received=".glb")
         if suffix == ".glb" and self.lighting.environment is not None:
             raise InputError("option environment", expected="a film or pictures", received=f"output {self.out}")
+        if self.cloth == "field" and not self._of_student:
+            expected = "simulate or skin for the template, which has no field"
+            raise InputError("option cloth", expected=expected, received="field", remedy="--model student has one")
+        if self.loose_parts and self._of_student:
+            expected = "none for a student, whose loose parts its training found"
+            raise InputError("option loose-parts", expected=expected, received=" ".join(self.loose_parts))
         if self.codes == "trained" and (self.interpolate is not None or not self._of_student):
             raise InputError(
                 "option codes trained",

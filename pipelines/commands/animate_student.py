@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,9 @@ from jaxtyping import UInt8
 
 from pipelines.commands.driving import Driving
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
+from pipelines.commands.options import ClothMode
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
+from smplxpp.cloth.following import ways
 from smplxpp.core.camera import Camera
 from smplxpp.core.light import Relighting
 from smplxpp.core.params import BodyParams
@@ -33,7 +36,8 @@ class StudentFilm:
 
     Attributes:
         view: name of a view, or "turntable". height, width: pixels; no width: as wide as the motion needs.
-        simulate: the loose clothes. clamp: joints turn no farther than in training.
+        cloth: what moves loose clothes: a simulation, the student's own field, or the joints alone.
+        clamp: joints turn no farther than in training.
         numbered_from: number of the motion's first frame, where its frames are the training's: those that have a code
             take it; None: the null code.
         relighting: the light that the person is shown in; None: that of the capture.
@@ -43,7 +47,7 @@ class StudentFilm:
     view: str
     height: int
     width: int | None
-    simulate: bool
+    cloth: ClothMode
     clamp: bool
     numbered_from: int | None = None
     relighting: Relighting | None = None
@@ -133,14 +137,17 @@ def _pictures(
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     picture = dict(zip(shown, cameras, strict=True))
     coded = set() if film.numbered_from is None else set(player.bundle.about.frames)
-    for k in range(len(motion)):
+    simulate, fps = film.cloth == "simulate" and player.has_clothes, motion.fps or 1.0
+    skinned = player.skinned_clothes if film.cloth == "skin" else None
+    paths = ways(motion, fps) if simulate else repeat([], len(motion))
+    for k, way in enumerate(paths):
         number = k + (film.numbered_from or 0)
-        if film.simulate:
-            player.step(motion.frame(k), 1.0 / (motion.fps or 1.0))
+        if simulate:
+            player.step(motion.frame(k), 1.0 / fps, way=way)
         if k not in picture:
             continue
-        if not film.simulate:
-            player.pose(motion.frame(k), frame=number if number in coded else None)
+        if not simulate:
+            player.pose(motion.frame(k), frame=number if number in coded else None, cloth=skinned)
         image, _ = player.draw(picture[k], background=_BACKGROUND, relighting=film.relighting)
         yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     said += player.said

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import OptionalPath, OptionalText, require_avatar
+from pipelines.commands.options import ClothMode, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
@@ -52,7 +52,7 @@ class Evaluate:
     held_out_poses: Literal["tracked", "both"] = "both"
     """Poses of held-out frames: as tracked, or beside them those that the run refined on the training cameras, where it
     has any."""
-    cloth: Literal["simulate", "field", "skin"] = "simulate"
+    cloth: ClothMode = "simulate"
     """What moves the loose clothes of a student in held-out poses: a simulation, where the run has found loose parts;
     its field; or skinning alone."""
     params: OptionalPath = None

@@ -12,7 +12,7 @@ from rich.console import Console
 from pipelines.commands.export_bundle import export_bundle
 from pipelines.commands.export_files import FileRequest, export_file, format_of
 from pipelines.commands.export_solid import SolidRequest, export_solid, tell_solid
-from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
 
 
@@ -43,8 +43,9 @@ class Export:
     """Of what moves: the row after the last one."""
     step: int = 1
     """Of what moves: take every step-th row."""
-    cloth: Literal["simulate", "skin"] = "simulate"
-    """What moves loose clothes in splats and OBJ files of --params: a simulation, or the joints alone."""
+    cloth: ClothMode = "simulate"
+    """What moves loose clothes in splats and OBJ files of --params: a simulation, the joints alone, or (splats) the
+    student's own field."""
     full_harmonics: bool = False
     """Fill a PLY up with zeros to harmonics of degree 3: some importers (Unity's) take no others."""
     up: Literal["y", "-y", "z"] = "y"
@@ -100,7 +101,7 @@ class Export:
             model=self.model,
             params=self.params,
             rows=(self.frame, self.stop, self.step),
-            simulate=self.cloth == "simulate",
+            cloth=self.cloth,
             full_harmonics=self.full_harmonics,
             up=self.up,
             quiet=self.json,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipelines.commands.options import ClothMode
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 
@@ -42,7 +43,7 @@ class FileRequest:
         model: "student" or "template", for formats that hold either.
         params: of the pose or the motion; None: those of the source.
         rows: of the parameters: the first, the one after the last (None: to the end), and the step.
-        simulate: loose clothes. full_harmonics, up: of a PLY. quiet: no bar of progress.
+        cloth: what moves loose clothes along params. full_harmonics, up: of a PLY. quiet: no bar of progress.
     """
 
     source: Path
@@ -51,7 +52,7 @@ class FileRequest:
     model: str = "student"
     params: Path | None = None
     rows: tuple[int, int | None, int] = (0, None, 1)
-    simulate: bool = True
+    cloth: ClothMode = "simulate"
     full_harmonics: bool = False
     up: str = "y"
     quiet: bool = True

@@ -13,6 +13,8 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import motion_for, open_student
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
+from pipelines.commands.options import ClothMode
+from smplxpp.cloth.following import ways
 from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
@@ -41,7 +43,8 @@ def writers(
     rows = request.chosen(len(motion), moves=moves)
     fps = request.rate(motion) if moves and len(rows) > 1 else None
     said = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
-    splats = _posed(player, motion, rows, simulate=request.simulate and request.params is not None, said=said)
+    cloth = request.cloth if request.params is not None or request.cloth != "simulate" else "field"
+    splats = _posed(player, motion, rows, cloth=cloth, said=said)
     shown = track(
         splats,
         total=len(rows),
@@ -72,19 +75,20 @@ def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
 
 
 def _posed(
-    player: AvatarPlayer, motion: BodyParams, rows: range, *, simulate: bool, said: list[str]
+    player: AvatarPlayer, motion: BodyParams, rows: range, *, cloth: ClothMode, said: list[str]
 ) -> Iterator[Splats]:
     """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
     from avatar.formats import world_splats
 
     rate = frames_a_second(motion)
-    simulate = simulate and bool(player.bundle.garments)
-    if not simulate:
+    if cloth != "simulate" or not player.has_clothes:
+        skinned = player.skinned_clothes if cloth == "skin" else None
         for k in rows:
-            yield world_splats(player.pose(motion.frame(k)))
+            yield world_splats(player.pose(motion.frame(k), cloth=skinned))
         return
-    for k in range(max(0, rows[0] - round(PRE_ROLL * rate)), rows[-1] + 1):
-        posed = player.step(motion.frame(k), 1.0 / rate)
+    begin = max(0, rows[0] - round(PRE_ROLL * rate))
+    for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
+        posed = player.step(motion.frame(k), 1.0 / rate, way=way)
         if k in rows:
             yield world_splats(posed)
     said += player.said

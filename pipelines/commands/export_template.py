@@ -76,7 +76,9 @@ def _posed(
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
     """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
     path, rate = request.source / GARMENTS, frames_a_second(params)
-    if not request.simulate or not path.is_file():
+    if request.cloth == "field":
+        raise InputError("option cloth", expected="simulate or skin for the template", received="field")
+    if request.cloth == "skin" or not path.is_file():
         for k in rows:
             yield template.pose(params.frame(k))[0]
         return

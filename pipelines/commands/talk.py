@@ -14,7 +14,7 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import StudentFilm, open_student, student_file, student_frames
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
 from pipelines.commands.talking_page import check_page_path, write_talking_page
 from pipelines.commands.talking_person import live_lips, person_of_bundle, person_of_run
 from pipelines.figures.film import write_film
@@ -74,8 +74,8 @@ class Talk:
     """What the film shows: head and shoulders, or the whole person."""
     height: int = 720
     """Height of the picture in pixels."""
-    cloth: Literal["simulate", "skin"] = "simulate"
-    """Loose clothes of a film: simulated, or moved by the student alone."""
+    cloth: ClothMode = "simulate"
+    """Loose clothes of a film: simulated, moved by the student's own field, or by the joints alone."""
     json: bool = False
     """Print what was written as JSON."""
 
@@ -201,7 +201,7 @@ class Talk:
             view="front" if portrait else self.view,
             height=self.height,
             width=None,
-            simulate=simulate,
+            cloth=self.cloth,
             clamp=False,
             below=_PORTRAIT if portrait else None,
         )

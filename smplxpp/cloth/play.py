@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
+from smplxpp.cloth.following import SMOOTHING, ways
 from smplxpp.cloth.garment import Garment
 from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_positive
 from smplxpp.template.template import Template
 
 
@@ -21,22 +21,23 @@ def play(
     *,
     fps: float,
     config: DriverConfig | None = None,
+    smoothing: float = SMOOTHING,
     said: list[str] | None = None,
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
     """Yield the posed surface of every frame, metres; the clothes start cold before the first one.
 
     Args:
         params: T frames, evenly spaced. fps: of them.
+        config: of the driver. smoothing: of what the clothes follow (`smplxpp.cloth.following`), seconds.
         said: takes the sentences of the driver on what went otherwise than asked for.
     """
-    require_positive("frames a second", fps)
     driver = ClothDriver(template, garments, config)
     weights = template.weights.dense()
     count = template.body.vertex_count
-    for k in range(len(params)):
+    for k, way in enumerate(ways(params, fps, smoothing=smoothing)):
         frame = params.frame(k)
         posed = template.posed_body(frame)
-        shape = driver.step(frame, 1.0 / fps, posed=posed)
+        shape = driver.follow(way, 1.0 / fps, frame, posed=posed)
         rest = template.vertices.copy()
         rest[:count] = posed.rest_vertices[0]
         rest[shape.vertices] += shape.share[:, None] * shape.displacements

@@ -10,9 +10,10 @@ from PIL import Image
 
 from pipelines.cli import main
 from pipelines.commands.animate import Animate
+from pipelines.commands.driving import Driving
 from pipelines.runs.layout import GARMENTS, PARAMS, TEMPLATE
 from smplxpp.cloth.garment_file import save_garments
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import PART, person, standing
 from tests.dolls.skirted import garment, pose
@@ -59,6 +60,29 @@ def test_a_part_of_a_film_is_simulated_too(run, params, tmp_path):
     assert (part["frames"], later["frames"]) == (len(pictures), len(last)) == (3, 2)
     # Both are preceded by the whole motion before them; the camera alone is fitted to other frames.
     assert [part["simulated"], later["simulated"]] == [[PART]] * 2
+
+
+def test_frames_without_a_pose_are_said_and_the_film_goes_on(run, params, tmp_path):
+    """One NaN refused the motion."""
+    with np.load(params) as file:
+        arrays = {name: file[name].copy() for name in file}
+    truth = arrays["transl"].copy()
+    arrays["transl"][2], arrays["body_pose"][FRAMES - 1, 4] = np.nan, np.inf
+    np.savez(tmp_path / "holes.npz", **arrays)
+    with pytest.warns(GeometryWarning, match=f"2 of {FRAMES} frames hold NaN or infinity, the first 2"):
+        result, pictures = film(run, tmp_path / "holes.npz", tmp_path / "film")
+    assert result["frames"] == len(pictures) == FRAMES and result["said"] == []
+    with pytest.warns(GeometryWarning):
+        filled = Driving().load(tmp_path / "holes.npz", person().body)
+    np.testing.assert_array_equal(np.delete(filled.transl, [2, FRAMES - 1], 0), np.delete(truth, [2, FRAMES - 1], 0))
+    held = np.linalg.norm(truth[1] - truth[2])
+    assert np.linalg.norm(filled.transl[2] - truth[2]) < 0.5 * held
+    np.testing.assert_array_equal(filled.transl[-1], truth[-2])
+
+
+def test_the_template_has_no_field(run, params, tmp_path):
+    with pytest.raises(InputError, match="cloth"):
+        film(run, params, tmp_path / "film", cloth="field")
 
 
 def test_parts_may_be_named_without_any_training(run, params, tmp_path, capsys):

@@ -90,8 +90,14 @@ def test_loose_clothes_of_a_bundle_are_simulated(tmp_path):
     replace(motion, fps=20.0).save(tmp_path / "motion.npz")
     simulated, one = film(tmp_path, tmp_path / "a")
     skinned, other = film(tmp_path, tmp_path / "b", cloth="skin")
-    assert simulated["simulated"] == ["lower"] and skinned["simulated"] == []
-    assert len(one) == len(other) == 3 and np.abs(one[-1].astype(int) - other[-1]).max() > 10
+    by_field, third = film(tmp_path, tmp_path / "c", cloth="field")
+    assert simulated["simulated"] == ["lower"] and skinned["simulated"] == by_field["simulated"] == []
+    assert len(one) == len(other) == len(third) == 3
+    # `skin` was the student's field, under the wrong name.
+    for a, b in ((one, other), (one, third), (other, third)):
+        assert np.abs(a[-1].astype(int) - b[-1]).max() > 10
+    with pytest.raises(InputError, match="loose-parts"):
+        film(tmp_path, tmp_path / "d", loose_parts=("lower",))
 
 
 def test_a_camera_that_stands_still_sees_all_of_a_walk(folder, tmp_path):
@@ -121,7 +127,7 @@ def test_frames_of_the_training_take_their_codes(folder, tmp_path):
         with pytest.raises(InputError, match="codes"):
             film(folder, tmp_path / "e", codes="trained", **wrong)
     write_dressed(tmp_path)
-    with pytest.raises(InputError, match="cloth skin"):
+    with pytest.raises(InputError, match="cloth field"):
         Animate(tmp_path / "me.avatar", folder / "motion.npz", tmp_path / "f", codes="trained", json=True).run()
 
 

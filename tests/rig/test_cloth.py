@@ -9,6 +9,7 @@ import torch
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from smplxpp.cloth import ClothDriver, ClothShape
+from smplxpp.cloth.following import ways
 from smplxpp.cloth.play import play
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import person
@@ -87,7 +88,8 @@ def test_a_student_wears_the_simulated_clothes_once(rig, motion):
 def test_the_rig_poses_simulated_clothes_as_films_of_the_template_do():
     frames = BodyParams.concatenate([swaying(k / 30) for k in range(4)])
     own, driver = Rig(person()), ClothDriver(person(), [garment()], QUICK)
+    paths = list(ways(frames, 30.0))
     for k, surface in enumerate(play(person(), [garment()], frames, fps=30.0, config=QUICK)):
-        shape = driver.step(frames.frame(k), 1 / 30)
+        shape = driver.follow(paths[k], 1 / 30, frames.frame(k))
         moved = own.with_cloth(own.motion(frames.frame(k)), shape)
         np.testing.assert_allclose(own.places(moved), surface, atol=2e-5)

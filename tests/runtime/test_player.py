@@ -10,7 +10,7 @@ import torch
 
 from avatar.render.api import rasterize
 from avatar.runtime import AvatarPlayer
-from smplxpp.cloth import ClothDriver
+from smplxpp.cloth import ClothDriver, ClothShape
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import person
@@ -140,6 +140,16 @@ def test_loose_clothes_are_simulated_as_in_torch(tmp_path):
     assert np.abs(bare - splats.means).max() > 0.01
     player.restart()
     assert np.isfinite(player.step(swaying(0.0), 0.05).means).all()
+
+
+def test_clothes_without_field_or_simulation_follow_the_joints(tmp_path):
+    write_dressed(tmp_path, EXACT)
+    frame, player, it = swaying(0.7), AvatarPlayer(tmp_path / "me.avatar", threads=1), dressed()
+    by_joints = player.pose(frame, cloth=player.skinned_clothes).means
+    zero = ClothShape(garment().vertices, np.zeros((len(garment().vertices), 3), np.float32), garment().share())
+    with torch.no_grad():
+        truth = it(it.rig.with_cloth(it.rig.motion(frame), zero), torch.tensor(EYE)[None])
+    np.testing.assert_allclose(by_joints, truth.gaussians.means[ordered(it)].numpy(), atol=2e-5)
 
 
 def test_parameters_of_others_are_refused(tmp_path):

@@ -103,14 +103,18 @@ def test_loose_clothes_of_a_motion_are_simulated(tmp_path, capsys):
     swing = BodyParams.concatenate([replace(swaying(k / 20.0), fps=None) for k in range(3)])
     replace(swing, fps=20.0).save(tmp_path / "swing.npz")
     means = {}
-    for cloth in ("simulate", "skin"):
+    for cloth in ("simulate", "field", "skin"):
         out = tmp_path / f"{cloth}.ply"
         options = ("--params", tmp_path / "swing.npz", "--frame", 2, "--cloth", cloth)
         assert "error" not in export(capsys, tmp_path / "me.avatar", "--out", out, *options)
         means[cloth] = read_splat_ply(out).means
-    skinned = AvatarPlayer(tmp_path / "me.avatar", threads=1).pose(swing.frame(2)).means
+    player = AvatarPlayer(tmp_path / "me.avatar", threads=1)
+    by_field = player.pose(swing.frame(2)).means.copy()
+    np.testing.assert_allclose(means["field"], by_field, atol=1e-6)
+    skinned = player.pose(swing.frame(2), cloth=player.skinned_clothes).means
     np.testing.assert_allclose(means["skin"], skinned, atol=1e-6)
-    assert np.abs(means["simulate"] - skinned).max() > 1e-3
+    for other in (by_field, skinned):
+        assert np.abs(means["simulate"] - other).max() > 1e-3
 
 
 def test_poses_that_training_did_not_see_are_said(folder, tmp_path, capsys):
