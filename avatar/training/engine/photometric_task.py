@@ -23,7 +23,7 @@ from avatar.rig.posed import AvatarModel, PosedAvatar
 from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.unseen_mouth import hold_unseen_mouth
+from avatar.training.engine.unseen import hold_unseen
 from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
@@ -154,7 +154,7 @@ class PhotometricTask(OptimizationTask[Item]):
         self.surface = context.surface if config.weights.normal else None
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
         super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
-        hold_unseen_mouth(sequence, model.gaussians, getattr(model, "blend_shapes", None))
+        hold_unseen(sequence, model.gaussians, getattr(model, "blend_shapes", None))
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
         """Return the step's frames and cameras; those of the next are read meanwhile."""
