@@ -14,6 +14,8 @@ from torch import Tensor
 
 from avatar.data.sequence import FrameSequence, Item, camera_centers_of
 from avatar.data.views import View
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.regularizers import offset_penalty, scale_penalty
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
@@ -73,6 +75,7 @@ class PhotometricConfig:
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
             found there first.
         eps2d: see `rasterize`.
+        scale_penalty, offset_penalty: weights of GaussianAvatars' penalties, where the attributes learn.
         betas: Adam's. amp: networks in bfloat16 on CUDA. max_grad_norm: largest norm of the gradient.
         evaluations: how often held-out views are measured, evenly. evaluated: how many frames of either kind then.
         seed: of the order of frames and views and of all noise.
@@ -90,6 +93,8 @@ class PhotometricConfig:
     perceptual_every: int = 1
     coarse: float = 0.0
     eps2d: float = 0.1
+    scale_penalty: float = 0.003
+    offset_penalty: float = 0.1
     betas: tuple[float, float] = (0.9, 0.999)
     amp: bool = False
     max_grad_norm: float = float("inf")
@@ -106,6 +111,8 @@ class PhotometricConfig:
             ("perceptual_every", 1),
             ("coarse", 0.0),
             ("eps2d", 0.0),
+            ("scale_penalty", 0.0),
+            ("offset_penalty", 0.0),
             ("evaluations", 1),
             ("evaluated", 1),
             ("seed", 0),
@@ -154,6 +161,7 @@ class PhotometricTask(OptimizationTask[Item]):
         self.surface = context.surface if config.weights.normal else None
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
         super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
+        self.rest_frames = triangle_frames(sequence.rig.vertices, sequence.rig.faces)
         hold_unseen(sequence, model.gaussians, getattr(model, "blend_shapes", None))
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
@@ -212,9 +220,19 @@ class PhotometricTask(OptimizationTask[Item]):
             total = total + loss / len(views)
             terms.append(figures)
             renderings.append(rendering)
+        total = total + self._attribute_penalties()
         names = {name: None for figures in terms for name in figures}
         means = {name: float(np.mean([f[name] for f in terms if name in f])) for name in names}
         return total, means, renderings
+
+    def _attribute_penalties(self) -> Float[Tensor, ""] | float:
+        """Return what large Gaussians, and such far from their triangles, cost; nothing where they stay as they are."""
+        if not self.config.attributes:
+            return 0.0
+        bound = self.model.gaussians()
+        return self.config.scale_penalty * scale_penalty(bound) + self.config.offset_penalty * offset_penalty(
+            bound, self.rest_frames
+        )
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         """Return mean figures of the measured views by kind, those of "novel_view" as "mean" too."""

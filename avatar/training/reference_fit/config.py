@@ -58,9 +58,11 @@ class FitConfig:
             require_between(f"fit: {name}", getattr(self, name), least, most)
 
     def photometric(self) -> PhotometricConfig:
-        """Return what the fit shares with the other trainings on photographs: everything but start and penalties."""
+        """Return what the fit shares with the other trainings on photographs: everything but the start."""
         return PhotometricConfig(
             iterations=self.iterations,
+            scale_penalty=self.scale_penalty,
+            offset_penalty=self.offset_penalty,
             schedule="exponential",
             attributes=1.0,
             rates=self.rates,

@@ -18,11 +18,8 @@ from avatar.data.views import View
 from avatar.export.posed import posed_splats
 from avatar.formats.splats import Splats
 from avatar.gaussians.binding import BoundGaussians
-from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.regularizers import offset_penalty, scale_penalty
 from avatar.metrics.view_quality import Box, ViewQuality, head_box, head_vertices, mean_quality
 from avatar.models.student import Student, StudentConfig
-from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
 from avatar.training.reference_fit.config import FitConfig
@@ -122,7 +119,7 @@ def fit_reference(
 class FitTask(PhotometricTask):
     """A reference fit: a student without field or blend shapes learns its Gaussians' attributes on one frame.
 
-    A step renders one view. To the loss of every photometric training come the penalties on scales and offsets.
+    A step renders one view.
     """
 
     sequence: OneFrame
@@ -141,7 +138,6 @@ class FitTask(PhotometricTask):
         self.fit_config, self.held_out = config, bool(scene.held_out)
         self.student = Student(StudentConfig(field=None), frame.rig, start, ())
         super().__init__(frame, self.student, config.photometric(), [], context)
-        self.frames = triangle_frames(frame.motion(FRAME).rest, frame.rig.faces)
         corners = scene.vertices[head_vertices(scene.template)]
         self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
 
@@ -152,13 +148,7 @@ class FitTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a view, rendered, and its terms."""
         views = self.views(item)
-        return self.penalised(self.student(self.sequence.motion(item.frame), camera_centers_of(views)), views)
-
-    def penalised(self, posed: PosedAvatar, views: Sequence[View]) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of the posed Gaussians in views, penalties included, and its terms."""
-        total, terms, _ = self.compared(posed, views)
-        total = total + self.fit_config.scale_penalty * scale_penalty(posed.bound)
-        total = total + self.fit_config.offset_penalty * offset_penalty(posed.bound, self.frames)
+        total, terms, _ = self.compared(self.student(self.sequence.motion(item.frame), camera_centers_of(views)), views)
         return total, {"loss": float(total.detach()), **terms}
 
     def head_box_of(self, view: View) -> Box | None:

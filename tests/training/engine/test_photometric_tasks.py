@@ -228,6 +228,24 @@ def test_attributes_without_a_rate_stay(stage, frames):
     assert not any(key.startswith("gaussians.") for key in task.learned)
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_what_hides_does_not_grow_nor_leave_its_triangle(stage, frames):
+    """The torso is under the dress: large Gaussians there shrink, and such far inside come nearer."""
+    sizes, ways = {}, {}
+    for weight in (0.0, 0.1):
+        task = make(stage, frames, iterations=40, attributes=1.0, scale_penalty=weight, offset_penalty=100.0 * weight)
+        learned, rig = task.model.gaussians, frames.rig
+        hidden = rig.template.vertices[rig.template.faces[learned.face_index.numpy(), 0], 1] < 0.6
+        hidden &= rig.template.vertex_part[rig.template.faces[learned.face_index.numpy(), 0]] == 0
+        with torch.no_grad():
+            learned.log_scales[hidden], learned.normal_offset[hidden] = 0.5, -0.1
+        steps(task, 20)
+        sizes[weight], ways[weight] = (
+            float(value[hidden].detach().abs().mean()) for value in (learned.log_scales, learned.normal_offset)
+        )
+    assert sizes[0.1] < min(0.5, sizes[0.0]) and ways[0.1] < min(0.1, ways[0.0])
+
+
 def test_steps_at_half_the_size_come_first(frames):
     task = make("teacher", frames, coarse=0.5)
     sizes = []
@@ -242,7 +260,8 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
     weights = replace(WEIGHTS, dssim=0.0, alpha=0.0, normal=0.0, perceptual=0.25)
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())
-    config = replace(TEACHER, weights=weights, perceptual_every=2, view_jitter=0.0)
+    alone = {"scale_penalty": 0.0, "offset_penalty": 0.0}
+    config = replace(TEACHER, weights=weights, perceptual_every=2, view_jitter=0.0, **alone)
     task = TeacherTask(frames, teacher, config, TaskContext(perceptual=MeanDifference()))
     for k, weight in ((0, 0.5), (1, 0.0)):
         total, terms = task.loss(task.micro_batches(k)[0])
