@@ -89,11 +89,11 @@ class LiveLipsFigures:
             "told of, ms before a row's last sample": round(1e3 * network.delay),
         }
         voices = {}
-        for name, said in self._voices():
+        for name, said in said_by_voices(self.flite):
             voices[name] = measure(network, said)
             print(f"{name:34s} {voices[name]}")
         figures["voices"] = voices
-        sound = next(self._voices())[1][0][0]
+        sound = next(said_by_voices(self.flite))[1][0][0]
         long = Sound(np.tile(sound.samples, 20), sound.rate).at_rate(RATE)
         began = time.process_time()
         network(long)
@@ -105,25 +105,26 @@ class LiveLipsFigures:
         command = "python -m benchmarks.live_lips --flite PROGRAM"
         print(f"stored {store_results('live_lips', command, figures).name}")
 
-    def _voices(self) -> Iterator[tuple[str, list[tuple[Sound, Speech]]]]:
-        """Each voice's sentences with their truth."""
-        voice, rng = PiperVoice(threads=1), np.random.default_rng(0)
-        spoken = [voice.say(text) for text in (*SENTENCES, *MORE)]
-        own = [(one.sound, one.speech) for one in spoken]
-        yield "the training's voice", own
-        for up, down, words in ((5, 4, "1.25 times as slow and low"), (4, 5, "1.25 times as fast and high")):
-            yield f"it, {words}", [_played(sound, speech, up, down) for sound, speech in own]
-        yield "it, white noise 10 dB below", [(_noisy(sound, rng), speech) for sound, speech in own]
-        yield "it, 300 to 3400 Hz", [(_narrow(sound), speech) for sound, speech in own]
-        if self.flite is not None:
-            for name in FLITE:
-                yield f"flite {name}", [by_flite(self.flite, name, text) for text in (*SENTENCES, *MORE)]
-        try:
-            espeak = Espeak()
-        except OSError:
-            return
-        for name, options in ESPEAK.items():
-            yield f"espeak-ng {name}", [espeak.say(text, *options) for text in (*SENTENCES, *MORE)]
+
+def said_by_voices(flite: Path | None) -> Iterator[tuple[str, list[tuple[Sound, Speech]]]]:
+    """Yield each voice's name and the twenty sentences with their truth; flite's where its program is given."""
+    voice, rng = PiperVoice(threads=1), np.random.default_rng(0)
+    spoken = [voice.say(text) for text in (*SENTENCES, *MORE)]
+    own = [(one.sound, one.speech) for one in spoken]
+    yield "the training's voice", own
+    for up, down, words in ((5, 4, "1.25 times as slow and low"), (4, 5, "1.25 times as fast and high")):
+        yield f"it, {words}", [_played(sound, speech, up, down) for sound, speech in own]
+    yield "it, white noise 10 dB below", [(_noisy(sound, rng), speech) for sound, speech in own]
+    yield "it, 300 to 3400 Hz", [(_narrow(sound), speech) for sound, speech in own]
+    if flite is not None:
+        for name in FLITE:
+            yield f"flite {name}", [by_flite(flite, name, text) for text in (*SENTENCES, *MORE)]
+    try:
+        espeak = Espeak()
+    except OSError:
+        return
+    for name, options in ESPEAK.items():
+        yield f"espeak-ng {name}", [espeak.say(text, *options) for text in (*SENTENCES, *MORE)]
 
 
 def measure(network: LipNetwork, said: list[tuple[Sound, Speech]]) -> dict[str, float]:

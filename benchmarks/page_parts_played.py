@@ -84,9 +84,17 @@ PLAYED = (
         "Lips from sound alone",
         "Twenty sentences that were not trained on, a voice a row. The first five rows are the Piper voice that the"
         " network learned from; nothing was trained on flite's and espeak-ng's, whose times are their own. Weights "
-        "of an earlier training were measured on them before. No person was recorded. Shapes: share of hundredths "
+        "of an earlier training were measured on them before. Shapes: share of hundredths "
         "of a second in which something is said. A closure belongs to a bilabial whose middle is within 0.1 s of "
         "it. The jaw's delay is behind the network's own, which the page adds for a microphone and not for a file.",
+    ),
+    Part(
+        "recorded_people",
+        "Recordings of people",
+        "The recordings in the tests of pocketsphinx 5.1.1 whose words are known: one reader of LibriVox, and no "
+        "more than three others, at 16 kHz. Nobody marked phonemes: the truth is pocketsphinx's own alignment of the "
+        "right words, so that figures say how far a way without words is from one with words. Each recording is "
+        "given its own text and those of all others, some of which share words with it (cards).",
     ),
     Part(
         "gestures",

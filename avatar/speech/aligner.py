@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from avatar.speech.lips import LipNetwork, agreement
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
 from avatar.speech.rests import find_rests, spoken_level, without_rests
 from avatar.speech.text import EXTRA, checked_text, no_words, phones_of, words_of
@@ -19,8 +20,10 @@ _FRAME = 0.01  # seconds
 _WINDOW = 0.025625  # seconds of sound that the recogniser sees for a frame, from the frame's time on
 # A frame stands for the sound about its window's middle: half a frame ahead of it, it begins.
 _OFFSET = 0.5 * (_WINDOW - _FRAME)
-_LEADS = (0.0, 0.1, 0.005)  # seconds of silence put ahead of a sound in which the search lost its way
 _LOUD = 0.1  # root mean square that the recogniser is given
+_HISS = 1e-3  # root mean square of white noise laid under a text's sound: the stops of a made voice are zeros
+AGREES = 0.0
+"""Nats a hundredth of a second: texts whose phonemes fit what is heard less well are another recording's."""
 
 
 def aligns() -> bool:
@@ -28,47 +31,66 @@ def aligns() -> bool:
     return find_spec("pocketsphinx") is not None
 
 
-def align(sound: Sound, text: str | None = None) -> Speech:
-    """Return the phonemes of a recording of English.
-
-    Args:
-        text: what is said in it; None: recognised.
+def load_recogniser() -> Any:
+    """Return pocketsphinx's `Decoder` of English: for `align`, where it is called more than once.
 
     Raises:
         MissingExtraError: pocketsphinx is not installed.
-        InputError: silence, no words in it, a text without English words or one that cannot be laid over the sound,
-            more than 20 minutes.
     """
-    seconds, level = sound.seconds, spoken_level(sound)
     try:
         import pocketsphinx
     except ImportError:
         raise MissingExtraError("pocketsphinx", extra=EXTRA, purpose="phonemes of a recording") from None
-    samples = sound.at_rate(_RATE)
-    data = Sound(samples.samples * np.float32(_LOUD / level), _RATE).integers().tobytes()
-    decoder = pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
-    words = _recognised(decoder, data) if text is None else _words(text)
-    for word in dict.fromkeys(words):
-        if decoder.lookup_word(word) is None:
-            decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_of(word)[0]), True)
-    tries = (_aligned(decoder, data, words, lead=lead) for lead in _LEADS)
-    found = next((one for one in tries if one is not None), None)
-    if found is None:
+    return pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
+
+
+def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = None) -> Speech:
+    """Return the phonemes of a recording of English.
+
+    A text is taken where the recogniser finds a way through it and its phonemes fit what the network of
+    `avatar.speech.lips` hears at their times (`agreement`).
+
+    Args:
+        text: what is said in it; None: recognised.
+        recogniser: of `load_recogniser`; None: another one, which takes a second.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+        InputError: silence, no words in it, a text without English words or one that it does not say, more than 20
+            minutes.
+    """
+    spoken_level(sound)
+    decoder = load_recogniser() if recogniser is None else recogniser
+    words = recognised_words(sound, decoder) if text is None else _words(text)
+    found = _aligned(decoder, sound, words)
+    if found is None or (text is not None and agreement(LipNetwork.shipped()(sound), found) < AGREES):
         raise InputError(
             "sound",
             expected="English speech that can be aligned" if text is None else "what the text says",
             received="something else",
             remedy="give what is said in it as --text" if text is None else "leave --text away: it is recognised then",
         )
-    speech = Speech(tuple(without_rests(_clipped(found, seconds), find_rests(sound))), seconds)
+    speech = Speech(tuple(without_rests(found.phonemes, find_rests(sound))), sound.seconds)
     if not speech.spoken:  # words that are noises
         raise _nobody()
     return speech
 
 
-def _recognised(decoder: Any, data: bytes) -> list[str]:
-    _heard(decoder, data)
-    words = [one.word.split("(")[0] for one in decoder.seg() or ()]
+def aligned_text(sound: Sound, text: str, recogniser: Any) -> Speech | None:
+    """Return the recogniser's phonemes of a text, whether or not they fit what is heard; None where it finds no way."""
+    return _aligned(recogniser, sound, _words(text))
+
+
+def recognised_words(sound: Sound, recogniser: Any) -> list[str]:
+    """Return the words of English that the recogniser hears, as its dictionary spells them.
+
+    Raises:
+        InputError: silence, no words in it, more than 20 minutes.
+    """
+    recogniser.config["bestpath"] = True
+    recogniser.activate_search()
+    _heard(recogniser, _samples(sound))
+    words = [one.word.split("(")[0] for one in recogniser.seg() or ()]
     words = [word for word in words if word[0] not in "<["]
     if not words:
         raise _nobody()
@@ -91,19 +113,29 @@ def _nobody() -> InputError:
     )
 
 
+def _samples(sound: Sound, hiss: float = 0.0) -> bytes:
+    samples = sound.at_rate(_RATE).samples * np.float32(_LOUD / spoken_level(sound))
+    noise = np.random.default_rng(0).normal(scale=hiss, size=len(samples)).astype(np.float32)
+    return Sound(samples + noise, _RATE).integers().tobytes()
+
+
 def _heard(decoder: Any, data: bytes) -> None:
     decoder.start_utt()
     decoder.process_raw(data, full_utt=True)
     decoder.end_utt()
 
 
-def _aligned(decoder: Any, data: bytes, words: list[str], *, lead: float) -> list[Phoneme] | None:
+def _aligned(decoder: Any, sound: Sound, words: list[str]) -> Speech | None:
     """Two passes: the words' times, then those of the phones within; None where they do not fit the sound.
 
-    The search prunes, and now and then loses a sentence that it finds with its frames laid elsewhere: with so many
-    seconds of silence in front.
+    The first takes its search's own best path: that through the lattice of what it kept (`bestpath`), which language
+    models ask for, has no way through many a sentence that the search has found.
     """
-    data = bytes(2 * round(lead * _RATE)) + data
+    data = _samples(sound, _HISS)
+    for word in dict.fromkeys(words):
+        if decoder.lookup_word(word) is None:
+            decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_of(word)[0]), True)
+    decoder.config["bestpath"] = False
     try:
         decoder.set_align_text(" ".join(words))
         _heard(decoder, data)
@@ -121,10 +153,10 @@ def _aligned(decoder: Any, data: bytes, words: list[str], *, lead: float) -> lis
         stresses = iter(_stresses(word.name.split("(")[0], len(vowels)))
         for phone in phones:
             known = phone.name in VOWELS | CONSONANTS
-            start = phone.start * _FRAME + _OFFSET - lead
+            start = phone.start * _FRAME + _OFFSET
             stress = next(stresses) if phone.name in VOWELS else 0
             out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * _FRAME, stress))
-    return out
+    return Speech(tuple(_clipped(out, sound.seconds)), sound.seconds)
 
 
 def _stresses(word: str, count: int) -> list[int]:

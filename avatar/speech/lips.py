@@ -37,6 +37,8 @@ _JAW, _PRESS = (ARTICULATORS.index(name) for name in ("jaw", "press"))
 _FOLLOWS = 0.5  # of what is new, a row
 _OPEN, _CLOSED = 0.3, 0.6  # of the lips' pressing: from which they begin to close; from which they are closed
 _CHANGE = 3.0  # nats that another phoneme has to be worth
+_LEAST = 1e-3  # added to probabilities: no single row refuses a text
+_EVEN = 100.0  # rows of even probabilities that are laid under a recording's mean: "five five" is little else
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,25 @@ def steady(mouth: Float[np.ndarray, "T 6"]) -> Float64[np.ndarray, "T 6"]:
     out[:, _PRESS] = np.maximum(out[:, _PRESS], closed)
     out[:, _JAW] *= 1.0 - closed
     return out
+
+
+def agreement(heard: Lips, speech: Speech) -> float:
+    """Return by how much phonemes fit what is heard at their times better than what is heard at any, nats a row.
+
+    The mean of `log p_t(a_t) - log mean_s p_s(a_t)` over the rows t in which a phoneme `a_t` is said: 0 is about what
+    the same phonemes have at times that know nothing of the sound. What a voice or a room does to all rows cancels.
+    """
+    names = np.zeros(len(heard.times), np.int64)
+    for one in speech.spoken:
+        first, behind = np.searchsorted(heard.times, (one.start, one.end))
+        names[first:behind] = PHONES.index(one.name)
+    said = np.flatnonzero(names)
+    if not len(said):
+        return -np.inf
+    rows = heard.phones[said].astype(np.float64)
+    mean = (rows.sum(axis=0) + _EVEN / len(PHONES)) / (len(said) + _EVEN)
+    own = rows[np.arange(len(said)), names[said]]
+    return float(np.mean(np.log(own + _LEAST) - np.log(mean[names[said]] + _LEAST)))
 
 
 def sounds_of(sound: Sound) -> Speech:

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from avatar.speech import articulate
-from avatar.speech.aligner import align
+from avatar.speech.aligner import align, aligned_text, load_recogniser
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
 from avatar.speech.text import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
+from benchmarks.other_voices import Espeak
+from benchmarks.talking import starts_apart
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
 from tests.speech.conftest import TEXT
@@ -105,6 +107,35 @@ def test_words_are_recognised_and_other_words_refused(spoken, recogniser):
     assert len(heard.spoken) > 20 and heard.seconds == spoken.sound.seconds
     with pytest.raises(InputError, match="says"):
         align(spoken.sound, "one " * 200)
+
+
+@pytest.mark.parametrize(
+    "text", ["The music was loud, but the singer had a good voice.", "Can you show me where it is?"]
+)
+def test_a_text_through_which_the_recogniser_finds_a_way_is_refused_where_it_is_not_what_is_heard(
+    spoken, recogniser, text
+):
+    decoder = load_recogniser()
+    assert aligned_text(spoken.sound, TEXT, decoder) is not None
+    assert aligned_text(spoken.sound, text, decoder) is not None
+    with pytest.raises(InputError, match="what the text says"):
+        align(spoken.sound, text, recogniser=decoder)
+
+
+def test_a_voice_whose_stops_are_zeros_is_aligned(recogniser):
+    """Two sentences that were refused: the search had no final word in a sound that ends in zeros."""
+    try:
+        espeak = Espeak()
+    except OSError:
+        pytest.skip("the library of espeak-ng is not installed")
+    decoder = load_recogniser()
+    for text in (
+        "The young child watched a yellow bird over the garden.",
+        "People may put both blue boats by the pier!",
+    ):
+        sound, truth = espeak.say(text, "en-gb-x-rp", 130, 30)
+        found = align(sound, text, recogniser=decoder)
+        assert np.abs(starts_apart(truth, found)).mean() < 0.04
 
 
 def test_silence_and_a_blip_are_refused(recogniser):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar.speech import ARTICULATORS, SILENCE, articulate
-from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, sounds_of, steady
+from avatar.speech import ARTICULATORS, SILENCE, Phoneme, Speech, articulate
+from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, Lips, agreement, sounds_of, steady
 from avatar.speech.phonemes import BILABIALS, VOWELS
 from avatar.speech.sound_features import BANDS, HOP, RATE, hear, mel_bands
 from pipelines.commands.talk import Talk
@@ -148,3 +148,22 @@ def test_another_version_is_refused():
 def test_sounds_are_heard_in_a_recording_alone(tmp_path, options):
     with pytest.raises(InputError, match="hear"):
         Talk(tmp_path, tmp_path / "a.npz", hear="sounds", **options).run()
+
+
+def test_phonemes_agree_with_what_is_heard_at_their_times_alone():
+    """Rows that are sure of five phonemes in turn: their own order is worth some log 5, another is below 0."""
+    names, rows = ("AA", "M", "S", "IY", "T"), 40
+    phones = np.full((5 * rows, len(PHONES)), 1e-6, np.float32)
+    for k, name in enumerate(names):
+        phones[k * rows : (k + 1) * rows, PHONES.index(name)] = 1.0
+    heard = Lips((np.arange(len(phones)) + 0.5) * 0.01, phones, np.zeros((len(phones), len(ARTICULATORS)), np.float32))
+
+    def said(order):
+        each = rows * 0.01
+        spoken = tuple(Phoneme(name, k * each, (k + 1) * each) for k, name in enumerate(order))
+        return agreement(heard, Speech(spoken, 5 * each))
+
+    even = (rows + 100.0 / len(PHONES)) / (5 * rows + 100.0)
+    assert said(names) == pytest.approx(-np.log(even), abs=0.01)
+    assert said(names[1:] + names[:1]) < -3.0
+    assert agreement(heard, Speech((), 2.0)) == -np.inf
