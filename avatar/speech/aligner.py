@@ -63,13 +63,15 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     decoder = load_recogniser() if recogniser is None else recogniser
     words = recognised_words(sound, decoder) if text is None else _words(text)
     found = _aligned(decoder, sound, words)
-    if found is None or (text is not None and agreement(LipNetwork.shipped()(sound), found) < AGREES):
+    if text is not None and (found is None or agreement(LipNetwork.shipped()(sound), found) < AGREES):
         raise InputError(
             "sound",
-            expected="English speech that can be aligned" if text is None else "what the text says",
+            expected="what the text says",
             received="something else",
-            remedy="give what is said in it as --text" if text is None else "leave --text away: it is recognised then",
+            remedy="leave --text away: it is recognised then",
         )
+    if found is None:
+        raise _nobody()
     speech = Speech(tuple(without_rests(found.phonemes, find_rests(sound))), sound.seconds)
     if not speech.spoken:  # words that are noises
         raise _nobody()
