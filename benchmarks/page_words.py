@@ -36,10 +36,6 @@ PERSON = (
     "frames are held out. All inputs are exact, as above. Preset `demo`, 22k Gaussians, lean as `cpu` is. No "
     "perceptual distance was measured; the surface of a single held-out frame is known."
 )
-ABLATION_OF_DEMO = (
-    " Thirteen images carry the novel views, three the novel poses: differences of a tenth of a decibel say nothing. "
-    "Times are of a shared machine."
-)
 TRACKED_INPUTS = (
     "**Nothing here is exact**: body parameters as a tracker gives them, estimated labels, normals estimated or none, "
     "as the words below say."

@@ -23,7 +23,7 @@ _OFFSET = 0.5 * (_WINDOW - _FRAME)
 _LOUD = 0.1  # root mean square that the recogniser is given
 _HISS = 1e-3  # root mean square of white noise laid under a text's sound: the stops of a made voice are zeros
 AGREES = 0.0
-"""Nats a hundredth of a second: texts whose phonemes fit what is heard less well are another recording's."""
+"""Nats a hundredth of a second: words whose phonemes fit what is heard less well are another recording's."""
 
 
 def aligns() -> bool:
@@ -47,8 +47,8 @@ def load_recogniser() -> Any:
 def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = None) -> Speech:
     """Return the phonemes of a recording of English.
 
-    A text is taken where the recogniser finds a way through it and its phonemes fit what the network of
-    `avatar.speech.lips` hears at their times (`agreement`).
+    Words, given or recognised, are taken where the recogniser finds a way through them and their phonemes fit what the
+    network of `avatar.speech.lips` hears at their times (`agreement`): tones may be heard as words, too.
 
     Args:
         text: what is said in it; None: recognised.
@@ -63,15 +63,17 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     decoder = load_recogniser() if recogniser is None else recogniser
     words = recognised_words(sound, decoder) if text is None else _words(text)
     found = _aligned(decoder, sound, words)
-    if text is not None and (found is None or agreement(LipNetwork.shipped()(sound), found) < AGREES):
-        raise InputError(
-            "sound",
-            expected="what the text says",
-            received="something else",
-            remedy="leave --text away: it is recognised then",
+    if found is None or agreement(LipNetwork.shipped()(sound), found) < AGREES:
+        raise (
+            _nobody()
+            if text is None
+            else InputError(
+                "sound",
+                expected="what the text says",
+                received="something else",
+                remedy="leave --text away: it is recognised then",
+            )
         )
-    if found is None:
-        raise _nobody()
     speech = Speech(tuple(without_rests(found.phonemes, find_rests(sound))), sound.seconds)
     if not speech.spoken:  # words that are noises
         raise _nobody()
