@@ -23,7 +23,9 @@ _OFFSET = 0.5 * (_WINDOW - _FRAME)
 _LOUD = 0.1  # root mean square that the recogniser is given
 _HISS = 1e-3  # root mean square of white noise laid under a text's sound: the stops of a made voice are zeros
 AGREES = 0.0
-"""Nats a hundredth of a second: words whose phonemes fit what is heard less well are another recording's."""
+"""Nats a hundredth of a second: texts whose phonemes fit what is heard less well are another recording's."""
+RECOGNISED_AGREE = -0.35
+"""The same for words that were recognised: some may be wrong, and most of their sounds right."""
 
 
 def aligns() -> bool:
@@ -63,7 +65,8 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     decoder = load_recogniser() if recogniser is None else recogniser
     words = recognised_words(sound, decoder) if text is None else _words(text)
     found = _aligned(decoder, sound, words)
-    if found is None or agreement(LipNetwork.shipped()(sound), found) < AGREES:
+    least = RECOGNISED_AGREE if text is None else AGREES
+    if found is None or agreement(LipNetwork.shipped()(sound), found) < least:
         raise (
             _nobody()
             if text is None
