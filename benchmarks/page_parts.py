@@ -7,6 +7,7 @@ from benchmarks.page_parts_played import PLAYED
 from benchmarks.page_tables import reconstruction_lines, registration_lines
 from benchmarks.page_trainings import ablation_lines, build_lines, training_lines
 from benchmarks.page_words import (
+    ABLATION_OF_DEMO,
     DETECTION,
     EVERY_FOURTH,
     EVERY_FRAME,
@@ -103,6 +104,12 @@ PARTS = (
         training_lines,
     ),
     Part("training_person_demo", "Training of `make demo`", PERSON, training_lines),
+    Part(
+        "ablation_person_demo_tracked",
+        "Ablation on the embedded person, all rows: tracked inputs",
+        ABLATION_OF_DEMO,
+        ablation_lines,
+    ),
     Part(
         "cloth_from_pose_woman_casual",
         "What a pose tells of a skirt",
