@@ -67,16 +67,7 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     found = _aligned(decoder, sound, words)
     least = RECOGNISED_AGREE if text is None else AGREES
     if found is None or agreement(LipNetwork.shipped()(sound), found) < least:
-        raise (
-            _nobody()
-            if text is None
-            else InputError(
-                "sound",
-                expected="what the text says",
-                received="something else",
-                remedy="leave --text away: it is recognised then",
-            )
-        )
+        raise _nobody() if text is None else _something_else()
     speech = Speech(tuple(without_rests(found.phonemes, find_rests(sound))), sound.seconds)
     if not speech.spoken:  # words that are noises
         raise _nobody()
@@ -117,6 +108,15 @@ def _nobody() -> InputError:
         expected="words of English",
         received="none that the recogniser knows (music, noise or another language)",
         remedy="give what is said in it as --text, or --hear sounds, which follows any language",
+    )
+
+
+def _something_else() -> InputError:
+    return InputError(
+        "sound",
+        expected="what the text says",
+        received="something else",
+        remedy="leave --text away: it is recognised then",
     )
 
 

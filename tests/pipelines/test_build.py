@@ -16,8 +16,8 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
-from pipelines.runs.artefacts import load_parts, load_scan, load_source_faces
-from pipelines.runs.layout import TEMPLATE, TEMPLATE_STAGES
+from pipelines.runs.artefacts import load_scan, load_source_faces
+from pipelines.runs.layout import TEMPLATE_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
@@ -28,7 +28,6 @@ from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.labels import CLOTH_LABELS, HAIR
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
-from smplxpp.metrics import mesh_quality
 from smplxpp.segment import BoxCorrection, Corrections, read_labels
 from smplxpp.template.template import Template
 
@@ -179,19 +178,6 @@ def test_webs_stay_where_the_user_wants_them(small):
     assert faces[0] == 0 < faces[1]
     assert load_build(small.folder / "run")[1].webs == WebConfig()
     assert Build(out=small.folder, keep_webs=True).config().webs.rounds == 0
-
-
-def test_holes_that_cuts_leave_are_closed_in_the_template_and_the_report_counts_them(person_run):
-    darned = json.loads((person_run / "60_assemble" / "manifest.json").read_text())["numbers"]["darned"]
-    assert darned["upper"]["holes"] == darned["upper"]["closed"] > 1
-    template = Template.load(person_run / TEMPLATE)
-    quality = mesh_quality(template.part_mesh("upper"))
-    assert quality.border_loops == 4  # neck, cuffs, hem
-    assert quality.nonmanifold_edges == quality.nonmanifold_vertices == 0
-    cut, _ = load_parts(person_run)["upper"]
-    assert quality.faces == cut.face_count + darned["upper"]["faces"]
-    assert (template.scan_index[template.vertex_part == template.part_names.index("upper")] < 0).any()
-    assert "holes of cuts" in (person_run / "report.html").read_text()
 
 
 def test_holes_stay_where_the_user_wants_them(small):
