@@ -40,7 +40,7 @@ struct Skinned {
 Vec3 unit(Vec3 a) { return a * (1.0f / std::max(smplxpp::length(a), 1e-12f)); }
 
 // To `margin` metres before the surface, along its smooth normal, where a place lies behind that and not too deep.
-Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, const Surface& surface, const int32_t* faces, const Vec3* skin, float margin,
+Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, Surface& surface, const int32_t* faces, const Vec3* skin, float margin,
                 const float* deepest) {
     const int32_t near = surface.nearest(p, cloth_normal);
     if (near < 0 || surface.clear(p, near)) return p;

@@ -25,13 +25,24 @@ public:
         for (uint32_t k = 1; k <= kCells; ++k) first_[k] += first_[k - 1];
         for (int32_t i = 0; i < count; ++i) order_[size_t(--first_[at_[size_t(i)]])] = i;  // the last one first
     }
+    // The 8 cells that are nearest to a place, by the first of them.
+    struct Block {
+        int32_t x, y, z;
+        friend bool operator==(Block a, Block b) { return a.x == b.x && a.y == b.y && a.z == b.z; }
+        uint32_t hash() const { return uint32_t(x) * 73856093u ^ uint32_t(y) * 19349663u ^ uint32_t(z) * 83492791u; }
+    };
+    Block block(Vec3 p) const { return {first(p.x), first(p.y), first(p.z)}; }
+
     // Calls visit with the points within the reach of a place, and with others about it; some of those twice.
     template <class Visit>
     void around(Vec3 p, Visit&& visit) const {
-        const int32_t x = first(p.x), y = first(p.y), z = first(p.z);
-        for (int32_t i = x; i <= x + 1; ++i)
-            for (int32_t j = y; j <= y + 1; ++j)
-                for (int32_t k = z; k <= z + 1; ++k) {
+        in(block(p), visit);
+    }
+    template <class Visit>
+    void in(Block b, Visit&& visit) const {
+        for (int32_t i = b.x; i <= b.x + 1; ++i)
+            for (int32_t j = b.y; j <= b.y + 1; ++j)
+                for (int32_t k = b.z; k <= b.z + 1; ++k) {
                     const uint32_t at = key(i, j, k);
                     for (int32_t q = first_[at]; q < first_[at + 1]; ++q) visit(order_[size_t(q)]);
                 }
@@ -39,9 +50,7 @@ public:
 
 private:
     static constexpr uint32_t kCells = 1u << 14;
-    static uint32_t key(int32_t i, int32_t j, int32_t k) {
-        return (uint32_t(i) * 73856093u ^ uint32_t(j) * 19349663u ^ uint32_t(k) * 83492791u) & (kCells - 1);
-    }
+    static uint32_t key(int32_t i, int32_t j, int32_t k) { return Block{i, j, k}.hash() & (kCells - 1); }
     static int32_t whole(float x) {  // far and broken points share a cell: a cast of them has no value
         const float down = std::floor(x);
         return down > -1e9f && down < 1e9f ? int32_t(down) : 0;
@@ -58,18 +67,20 @@ struct Contact {
     float weight[3];
 };
 
-inline void add_normals(const Vec3* x, const int32_t* face, int64_t count, Vec3* out) {
+template <class Vec>
+void add_normals(const Vec* x, const int32_t* face, int64_t count, Vec* out) {
     for (int64_t k = 0; k < count; ++k) {
         const int32_t* q = face + 3 * k;
-        const Vec3 n = cross(x[q[1]] - x[q[0]], x[q[2]] - x[q[0]]);
+        const Vec n = cross(x[q[1]] - x[q[0]], x[q[2]] - x[q[0]]);
         for (int j = 0; j < 3; ++j) out[q[j]] = out[q[j]] + n;
     }
 }
 
-inline void normals(const Vec3* x, const int32_t* face, int64_t faces, std::vector<Vec3>& out) {
-    std::fill(out.begin(), out.end(), Vec3{0, 0, 0});
+template <class Vec>
+void normals(const Vec* x, const int32_t* face, int64_t faces, std::vector<Vec>& out) {
+    std::fill(out.begin(), out.end(), Vec{0, 0, 0});
     add_normals(x, face, faces, out.data());
-    for (Vec3& n : out) n = n * (1.0f / std::max(length(n), 1e-12f));
+    for (Vec& n : out) n = n * (1.0f / std::max(length(n), 1e-12f));
 }
 
 // A moving surface that cloth may touch: where a point's nearest vertex is, and the nearest place on its faces
@@ -88,19 +99,28 @@ public:
         vertex_ = vertex;
         normals(vertex, face_, faces_, normal_);
         grid_.fill(vertex, int64_t(normal_.size()), kReach);
+        gathered_.assign(kGathered, {{0, 0, 0}, 0, -1});
+        candidates_.clear();
     }
     Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
 
     // The nearest vertex within reach that faces as the cloth does, -1: none.
-    int32_t nearest(Vec3 p, Vec3 cloth_normal) const {
+    int32_t nearest(Vec3 p, Vec3 cloth_normal) {
+        const Gathered& about = gather(grid_.block(p));
         int32_t near = -1;
         float best = kReach * kReach;
-        grid_.around(p, [&](int32_t j) {
-            const Vec3 d = p - vertex_[j];
-            const float squared = dot(d, d);
-            // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
-            if (squared < best && dot(normal_[size_t(j)], cloth_normal) > kCovers) best = squared, near = j;
-        });
+        for (int32_t at = about.begin; at < about.end; ++at) {
+            const Candidates& c = candidates_[size_t(at)];
+            float squared[kWide];
+            for (int k = 0; k < kWide; ++k) {
+                const Vec3 d = {p.x - c.x[k], p.y - c.y[k], p.z - c.z[k]};
+                const float covers = c.nx[k] * cloth_normal.x + c.ny[k] * cloth_normal.y + c.nz[k] * cloth_normal.z;
+                // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
+                squared[k] = covers > kCovers ? dot(d, d) : kReach * kReach;
+            }
+            for (int k = 0; k < kWide; ++k)
+                if (squared[k] < best) best = squared[k], near = c.vertex[k];
+        }
         return near;
     }
     // Whether a place is so far before its nearest vertex that no face about can be over it.
@@ -109,7 +129,7 @@ public:
         const float height = dot(d, normal_[size_t(near)]);
         return height > kClear && 2.0f * height * height > dot(d, d);
     }
-    Contact find(Vec3 p, Vec3 cloth_normal) const { return find_from(nearest(p, cloth_normal), p, cloth_normal); }
+    Contact find(Vec3 p, Vec3 cloth_normal) { return find_from(nearest(p, cloth_normal), p, cloth_normal); }
     Contact find_from(int32_t near, Vec3 p, Vec3 cloth_normal) const {
         Contact found = {-1, {0, 0, 0}};
         if (near < 0) return found;
@@ -131,6 +151,36 @@ public:
     }
 
 private:
+    static constexpr int kWide = 16;
+    // Vertices of a block of the grid side by side, for one instruction to look at many; the last are filled up with far ones.
+    struct Candidates {
+        float x[kWide], y[kWide], z[kWide], nx[kWide], ny[kWide], nz[kWide];
+        int32_t vertex[kWide];
+    };
+    struct Gathered {
+        Grid::Block block;
+        int32_t begin, end;  // among the candidates; -1: nothing was gathered
+    };
+    // The vertices of a block; places that lie together share them.
+    const Gathered& gather(Grid::Block block) {
+        Gathered& known = gathered_[block.hash() & (kGathered - 1)];
+        if (known.end >= 0 && known.block == block) return known;
+        const int32_t begin = int32_t(candidates_.size());
+        int k = kWide;
+        grid_.in(block, [&](int32_t j) {
+            if (k == kWide) {
+                candidates_.emplace_back();
+                std::fill_n(candidates_.back().x, kWide, INFINITY);
+                k = 0;
+            }
+            Candidates& c = candidates_.back();
+            c.x[k] = vertex_[j].x, c.y[k] = vertex_[j].y, c.z[k] = vertex_[j].z, c.vertex[k] = j;
+            c.nx[k] = normal_[size_t(j)].x, c.ny[k] = normal_[size_t(j)].y, c.nz[k] = normal_[size_t(j)].z;
+            ++k;
+        });
+        return known = {block, begin, int32_t(candidates_.size())};
+    }
+
     // Looks for a place nearer than the best on the faces of a vertex; says whether there is one.
     bool scan(Vec3 p, int32_t vertex, float& best, Contact& found) const {
         bool nearer = false;
@@ -146,6 +196,7 @@ private:
         return nearer;
     }
 
+    static constexpr uint32_t kGathered = 1u << 11;  // blocks that are remembered
     static constexpr int kSteps = 8;          // from one vertex's faces to the next one's
     static constexpr float kReach = 0.035f;   // metres within which a vertex is found
     static constexpr float kClear = 0.01f;    // metres before a vertex
@@ -156,6 +207,8 @@ private:
     std::vector<Vec3> normal_;
     std::vector<int32_t> first_, at_;
     Grid grid_;
+    std::vector<Gathered> gathered_;
+    std::vector<Candidates> candidates_;
 };
 
 }  // namespace smplxpp

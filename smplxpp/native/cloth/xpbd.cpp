@@ -15,9 +15,15 @@
 namespace {
 
 using smplxpp::Contact;
+using smplxpp::cross;
+using smplxpp::dot;
 using smplxpp::Grid;
+using smplxpp::length;
 using smplxpp::Surface;
+using smplxpp::narrowed;
 using smplxpp::Vec3;
+using smplxpp::Vec4;
+using smplxpp::widened;
 
 // What a garment is, over n particles, m faces, e edges, b hinges and a collider of c vertices and d faces.
 // smplxpp/cloth/solver.py says the same.
@@ -62,12 +68,16 @@ void at_time(const float* const* moments, int64_t count, float t, Vec3* out) {
 class Solver {
 public:
     Solver(const Model& m, const Forces& f, Vec3* position, Vec3* velocity)
-        : m_(m), f_(f), x_(position), v_(velocity), n_(size_t(m.particles)), before_(n_), place_(n_), normal_(n_),
+        : m_(m), f_(f), position_(position), velocity_(velocity), n_(size_t(m.particles)), x_(n_), v_(n_), before_(n_),
+          place_(n_), normal_(n_),
           skin_(size_t(m.collider_vertices)), skin_before_(skin_.size()),
           surface_(m.collider_vertices, m.collider_face, m.collider_faces), contact_(n_, Contact{-1, {0, 0, 0}}) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
         const float h = seconds / float(substeps);
+        prepare(h);
+        std::transform(position_, position_ + n_, x_.begin(), widened);
+        std::transform(velocity_, velocity_ + n_, v_.begin(), widened);
         at_time(moments.collider, m_.collider_vertices, 0.0f, skin_.data());
         for (int32_t s = 0; s < substeps; ++s) {
             const float t = float(s + 1) / float(substeps);
@@ -75,18 +85,20 @@ public:
             at_time(moments.place, m_.particles, t, place_.data());
             at_time(moments.collider, m_.collider_vertices, t, skin_.data());
             const bool looks = s % contacts_every == 0;
-            if (looks || f_.normal_drag > 0) smplxpp::normals(x_, m_.face, m_.faces, normal_);
+            if (looks || f_.normal_drag > 0) smplxpp::normals(x_.data(), m_.face, m_.faces, normal_);
             move(h);
             if (looks) find_contacts();
             if (looks && f_.own_margin > 0) find_pairs();
-            stretch(h);
-            bend(h);
+            stretch();
+            bend();
             if (m_.spring) pull(h);
             hold();
             if (f_.own_margin > 0) part();
             touch();
             finish(h);
         }
+        std::transform(x_.begin(), x_.end(), position_, narrowed);
+        std::transform(v_.begin(), v_.end(), velocity_, narrowed);
     }
 
 private:
@@ -99,48 +111,63 @@ private:
         for (size_t i = 0; i < n_; ++i) {
             before_[i] = x_[i];
             if (w(int64_t(i)) == 0) {
-                x_[i] = place_[i];
+                x_[i] = widened(place_[i]);
                 continue;
             }
-            Vec3 v = v_[i];
+            Vec4 v = v_[i];
             if (across > 0) v = v - normal_[i] * (dot(v, normal_[i]) * across);
-            v.y -= fall;
-            x_[i] = x_[i] + v * (drag * h);
+            x_[i] = x_[i] + (v - Vec4{0, fall, 0, 0}) * (drag * h);
         }
     }
 
-    void stretch(float h) {
-        const float over = 1.0f / (h * h);
+    // What of edges and hinges is the same in all substeps, in the order in which those read it.
+    void prepare(float h) {
+        const float over = 1.0f / (h * h), share = std::min(0.45f, float(f_.inner_friction) * h);
+        edges_.resize(size_t(m_.edges));
         for (int64_t k = 0; k < m_.edges; ++k) {
             const int32_t i = m_.edge[2 * k], j = m_.edge[2 * k + 1];
-            const Vec3 d = x_[i] - x_[j];
-            const float l = length(d), error = l - m_.length[k];
-            const float soft = (error < 0 ? m_.compress : m_.stretch)[k] * over;
-            const Vec3 step = d * (error / (std::max(l, 1e-9f) * std::max(w(i) + w(j) + soft, 1e-20f)));
-            x_[i] = x_[i] - step * w(i);
-            x_[j] = x_[j] + step * w(j);
+            const float masses = w(i) + w(j);
+            const auto stiff = [&](const float* soft) { return std::max(masses + soft[k] * over, 1e-20f); };
+            const float drags = masses == 0 || share <= 0 ? 0.0f : share / masses;
+            edges_[size_t(k)] = {i, j, w(i), w(j), m_.length[k], stiff(m_.stretch), stiff(m_.compress), drags};
+        }
+        hinges_.resize(size_t(m_.hinges));
+        for (int64_t k = 0; k < m_.hinges; ++k) {
+            Hinge& hinge = hinges_[size_t(k)];
+            hinge.rest = m_.rest_curvature[k], hinge.stiff = m_.bend[k] * over;
+            for (int j = 0; j < 4; ++j) {
+                const float c = m_.curvature[4 * k + j], mass = w(hinge.corner[j] = m_.hinge[4 * k + j]);
+                hinge.curvature[j] = c, hinge.moves[j] = mass * c;
+                hinge.stiff += mass * c * c;
+            }
+            hinge.stiff = std::max(hinge.stiff, 1e-20f);
+        }
+    }
+
+    void stretch() {
+        for (const Edge& e : edges_) {
+            const Vec4 d = x_[size_t(e.i)] - x_[size_t(e.j)];
+            const float l = length(d), error = l - e.length;
+            const Vec4 step = d * (error / (std::max(l, 1e-9f) * (error < 0 ? e.compressed : e.stretched)));
+            x_[size_t(e.i)] -= step * e.mass_i;
+            x_[size_t(e.j)] += step * e.mass_j;
         }
     }
 
     // The quadratic model of Bergou et al. 2006: the curvature vector's part along the hinge's normal returns to that at rest.
-    void bend(float h) {
-        const float over = 1.0f / (h * h);
-        for (int64_t k = 0; k < m_.hinges; ++k) {
-            const int32_t* q = m_.hinge + 4 * k;
-            const float* c = m_.curvature + 4 * k;
-            const Vec3 along = x_[q[1]] - x_[q[0]];
-            const Vec3 n = cross(along, x_[q[2]] - x_[q[0]]) + cross(x_[q[3]] - x_[q[0]], along);
+    void bend() {
+        for (const Hinge& hinge : hinges_) {
+            Vec4* const at[4] = {&x_[size_t(hinge.corner[0])], &x_[size_t(hinge.corner[1])], &x_[size_t(hinge.corner[2])],
+                                 &x_[size_t(hinge.corner[3])]};
+            const Vec4 along = *at[1] - *at[0];
+            const Vec4 n = cross(along, *at[2] - *at[0]) + cross(*at[3] - *at[0], along);
             const float l = length(n);
             if (!(l > 1e-12f)) continue;
-            const Vec3 unit = n * (1.0f / l);
-            Vec3 curvature = {0, 0, 0};
-            float weight = m_.bend[k] * over;
-            for (int j = 0; j < 4; ++j) {
-                curvature = curvature + x_[q[j]] * c[j];
-                weight += w(q[j]) * c[j] * c[j];
-            }
-            const Vec3 step = unit * ((dot(curvature, unit) - m_.rest_curvature[k]) / std::max(weight, 1e-20f));
-            for (int j = 0; j < 4; ++j) x_[q[j]] = x_[q[j]] - step * (w(q[j]) * c[j]);
+            const Vec4 unit = n * (1.0f / l);
+            Vec4 curvature = {0, 0, 0, 0};
+            for (int j = 0; j < 4; ++j) curvature += *at[j] * hinge.curvature[j];
+            const Vec4 step = unit * ((dot(curvature, unit) - hinge.rest) / hinge.stiff);
+            for (int j = 0; j < 4; ++j) *at[j] -= step * hinge.moves[j];
         }
     }
 
@@ -148,7 +175,7 @@ private:
         const float over = 1.0f / (h * h);
         for (size_t i = 0; i < n_; ++i) {
             const float mass = w(int64_t(i)), soft = m_.spring[i] * over;
-            if (mass > 0 && std::isfinite(soft)) x_[i] = x_[i] + (place_[i] - x_[i]) * (mass / (mass + soft));
+            if (mass > 0 && std::isfinite(soft)) x_[i] += (widened(place_[i]) - x_[i]) * (mass / (mass + soft));
         }
     }
 
@@ -157,16 +184,16 @@ private:
         for (size_t i = 0; i < n_; ++i) {
             const int32_t to = m_.anchor[i];
             if (to < 0 || w(int64_t(i)) == 0) continue;
-            const Vec3 d = x_[i] - x_[to];
+            const Vec4 d = x_[i] - x_[size_t(to)];
             const float squared = dot(d, d), most = m_.tether[i];
-            if (squared > most * most) x_[i] = x_[to] + d * (most / std::sqrt(squared));
+            if (squared > most * most) x_[i] = x_[size_t(to)] + d * (most / std::sqrt(squared));
         }
     }
 
     void find_contacts() {
         surface_.look(skin_.data());
         for (size_t i = 0; i < n_; ++i)
-            contact_[i] = w(int64_t(i)) == 0 ? Contact{-1, {0, 0, 0}} : surface_.find(x_[i], normal_[i]);
+            contact_[i] = w(int64_t(i)) == 0 ? Contact{-1, {0, 0, 0}} : surface_.find(narrowed(x_[i]), narrowed(normal_[i]));
     }
 
     // Out of the collider along its smooth normal; Coulomb's friction against its own motion.
@@ -188,13 +215,15 @@ private:
             const float l = length(n);
             if (l < 1e-6f) continue;
             n = n * (1.0f / l);
-            const float height = dot(x_[i] - p, n), depth = margin - height;
+            Vec3 x = narrowed(x_[i]);
+            const float height = dot(x - p, n), depth = margin - height;
             if (depth <= 0 || height < -deepest) continue;
-            x_[i] = x_[i] + n * depth;
-            Vec3 slip = (x_[i] - before_[i]) - (p - was);
+            x = x + n * depth;
+            Vec3 slip = (x - narrowed(before_[i])) - (p - was);
             slip = slip - n * dot(slip, n);
             const float way = length(slip);
-            if (way > 1e-9f) x_[i] = x_[i] - slip * std::min(1.0f, friction * depth / way);
+            if (way > 1e-9f) x = x - slip * std::min(1.0f, friction * depth / way);
+            x_[i] = widened(x);
         }
     }
 
@@ -202,11 +231,12 @@ private:
     void find_pairs() {
         const float reach = 1.5f * float(f_.own_margin);
         pairs_.clear();
-        own_.fill(x_, m_.particles, reach);
+        std::transform(x_.begin(), x_.end(), position_, narrowed);
+        own_.fill(position_, m_.particles, reach);
         for (int32_t i = 0; i < m_.particles; ++i)
-            own_.around(x_[i], [&](int32_t j) {
+            own_.around(position_[i], [&](int32_t j) {
                 if (j <= i) return;
-                const Vec3 d = x_[i] - x_[j];
+                const Vec3 d = position_[i] - position_[j];
                 if (dot(d, d) < reach * reach && !neighbours(i, j)) pairs_.push_back({i, j});
             });
     }
@@ -225,12 +255,12 @@ private:
         const float margin = float(f_.own_margin);
         for (const auto& [i, j] : pairs_) {
             const float masses = w(i) + w(j);
-            const Vec3 d = x_[i] - x_[j];
+            const Vec4 d = x_[size_t(i)] - x_[size_t(j)];
             const float l = length(d);
             if (masses == 0 || l >= margin || l < 1e-7f) continue;
-            const Vec3 step = d * ((margin - l) / (masses * l));
-            x_[i] = x_[i] + step * w(i);
-            x_[j] = x_[j] - step * w(j);
+            const Vec4 step = d * ((margin - l) / (masses * l));
+            x_[size_t(i)] += step * w(i);
+            x_[size_t(j)] -= step * w(j);
         }
     }
 
@@ -242,27 +272,40 @@ private:
             const float speed = length(v_[i]);
             if (speed > most) v_[i] = v_[i] * (most / speed);
         }
-        const float share = std::min(0.45f, float(f_.inner_friction) * h);
-        if (share <= 0) return;
-        for (int64_t k = 0; k < m_.edges; ++k) {
-            const int32_t i = m_.edge[2 * k], j = m_.edge[2 * k + 1];
-            const float masses = w(i) + w(j);
-            if (masses == 0) continue;
-            const Vec3 d = (v_[i] - v_[j]) * (share / masses);
-            v_[i] = v_[i] - d * w(i);
-            v_[j] = v_[j] + d * w(j);
+        for (const Edge& e : edges_) {
+            if (e.drags == 0) continue;
+            const Vec4 d = (v_[size_t(e.i)] - v_[size_t(e.j)]) * e.drags;
+            v_[size_t(e.i)] -= d * e.mass_i;
+            v_[size_t(e.j)] += d * e.mass_j;
         }
     }
+
+    struct Edge {
+        int32_t i, j;
+        float mass_i, mass_j;  // inverse masses
+        float length, stretched, compressed;  // at rest; what resists it where it is longer, where it is shorter
+        float drags;           // of the ends' difference of velocities over their masses
+    };
+    struct Hinge {
+        int32_t corner[4];
+        float curvature[4], moves[4];  // weights in the curvature vector, times the inverse masses
+        float rest, stiff;
+    };
 
     struct Pair {
         int32_t i, j;
     };
     const Model& m_;
     const Forces& f_;
-    Vec3 *x_, *v_;
+    Vec3 *position_, *velocity_;
     size_t n_;
-    std::vector<Vec3> before_, place_, normal_, skin_, skin_before_;
+    std::vector<Vec4> x_, v_, before_;
+    std::vector<Vec3> place_;
+    std::vector<Vec4> normal_;
+    std::vector<Vec3> skin_, skin_before_;
     Surface surface_;
+    std::vector<Edge> edges_;
+    std::vector<Hinge> hinges_;
     std::vector<Contact> contact_;
     std::vector<Pair> pairs_;
     std::vector<int64_t> linked_;
