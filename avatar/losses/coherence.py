@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -10,7 +12,6 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.gather import gather_rows
 from avatar.rig.rig import Rig
 
 NEIGHBOURS = 8
@@ -36,23 +37,51 @@ class Coherence:
         faces = gaussians.face_index
         with torch.no_grad():
             frames = triangle_frames(rig.vertices, rig.faces)
-            self._axes, self._start = frames.rotations[faces], start.detach().clone()
+            axes, self._start = frames.rotations[faces], start.detach().clone()
             places = world_from_frames(gaussians, frames).means.double().cpu().numpy()
         part = rig.template.vertex_part[rig.template.faces[faces.cpu().numpy(), 0]]
         self._near = _neighbours(places, part)
+        near = torch.as_tensor(self._near, device=axes.device)
+        # (N, k, 3, 3): R_i^T R_j
+        self._own_from_other = torch.stack([axes.mT @ axes[others] for others in near.unbind(1)], dim=1)
 
     def __call__(self, shapes: Float[Tensor, "N 3 n"], random: np.random.Generator) -> Float[Tensor, ""]:
         """Return the penalty of shapes as they are now, estimated on Gaussians and neighbours drawn at random."""
         count, near = self._near.shape
         rows = random.choice(count, size=max(1, round(SHARE * count)), replace=False)
-        others = self._near[rows, random.integers(near, size=len(rows))]
-        learned, beside = (
-            self._learned(shapes, torch.as_tensor(each, device=shapes.device)) for each in (rows, others)
-        )
-        return (learned - beside).square().sum((1, 2)).mean()
+        which = random.integers(near, size=len(rows))
+        drawn = np.stack([rows, self._near[rows, which], which])
+        own, other, turned = torch.as_tensor(drawn, device=shapes.device)
+        turn = self._own_from_other[own, turned]
+        apart: Tensor = _Apart.apply(shapes, self._start, torch.stack([own, other]), turn)
+        return apart
 
-    def _learned(self, shapes: Tensor, rows: Tensor) -> Tensor:
-        return torch.einsum("nij,njk->nik", self._axes[rows], gather_rows(shapes, rows) - self._start[rows])
+
+class _Apart(torch.autograd.Function):
+    """Mean over P pairs i, j of `|a_i - Q a_j|^2`, `a = shapes - start`, with one dense gradient for all of them."""
+
+    @staticmethod
+    def forward(ctx: Any, shapes: Tensor, start: Tensor, pairs: Tensor, turn: Tensor) -> Tensor:
+        learned = shapes.index_select(0, pairs.flatten()) - start.index_select(0, pairs.flatten())
+        own, other = learned.unflatten(0, (2, -1))
+        apart = own - _turned(turn, other)
+        ctx.save_for_backward(pairs, turn, apart)
+        ctx.shape = shapes.shape
+        return apart.square().sum((1, 2)).mean()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None, None]:
+        pairs, turn, apart = ctx.saved_tensors
+        own = (2.0 / len(apart) * slope) * apart
+        both = torch.cat([own, -_turned(turn.mT, own)])
+        index = pairs.flatten()[:, None, None].expand_as(both)
+        return apart.new_zeros(ctx.shape).scatter_add_(0, index, both), None, None, None
+
+
+def _turned(turn: Float[Tensor, "P 3 3"], values: Float[Tensor, "P 3 n"]) -> Tensor:
+    """Return the products; many small matrices are slow in `bmm`."""
+    return sum((turn[:, :, k, None] * values[:, None, k] for k in (1, 2)), turn[:, :, 0, None] * values[:, None, 0])
 
 
 def _neighbours(places: np.ndarray, part: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resources import explain_resource_errors
+from avatar.training.engine.resources import explain_resource_errors, keep_freed_memory
 from avatar.training.engine.session import Session
 from pipelines.figures.comparison import preview_writer
 from pipelines.runs.digests import TRAINING
@@ -167,6 +167,7 @@ class Trainer:
         self._deadline = time.monotonic() + options.max_seconds
         self._sequences: dict[str, AvatarSequence] = {}
         self._finished: dict[str, StageRecord] = {}
+        keep_freed_memory()
 
     @property
     def device(self) -> str:

@@ -68,6 +68,15 @@ def test_gradients_draw_a_gaussian_to_its_neighbours(rig, bound, start, monkeypa
     assert shapes.grad[7, 1, 0] > 0 and not shapes.grad[..., 1].any()
 
 
+def test_gradients_are_those_of_finite_differences(rig, bound, start, monkeypatch):
+    monkeypatch.setattr(coherence, "SHARE", 1.0)
+    few = bound.select(torch.arange(12))
+    penalty = Coherence(rig, few, start[:12])
+    penalty._start, penalty._own_from_other = penalty._start.double(), penalty._own_from_other.double()
+    shapes = (start[:12] + torch.randn(12, 3, 2, generator=torch.Generator().manual_seed(2))).double()
+    assert torch.autograd.gradcheck(lambda U: penalty(U, np.random.default_rng(3)), shapes.requires_grad_(True))
+
+
 def test_parts_are_apart_and_a_lonely_gaussian_is_its_own_neighbour():
     places = np.array([[0.0, 0, 0], [1e-3, 0, 0], [2e-3, 0, 0], [0.5, 0, 0]])
     near = _neighbours(places, np.array([0, 0, 1, 0]))

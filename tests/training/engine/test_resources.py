@@ -1,0 +1,39 @@
+"""What a training asks of the machine's memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+CHILD = """
+import resource
+import torch
+from avatar.training.engine.resources import keep_freed_memory
+
+kept = {kept}
+assert not kept or keep_freed_memory()
+
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+def use():  # beyond what malloc keeps by itself in any layout of the heap
+    return torch.ones(1 << 24)
+
+for _ in range(3):
+    use()
+before = faults()
+for _ in range(5):
+    use()
+print(faults() - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator alone can be told")
+def test_freed_memory_is_kept_for_the_next_step():
+    def pages(kept: bool) -> int:
+        code = CHILD.format(kept=kept)
+        return int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+
+    assert pages(True) < 1000 < pages(False)
