@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Int64
@@ -23,12 +25,16 @@ CAMERAS = 12
 """Of these, cameras at most."""
 TOLERANCE = 0.01
 """Metres that clothes may lie behind what a camera sees and still count as seen."""
+# Of the sequences that are still there: all stages of a training ask for the same, which takes seconds.
+_FOUND: WeakKeyDictionary[FrameSequence, Bool[np.ndarray, " F"]] = WeakKeyDictionary()
 
 
 def unseen(sequence: FrameSequence, gaussians: LearnedGaussians) -> Bool[Tensor, " N"]:
     """Mark the Gaussians inside a mouth that stays shut, and on clothes that hide in all views, as in an armpit."""
-    hidden = _faces_of_shut_mouth(sequence) | _hidden_clothes(sequence)[sequence.rig.template.faces].all(axis=1)
-    return torch.tensor(hidden, device=gaussians.face_index.device)[gaussians.face_index]
+    if sequence not in _FOUND:
+        clothes = _hidden_clothes(sequence)[sequence.rig.template.faces].all(axis=1)
+        _FOUND[sequence] = _faces_of_shut_mouth(sequence) | clothes
+    return torch.tensor(_FOUND[sequence], device=gaussians.face_index.device)[gaussians.face_index]
 
 
 def _faces_of_shut_mouth(sequence: FrameSequence) -> Bool[np.ndarray, " F"]:
