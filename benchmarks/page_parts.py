@@ -174,8 +174,8 @@ PARTS = (
     Part(
         "loose_cloth_woman_casual",
         "The same, exact inputs",
-        "Exact poses. Vertexwise: frame-0 correspondences. Rows differ by where the simulation starts. Milliseconds of CPU a "
-        "step on a busy machine; the solver alone takes about 3 (least of 15).",
+        "Exact poses. Vertexwise: frame-0 correspondences. Rows differ by where the simulation starts. Milliseconds of "
+        "CPU a step on a busy machine; the solver alone takes about 3 (least of 15).",
     ),
     Part(
         "loose_cloth_woman_casual_noisy",

@@ -18,7 +18,7 @@ from smplxpp.template.template import Template
 
 # Farther than this from the followed surface a particle says no more: it hangs in another fold.
 MOST = 0.15
-# Standard errors, or share of the best one's distance, by which the defaults must be worse than the best to be given up.
+# Standard errors, and share of the best one's distance, by which the defaults have to be worse than it to be given up.
 _ERRORS, _SHARE = 2.0, 0.1
 
 
