@@ -18,8 +18,6 @@ from smplxpp.template.template import Template
 
 # Farther than this from the followed surface a particle says no more: it hangs in another fold.
 MOST = 0.15
-# Standard errors, and share of the best one's distance, by which the defaults have to be worse than it to be given up.
-_ERRORS, _SHARE = 2.0, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +32,8 @@ class CalibrationConfig:
         blocks: of consecutive frames; each is left out once for the uncertainty.
     """
 
-    drags: tuple[float, ...] = (0.6, 1.25, 2.5, 5.0, 10.0)
-    pin_depths: tuple[float, ...] = (0.014, 0.03)
+    drags: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    pin_depths: tuple[float, ...] = (0.008, 0.014, 0.03)
     least_motion: float = 0.006
     most_share: float = 0.85
     blocks: int = 4
@@ -222,17 +220,15 @@ def _plainest(
     *,
     default: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return what is nearest to the defaults of all that is as good as the best.
+    """Return what is nearest to the defaults of all that is not worse than the best by more than a standard error.
 
-    That is, not worse by more than two standard errors, nor by more than a tenth of the best one's distance. The error
-    is that of the difference to the best, by leaving blocks of frames out: chaos puts folds elsewhere with any value,
-    and its luck in these frames is not that of others.
+    The error is that of the difference to the best, by leaving blocks of frames out: chaos puts folds elsewhere with
+    any value, and its luck in these frames is not that of others.
     """
 
     def as_good(pair: tuple[float, float]) -> bool:
         worse = table[pair] - table[best]
-        error = _jackknife([np.delete(worse, block).mean() for block in blocks])
-        return bool(worse.mean() <= min(_ERRORS * error, _SHARE * table[best].mean()))
+        return bool(worse.mean() <= _jackknife([np.delete(worse, block).mean() for block in blocks]))
 
     def away(pair: tuple[float, float]) -> float:
         return float(np.abs(np.log(np.array(pair) / np.array(default))).sum())
