@@ -16,9 +16,9 @@ from smplxpp.core.errors import InputError
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
 """In the words of CUDA's libraries and of the CPU allocators, which have no exception of their own."""
-# Of malloc.h: sizes, bytes, from which freed memory goes back to the system.
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _NEVER = -1, -3, 1 << 30
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# glibc's malloc.h: options that say from how many bytes on freed memory goes back to the system, and what never does.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _NEVER = -1, -3, 1 << 30
 
 
 def peak_memory(device: str = "cpu") -> dict[str, int]:
@@ -38,10 +38,10 @@ def keep_freed_memory() -> bool:
     """
     if not sys.platform.startswith("linux"):
         return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None or not hasattr(ctypes.CDLL(None), "gnu_get_libc_version"):
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "gnu_get_libc_version"):
         return False
-    return all(mallopt(option, _NEVER) == 1 for option in (_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD))
+    return all(libc.mallopt(option, _NEVER) == 1 for option in (_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD))
 
 
 @contextmanager
