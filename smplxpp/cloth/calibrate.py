@@ -25,15 +25,20 @@ class CalibrationConfig:
     """What is searched, and when a simulation is worth its while.
 
     Attributes:
-        drags: 1/s. pin_depths: metres. All pairs are tried, then drags between the best one's neighbours.
+        drags: 1/s. pin_depths: metres. All pairs are tried; what lies between them is chaos's luck.
+        drag_prior, pin_prior: how far the garment's own values are believed: the distance counts as larger by this
+            share for each squared factor of two from them. Slow motion tells drags hardly apart, and what was followed
+            there is stiffer than cloth; a motion that does tell finds the same values with and without it.
         least_motion: metres by which the followed surface leaves skinning, on average over a part, for it to be loose.
         most_share: of skinning's distance to the followed surface that the simulation's may have for what was fitted to
             be kept; else the surface was followed too badly to say anything, and the values stay what they were.
         blocks: of consecutive frames; each is left out once for the uncertainty.
     """
 
-    drags: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
-    pin_depths: tuple[float, ...] = (0.008, 0.014, 0.03)
+    drags: tuple[float, ...] = (0.625, 1.25, 2.5, 5.0, 10.0)
+    pin_depths: tuple[float, ...] = (0.014, 0.03)
+    drag_prior: float = 0.08
+    pin_prior: float = 0.04
     least_motion: float = 0.006
     most_share: float = 0.85
     blocks: int = 4
@@ -43,7 +48,8 @@ class CalibrationConfig:
             values = getattr(self, name)
             if not values or min(values) <= 0:
                 raise InputError(f"calibration: {name}", expected="one or more above 0", received=str(values))
-        require_at_least("calibration: least_motion", self.least_motion, 0.0)
+        for name in ("drag_prior", "pin_prior", "least_motion"):
+            require_at_least(f"calibration: {name}", getattr(self, name), 0.0)
         require_between("calibration: most_share", self.most_share, 0.0, 1.0)
         require_at_least("calibration: blocks", self.blocks, 2)
 
@@ -150,22 +156,31 @@ def calibrate(
 
     pairs = list(product(config.drags, config.pin_depths))
     table: dict[tuple[float, float], Float[np.ndarray, " L"]] = {}
+    own = np.array([garment.config.fabric.drag, garment.config.pin_depth])
+    believed = np.array([config.drag_prior, config.pin_prior])
+
+    def best(frames: np.ndarray) -> tuple[float, float]:
+        """The pair of the least distance in these frames, the prior counted."""
+
+        def cost(pair: tuple[float, float]) -> float:
+            octaves = np.log2(np.array(pair) / own)
+            return float(table[pair][frames].mean() * (1.0 + believed @ octaves**2))
+
+        return min(table, key=cost)
+
+    frames = np.arange(len(skinned))
+
     for done, pair in enumerate(pairs):
-        progress(done, len(pairs) + 2)
+        progress(done, len(pairs))
         table[pair] = simulated(*pair)
-    drag, pin = min(table, key=lambda pair: table[pair].mean())
-    for finer in _between_neighbours(drag, config.drags):
-        table[finer, pin] = simulated(finer, pin)
-    progress(len(pairs) + 2, len(pairs) + 2)
-    best = min(table, key=lambda pair: table[pair].mean())
-    if table[best].mean() > config.most_share * skinned.mean():
-        return garment, _found(garment, skinned, table[best], moves=True)
-    blocks = np.array_split(np.arange(int(followed_frames.sum())), config.blocks)
-    best = _plainest(table, best, blocks, default=(garment.config.fabric.drag, garment.config.pin_depth))
-    left_out = [_best_without(table, block) for block in blocks]
+    progress(len(pairs), len(pairs))
+    drag, pin = best(frames)
+    if table[drag, pin].mean() > config.most_share * skinned.mean():
+        return garment, _found(garment, skinned, table[drag, pin], moves=True)
+    left_out = [best(np.setdiff1d(frames, block)) for block in np.array_split(frames, config.blocks)]
     spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
-    found = with_values(garment, drag=best[0], pin_depth=best[1])
-    return found, _found(found, skinned, table[best], moves=True, spread=(spread[0], spread[1]))
+    found = with_values(garment, drag=drag, pin_depth=pin)
+    return found, _found(found, skinned, table[drag, pin], moves=True, spread=(spread[0], spread[1]))
 
 
 def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
@@ -200,40 +215,6 @@ def _found(
 def _particle_areas(garment: Garment) -> Float[np.ndarray, " n"]:
     rest = garment.rest
     return np.bincount(rest.faces.ravel(), np.repeat(rest.face_areas / 3.0, 3), minlength=rest.vertex_count)
-
-
-def _between_neighbours(value: float, values: Sequence[float]) -> list[float]:
-    """Return the geometric means of a value and its neighbours."""
-    ordered = sorted(values)
-    at = ordered.index(value)
-    return [float(np.sqrt(value * ordered[k])) for k in (at - 1, at + 1) if 0 <= k < len(ordered)]
-
-
-def _best_without(table: dict[tuple[float, float], Float[np.ndarray, " L"]], block: np.ndarray) -> tuple[float, float]:
-    return min(table, key=lambda pair: np.delete(table[pair], block).mean())
-
-
-def _plainest(
-    table: dict[tuple[float, float], Float[np.ndarray, " L"]],
-    best: tuple[float, float],
-    blocks: Sequence[np.ndarray],
-    *,
-    default: tuple[float, float],
-) -> tuple[float, float]:
-    """Return what is nearest to the defaults of all that is not worse than the best by more than a standard error.
-
-    The error is that of the difference to the best, by leaving blocks of frames out: chaos puts folds elsewhere with
-    any value, and its luck in these frames is not that of others.
-    """
-
-    def as_good(pair: tuple[float, float]) -> bool:
-        worse = table[pair] - table[best]
-        return bool(worse.mean() <= _jackknife([np.delete(worse, block).mean() for block in blocks]))
-
-    def away(pair: tuple[float, float]) -> float:
-        return float(np.abs(np.log(np.array(pair) / np.array(default))).sum())
-
-    return min((pair for pair in table if as_good(pair)), key=away)
 
 
 def _jackknife(values: Sequence[float]) -> float:

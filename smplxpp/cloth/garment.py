@@ -37,7 +37,7 @@ class GarmentConfig:
 
     spacing: float = 0.03
     collider_spacing: float = 0.03
-    pin_depth: float = 0.014
+    pin_depth: float = 0.03
     band: float = 0.03
     skin_margin: float = 0.007
     sheet_margin: float = 0.003

@@ -101,3 +101,15 @@ def test_surfaces_and_choices_that_cannot_be_are_refused():
     for name, value in (("drags", ()), ("pin_depths", (0.0,)), ("most_share", 1.5), ("blocks", 1)):
         with pytest.raises(InputError, match=name):
             CalibrationConfig(**{name: value})
+
+
+def test_defaults_stay_where_the_surface_hardly_tells_others_and_yield_where_it_does():
+    own = garment().config
+    slow, fast = own.fabric.drag, 4.0 * own.fabric.drag
+    at = {drag: simulated(with_values(garment(), drag=drag, pin_depth=own.pin_depth)) for drag in (slow, fast)}
+    for share, prior, expected in ((0.52, 0.0, fast), (0.52, 0.08, slow), (0.9, 0.08, fast)):
+        config = CalibrationConfig(
+            drags=(slow, fast), pin_depths=(own.pin_depth,), drag_prior=prior, most_share=1.0, blocks=3
+        )
+        between = Followed(swaying(), FPS, (1.0 - share) * at[slow] + share * at[fast])
+        assert calibrate(person(), garment(), between, config=config, driver=QUICK)[1].drag == expected

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
-from smplxpp.cloth import Garment, cut_garment
+from smplxpp.cloth import Garment, GarmentConfig, cut_garment
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.params import BodyParams
@@ -24,6 +24,8 @@ FADING = 0.3
 """Seconds in which what the simulation has wrong falls to 1/e: it swings as the cloth does, out of step."""
 JUDGED = 4
 """Frames, the last ones, by which forecasts are judged."""
+PINNED = 0.014
+"""Metres of cloth that a forecast holds to the body: less than players do, for what is found corrects it."""
 DOUBT = 1e-3
 """Metres that every forecast may be wrong by: two that are better are alike."""
 
@@ -97,7 +99,7 @@ def _loose_parts(template: Template, reference: BodyParams) -> list[Garment]:
     garments = []
     for name in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
         with suppress(InputError):
-            garments.append(cut_garment(template, name, reference))
+            garments.append(cut_garment(template, name, reference, GarmentConfig(pin_depth=PINNED)))
     return garments
 
 
