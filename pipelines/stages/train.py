@@ -196,8 +196,6 @@ def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ..
         return
     if there:
         log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
-    elif config.teacher and config.preset.teacher.track is not None:
-        log.info("capture %s has no normal maps: those of the followed surface stand for them", capture.name)
     else:
         log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 

@@ -29,25 +29,21 @@ from avatar.training.engine.unseen import hold_unseen
 from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
-Surface = Callable[[View, int], View]
-"""Gives a view of a frame normals that the capture has not."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaskContext:
-    """What a task has beside data, model and configuration; perceptual distance and surface alone change its steps.
+    """What a task has beside data, model and configuration; the perceptual distance alone changes its steps.
 
     Attributes:
         perceptual: for the perceptual term; None leaves it out.
         distributed: the processes that train together; None: this one alone.
         preview: called at every evaluation with rendered (H, W, 3) uint8 images by name.
-        surface: for the normal term, normals of views that have no map; None leaves the term out for these.
     """
 
     perceptual: PerceptualDistance | None = None
     distributed: Distributed | None = None
     preview: Preview = lambda images: None
-    surface: Surface | None = None
 
 
 ALONE = TaskContext()
@@ -158,7 +154,6 @@ class PhotometricTask(OptimizationTask[Item]):
         self.sequence, self.model, self.config, self.preview = sequence, model, config, context.preview
         self.perceptual = context.perceptual if config.weights.perceptual else None
         self.iteration = 0
-        self.surface = context.surface if config.weights.normal else None
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
         super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
         self.rest_frames = triangle_frames(sequence.rig.vertices, sequence.rig.faces)
@@ -179,13 +174,10 @@ class PhotometricTask(OptimizationTask[Item]):
         """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
-        """Return the item's photographs, at half their size in the coarse part of the training, with all normals."""
+        """Return the item's photographs, at half their size in the coarse part of the training."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
         coarse = self.iteration < self.config.coarse * self.config.iterations
-        views = [view.halved() for view in views] if coarse else views
-        if self.surface is None:
-            return views
-        return [self.surface(view, item.frame) if view.normals is None else view for view in views]
+        return [view.halved() for view in views] if coarse else views
 
     def compared(
         self,
