@@ -120,6 +120,7 @@ class _Size:
     teacher: _Steps
     bake: _Steps
     compensate: _Steps
+    surface_normals: bool = False
 
 
 def _lean(name: str, size: _Size) -> TrainingPreset:
@@ -146,6 +147,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             lr=size.teacher.lr,
             attributes=size.teacher.attributes,
             weights=_LEAN_WEIGHTS,
+            surface_normals=size.surface_normals,
             track=TrackConfig(
                 levels=size.track,
                 control_points=size.control_points,
@@ -166,6 +168,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             lr=size.bake.lr,
             null_share=0.2,
             weights=_LEAN_WEIGHTS,
+            surface_normals=size.surface_normals,
         ),
         compensate=CompensateConfig(
             iterations=size.compensate.iterations,
@@ -179,6 +182,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             init_from_track=True,
             coherence=200.0,
             weights=_LEAN_WEIGHTS,
+            surface_normals=size.surface_normals,
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
         control_points=size.control_points,
@@ -267,6 +271,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             bake=_Steps(250, 3e-4, 2.0),
             # Faster, what few frames teach the blend shapes of their poses costs new ones.
             compensate=_Steps(500, 1.5e-4, 0.15),
+            # Seven cameras of 250 pixels say less about folds than the surface that was followed.
+            surface_normals=True,
         ),
     ),
 }

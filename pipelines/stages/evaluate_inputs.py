@@ -34,7 +34,10 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
         parameters = NOT_KNOWN if NOT_KNOWN in (parameters, of_template) else MIXED
     used, frames, cameras = _trained(run)
     there, all_views = normal_maps(capture)
-    normals = "none" if not there or used == "none" else said.of_views("normals", folder_of_maps(capture, "normal"))
+    if used == "surface":
+        normals = "estimated"
+    else:
+        normals = "none" if not there or used == "none" else said.of_views("normals", folder_of_maps(capture, "normal"))
     return InputProtocol(
         parameters=parameters,
         stage=stage,

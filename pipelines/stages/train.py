@@ -196,6 +196,8 @@ def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ..
         return
     if there:
         log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
+    elif config.teacher and config.preset.teacher.track is not None and any(t.surface_normals for t in trainings):
+        log.info("capture %s has no normal maps: those of followed clothes stand for them", capture.name)
     else:
         log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 

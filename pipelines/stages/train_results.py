@@ -100,7 +100,7 @@ def _output(
         "training_frames": len(sequence.train_frames),
         "training_cameras": len(sequence.train_cameras),
         "held_out_cameras": held_out,
-        "normals": "maps" if sequence.normal_maps else "none",
+        "normals": _normals(sequence, folder),
         "convention": CONVENTION,
         "seconds_of_tracking": seconds[TRACK] + seconds[WAY_BACK],
         **_followed(model),
@@ -119,6 +119,13 @@ def _followed(model: TeacherAvatar | Student | Baseline) -> dict[str, Any]:
     if track is None or track.sigma is None:
         return {}
     return {"followed": {f"{name}_mm": 1e3 * metres for name, metres in track.errors_of_clothes().items()}}
+
+
+def _normals(sequence: AvatarSequence, folder: Path) -> str:
+    """Where the normals of the loss came from: "maps" of the capture, the followed "surface", or "none"."""
+    if sequence.normal_maps:
+        return "maps"
+    return "surface" if any("normal" in line for line in read_metrics(folder / METRICS_FILE)) else "none"
 
 
 def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:

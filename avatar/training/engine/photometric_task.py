@@ -29,21 +29,25 @@ from avatar.training.engine.unseen import hold_unseen
 from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
+Surface = Callable[[View, int], View]
+"""Gives a view of a frame normals that the capture has not."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaskContext:
-    """What a task has beside data, model and configuration; the perceptual distance alone changes its steps.
+    """What a task has beside data, model and configuration; perceptual distance and surface alone change its steps.
 
     Attributes:
         perceptual: for the perceptual term; None leaves it out.
         distributed: the processes that train together; None: this one alone.
         preview: called at every evaluation with rendered (H, W, 3) uint8 images by name.
+        surface: for the normal term, normals of views that have no map; None leaves the term out for these.
     """
 
     perceptual: PerceptualDistance | None = None
     distributed: Distributed | None = None
     preview: Preview = lambda images: None
+    surface: Surface | None = None
 
 
 ALONE = TaskContext()
@@ -67,6 +71,7 @@ class PhotometricConfig:
         attributes: multiple of `rates` for the Gaussians' own attributes; 0 leaves them as they are.
         rates: of those attributes.
         weights: of the losses.
+        surface_normals: of captures without normal maps: the normal term takes those of clothes that were followed.
         perceptual_every: steps between those with the perceptual term, which then counts as many times.
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
             found there first.
@@ -86,6 +91,7 @@ class PhotometricConfig:
     attributes: float = 0.0
     rates: LearningRates = field(default_factory=LearningRates)
     weights: ReconstructionWeights = field(default_factory=ReconstructionWeights)
+    surface_normals: bool = False
     perceptual_every: int = 1
     coarse: float = 0.0
     eps2d: float = 0.1
@@ -154,6 +160,7 @@ class PhotometricTask(OptimizationTask[Item]):
         self.sequence, self.model, self.config, self.preview = sequence, model, config, context.preview
         self.perceptual = context.perceptual if config.weights.perceptual else None
         self.iteration = 0
+        self.surface = context.surface if config.weights.normal else None
         attributes = attribute_groups(model.gaussians, config.attributes, pixel_size(sequence), config.rates)
         super().__init__((*groups, *attributes), config.optimiser(), context.distributed)
         self.rest_frames = triangle_frames(sequence.rig.vertices, sequence.rig.faces)
@@ -174,10 +181,13 @@ class PhotometricTask(OptimizationTask[Item]):
         """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
-        """Return the item's photographs, at half their size in the coarse part of the training."""
+        """Return the item's photographs, at half their size in the coarse part of the training, with all normals."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
         coarse = self.iteration < self.config.coarse * self.config.iterations
-        return [view.halved() for view in views] if coarse else views
+        views = [view.halved() for view in views] if coarse else views
+        if self.surface is None:
+            return views
+        return [self.surface(view, item.frame) if view.normals is None else view for view in views]
 
     def compared(
         self,

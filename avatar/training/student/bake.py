@@ -28,6 +28,7 @@ from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import PRETRAIN, Session
 from avatar.training.student.distillation import DistillationTargets
 from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.validation import require_at_least, require_between, require_choice
 
 
@@ -198,5 +199,8 @@ def bake(
         session = session.after(progress)
         if config.null_share or config.imagined:
             show_null_code(made)  # on the processes that only waited for the pretraining, too
-    progress = session.run(lambda: BakeTask(sequence, made, config, session.context, teacher=teacher), config)
+    context = session.context
+    if config.surface_normals and teacher is not None:
+        context = with_surface_normals(context, sequence, teacher.track)
+    progress = session.run(lambda: BakeTask(sequence, made, config, context, teacher=teacher), config)
     return made.eval(), progress

@@ -25,6 +25,7 @@ from avatar.training.engine.photometric_task import (
 )
 from avatar.training.engine.session import Session
 from avatar.training.student.init_blend_shapes import init_blend_shapes
+from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between
 
@@ -118,12 +119,16 @@ def compensate(
     """Give a baked student blend shapes and train them.
 
     Args:
-        teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so.
+        teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so, and
+            gives normals where the capture has no maps.
     """
     with fixed_seed(config.seed):
         known = torch.stack([sequence.motion(frame).pose for frame in sequence.train_frames])
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
-    progress = session.run(lambda: CompensateTask(sequence, made, config, session.context), config)
+    context = session.context
+    if config.surface_normals and teacher is not None:
+        context = with_surface_normals(context, sequence, teacher.track)
+    progress = session.run(lambda: CompensateTask(sequence, made, config, context), config)
     return made.eval(), progress

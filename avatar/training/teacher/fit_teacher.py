@@ -21,6 +21,7 @@ from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.config import TrackConfig
+from avatar.training.tracking.surface_normals import with_surface_normals
 from avatar.training.tracking.track import follow_surface
 from smplxpp.core.spread import spread_inside
 
@@ -123,5 +124,6 @@ def fit_teacher(
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
-    progress = session.run(lambda: TeacherTask(sequence, teacher, config, session.context), config)
+    context = with_surface_normals(session.context, sequence, track) if config.surface_normals else session.context
+    progress = session.run(lambda: TeacherTask(sequence, teacher, config, context), config)
     return teacher.eval(), progress
