@@ -26,9 +26,9 @@ class CalibrationConfig:
 
     Attributes:
         drags: 1/s. pin_depths: metres. All pairs are tried; what lies between them is chaos's luck.
-        drag_prior, pin_prior: how far the garment's own values are believed: the distance counts as larger by this
-            share for each squared factor of two from them. Slow motion tells drags hardly apart, and what was followed
-            there is stiffer than cloth; a motion that does tell finds the same values with and without it.
+        drag_prior: how far the garment's own drag is believed: the distance counts as larger by this share for each
+            squared factor of two from it. Slow motion tells drags hardly apart, and what was followed there is stiffer
+            than cloth; a motion that does tell finds the same drag with and without it.
         least_motion: metres by which the followed surface leaves skinning, on average over a part, for it to be loose.
         most_share: of skinning's distance to the followed surface that the simulation's may have for what was fitted to
             be kept; else the surface was followed too badly to say anything, and the values stay what they were.
@@ -38,7 +38,6 @@ class CalibrationConfig:
     drags: tuple[float, ...] = (0.625, 1.25, 2.5, 5.0, 10.0)
     pin_depths: tuple[float, ...] = (0.014, 0.03)
     drag_prior: float = 0.08
-    pin_prior: float = 0.04
     least_motion: float = 0.006
     most_share: float = 0.85
     blocks: int = 4
@@ -48,7 +47,7 @@ class CalibrationConfig:
             values = getattr(self, name)
             if not values or min(values) <= 0:
                 raise InputError(f"calibration: {name}", expected="one or more above 0", received=str(values))
-        for name in ("drag_prior", "pin_prior", "least_motion"):
+        for name in ("drag_prior", "least_motion"):
             require_at_least(f"calibration: {name}", getattr(self, name), 0.0)
         require_between("calibration: most_share", self.most_share, 0.0, 1.0)
         require_at_least("calibration: blocks", self.blocks, 2)
@@ -156,15 +155,13 @@ def calibrate(
 
     pairs = list(product(config.drags, config.pin_depths))
     table: dict[tuple[float, float], Float[np.ndarray, " L"]] = {}
-    own = np.array([garment.config.fabric.drag, garment.config.pin_depth])
-    believed = np.array([config.drag_prior, config.pin_prior])
 
     def best(frames: np.ndarray) -> tuple[float, float]:
         """The pair of the least distance in these frames, the prior counted."""
 
         def cost(pair: tuple[float, float]) -> float:
-            octaves = np.log2(np.array(pair) / own)
-            return float(table[pair][frames].mean() * (1.0 + believed @ octaves**2))
+            octaves = np.log2(pair[0] / garment.config.fabric.drag)
+            return float(table[pair][frames].mean() * (1.0 + config.drag_prior * octaves**2))
 
         return min(table, key=cost)
 
