@@ -104,7 +104,8 @@ class _Steps:
 class _Size:
     """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations, rates.
 
-    The compensation's rate is that of its mapping networks; those of U and C are in proportion.
+    The compensation's rate is that of its mapping networks; those of U and C are in proportion. `penalties` multiplies
+    its penalties of large and far Gaussians.
     """
 
     gaussians: int
@@ -120,6 +121,7 @@ class _Size:
     teacher: _Steps
     bake: _Steps
     compensate: _Steps
+    penalties: float = 1.0
     surface_normals: bool = False
 
 
@@ -179,6 +181,8 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             color_lr=size.compensate.lr,
             null_share=0.2,
             attributes=size.compensate.attributes,
+            scale_penalty=0.003 * size.penalties,
+            offset_penalty=0.1 * size.penalties,
             init_from_track=True,
             coherence=200.0,
             weights=_LEAN_WEIGHTS,
@@ -246,6 +250,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             teacher=_Steps(500, 2e-3, 3.0),
             bake=_Steps(900, 1e-3, 3.0),
             compensate=_Steps(3000, 1e-3, 2.0),
+            # What leaks through from behind others moves fast Gaussians farther.
+            penalties=5.0,
         ),
     ),
     "demo": _lean(
