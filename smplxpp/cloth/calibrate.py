@@ -166,7 +166,6 @@ def calibrate(
         return min(table, key=cost)
 
     frames = np.arange(len(skinned))
-
     for done, pair in enumerate(pairs):
         progress(done, len(pairs))
         table[pair] = simulated(*pair)

@@ -98,7 +98,13 @@ def test_surfaces_and_choices_that_cannot_be_are_refused():
             calibrate(person(), garment(), Followed(swaying(), FPS, world), config=FEW)
     with pytest.raises(InputError, match="in one frame at least"):
         calibrate(person(), garment(), Followed(swaying(), FPS, np.full_like(skinned(), np.nan)), config=FEW)
-    for name, value in (("drags", ()), ("pin_depths", (0.0,)), ("most_share", 1.5), ("blocks", 1)):
+    for name, value in (
+        ("drags", ()),
+        ("pin_depths", (0.0,)),
+        ("drag_prior", -0.1),
+        ("most_share", 1.5),
+        ("blocks", 1),
+    ):
         with pytest.raises(InputError, match=name):
             CalibrationConfig(**{name: value})
 

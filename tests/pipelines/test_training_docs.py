@@ -57,6 +57,12 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "cameras a pose": ", ".join(str(stage.views) for stage in stages),
         "rate of the networks": ", ".join(f"{stage.lr:g}" for stage in stages),
         "rate of the attributes, of the fit's": ", ".join(f"{stage.attributes:g}" for stage in stages),
+        "penalties of large, of far Gaussians": "; ".join(
+            f"{stage.scale_penalty:g}, {stage.offset_penalty:g}" if stage.attributes else "-" for stage in stages
+        ),
+        "followed clothes give normals where a capture has none": (
+            "yes" if all(stage.surface_normals for stage in stages) else "no"
+        ),
         "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",

@@ -71,7 +71,8 @@ class PhotometricConfig:
         attributes: multiple of `rates` for the Gaussians' own attributes; 0 leaves them as they are.
         rates: of those attributes.
         weights: of the losses.
-        surface_normals: of captures without normal maps: the normal term takes those of clothes that were followed.
+        surface_normals: whether normals of followed clothes stand for maps where a capture has none; without, the loss
+            has no normal term there.
         perceptual_every: steps between those with the perceptual term, which then counts as many times.
         coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
             found there first.

@@ -199,8 +199,7 @@ def bake(
         session = session.after(progress)
         if config.null_share or config.imagined:
             show_null_code(made)  # on the processes that only waited for the pretraining, too
-    context = session.context
-    if config.surface_normals and teacher is not None:
-        context = with_surface_normals(context, sequence, teacher.track)
+    followed = teacher.track if config.surface_normals and teacher is not None else None
+    context = with_surface_normals(session.context, sequence, followed)
     progress = session.run(lambda: BakeTask(sequence, made, config, context, teacher=teacher), config)
     return made.eval(), progress

@@ -127,8 +127,7 @@ def compensate(
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
-    context = session.context
-    if config.surface_normals and teacher is not None:
-        context = with_surface_normals(context, sequence, teacher.track)
+    followed = teacher.track if config.surface_normals and teacher is not None else None
+    context = with_surface_normals(session.context, sequence, followed)
     progress = session.run(lambda: CompensateTask(sequence, made, config, context), config)
     return made.eval(), progress

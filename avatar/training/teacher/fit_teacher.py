@@ -124,6 +124,6 @@ def fit_teacher(
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
-    context = with_surface_normals(session.context, sequence, track) if config.surface_normals else session.context
+    context = with_surface_normals(session.context, sequence, track if config.surface_normals else None)
     progress = session.run(lambda: TeacherTask(sequence, teacher, config, context), config)
     return teacher.eval(), progress

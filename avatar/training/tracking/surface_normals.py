@@ -1,4 +1,4 @@
-"""Normals of the surface that was followed, for the normal term of the loss where a capture has no normal maps."""
+"""Normals of clothes that were followed, for the normal term of the loss where a capture has no normal maps."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SurfaceNormals:
 
 
 def with_surface_normals(context: TaskContext, sequence: AvatarSequence, track: Track | None) -> TaskContext:
-    """Return the context with normals of the followed surface, if there is one and the capture has no normal maps."""
+    """Return the context with normals of followed clothes, if a surface was followed and the capture has no maps."""
     if track is None or sequence.normal_maps:
         return context
     return replace(context, surface=SurfaceNormals(sequence, track))
