@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
@@ -61,7 +61,12 @@ class SamplingConfig:
             raise InputError("sampling: opacity", expected="a number inside (0, 1)", received=repr(self.opacity))
 
 
-def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> BoundGaussians:
+def sample_on_mesh(
+    template: Template,
+    config: SamplingConfig | None = None,
+    *,
+    density: Float[np.ndarray, " F"] | None = None,
+) -> BoundGaussians:
     """Place Gaussians on the faces of a template, float32, lying flat, coloured as it is.
 
     Every region (head, rest) gets its count in proportion to area or faces, hidden faces less, and faces that close an
@@ -69,19 +74,24 @@ def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> 
     along the faces' order and follow a low-discrepancy sequence inside each face. Tangential scales start at
     `touch / sqrt(density)`, so that neighbours overlap.
 
+    Args:
+        density: positive factors of how densely each face is covered beside the others of its region; None: all 1.
+
     Raises:
         InputError: a share for the head of a body that has no joint "head", or a region without a face to sample.
     """
     config = config or SamplingConfig()
     mesh = template.mesh
     weights = mesh.face_areas * 1.0 if config.spread_by == "area" else (mesh.face_areas > 0).astype(float)
+    if density is not None:
+        weights *= density
     weights[find_opening_webs(template)] = 0.0
     head = np.zeros(mesh.face_count, dtype=bool) if config.head_share is None else head_faces(template)
     if config.hidden_density < 1.0:
         weights *= np.where(seen_faces(mesh), 1.0, config.hidden_density)
     on_head = round(config.count * (config.head_share or 0.0))
     rng = np.random.Generator(np.random.PCG64(config.seed))
-    density = np.zeros(mesh.face_count)
+    expected = np.zeros(mesh.face_count)
     regions = []
     for name, region, count in (("rest", ~head, config.count - on_head), ("head", head, on_head)):
         if not count:
@@ -92,11 +102,11 @@ def sample_on_mesh(template: Template, config: SamplingConfig | None = None) -> 
                 f"sampling: {name}", expected="faces with some area", received="none", remedy="change head_share"
             )
         regions.append(_stratified(inside, count, rng))
-        expected = inside * (count / inside.sum())
-        density += np.divide(expected, mesh.face_areas, out=np.zeros_like(density), where=expected > 0)
+        expected += inside * (count / inside.sum())
     face, barycentric = (np.concatenate(arrays) for arrays in zip(*regions, strict=True))
     order = np.argsort(face, kind="stable")
-    return _initial(template, face[order], barycentric[order], density, config)
+    each = np.divide(expected, mesh.face_areas, out=np.zeros_like(expected), where=expected > 0)
+    return _initial(template, face[order], barycentric[order], each, config)
 
 
 def head_faces(template: Template) -> Bool[np.ndarray, " F"]:

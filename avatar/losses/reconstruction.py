@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionWeights:
-    """Weights of `L_rec = w L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha`. The defaults are the paper's.
+    """Weights of `L_rec = w L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha + e L2`. The defaults are the paper's.
 
     Attributes:
         l1: of the mean absolute difference of colours. dssim: of `1 - SSIM`. perceptual: of LPIPS or ST-LPIPS.
         normal: of the L1 between normals.
         alpha: of the L1 between opacity and mask, which the paper does not have: on a black background dark hair could
             be a hole.
+        l2: of the mean squared difference of colours, which the paper does not have: what lies far off counts more.
     """
 
     l1: float = 1.0
@@ -34,6 +35,7 @@ class ReconstructionWeights:
     perceptual: float = 0.01
     normal: float = 0.02
     alpha: float = 0.0
+    l2: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -66,8 +68,12 @@ def reconstruction_loss(
     D-SSIM is `1 - SSIM` as in 3DGS's code. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a normal.
     Terms without what they need (no normals, no perceptual distance, an image below its size) are left out.
     """
-    l1 = (rendering.image - target.image).abs().mean()
+    difference = rendering.image - target.image
+    l1 = difference.abs().mean()
     total, terms = weights.l1 * l1, {"l1": l1}
+    if weights.l2:
+        terms["l2"] = difference.square().mean()
+        total = total + weights.l2 * terms["l2"]
     if weights.dssim:
         terms["dssim"] = 1.0 - ssim(rendering.image, target.image)
         total = total + weights.dssim * terms["dssim"]
@@ -81,8 +87,8 @@ def reconstruction_loss(
     if weights.normal and rendering.normals is not None and target.normals is not None:
         known = (target.normals != 0).any(-1)
         if bool(known.any()):
-            difference = (rendering.normals - target.normals.float()).abs().sum(-1)
-            terms["normal"] = difference[known].mean()
+            apart = (rendering.normals - target.normals.float()).abs().sum(-1)
+            terms["normal"] = apart[known].mean()
             total = total + weights.normal * terms["normal"]
     with torch.no_grad():
         square = float((rendering.image.clamp(0.0, 1.0) - target.image).square().mean())

@@ -88,7 +88,8 @@ def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
     return replace(config, iterations=iterations, pretrain=pretrain)
 
 
-_LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
+_PAPER_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
+_LEAN_WEIGHTS = replace(_PAPER_WEIGHTS, l2=5.0)
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         networks=network_preset(name),
         fit=FitConfig(
             sampling=SamplingConfig(count=size.gaussians, head_share=size.head_share),
+            detail=2.0,
             iterations=size.fit,
             rates=size.rates,
         ),
@@ -183,6 +185,8 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             attributes=size.compensate.attributes,
             scale_penalty=0.003 * size.penalties,
             offset_penalty=0.1 * size.penalties,
+            # What shines, hair above all, is not learned by then at the usual rate.
+            rates=LearningRates(sh=1e-3),
             init_from_track=True,
             coherence=200.0,
             weights=_LEAN_WEIGHTS,
@@ -204,12 +208,12 @@ def _paper_small() -> TrainingPreset:
         networks=network_preset("paper-small"),
         fit=FitConfig(sampling=SamplingConfig(count=50_000, head_share=70 / 270), iterations=600),
         teacher=FitTeacherConfig(
-            iterations=1500, pretrain=None, views=3, lr=2e-3, attributes=1.0, weights=_LEAN_WEIGHTS
+            iterations=1500, pretrain=None, views=3, lr=2e-3, attributes=1.0, weights=_PAPER_WEIGHTS
         ),
         bake=BakeConfig(
-            iterations=1200, semantic_map="mesh", views=3, lr=2e-3, code_lr_factor=5.0, weights=_LEAN_WEIGHTS
+            iterations=1200, semantic_map="mesh", views=3, lr=2e-3, code_lr_factor=5.0, weights=_PAPER_WEIGHTS
         ),
-        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_LEAN_WEIGHTS),
+        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_PAPER_WEIGHTS),
         blend_shapes=BlendShapeConfig(),
         control_points=2400,
     )

@@ -57,6 +57,18 @@ def test_samples_follow_area(template):
     assert np.abs(np.cumsum(counts) - 60_000 * np.cumsum(share)).max() <= 1.0
 
 
+def test_density_moves_samples_within_a_region(template):
+    density = np.where(template.mesh.triangles.mean(1)[:, 0] > 0.0, 3.0, 1.0)
+    bound = sample_on_mesh(template, spread(count=60_000), density=density)
+    share = density * template.mesh.face_areas / (density * template.mesh.face_areas).sum()
+    counts = np.bincount(bound.face_index, minlength=len(share))
+    assert np.abs(np.cumsum(counts) - 60_000 * np.cumsum(share)).max() <= 1.0
+    one, other = (bound.log_scales[density[bound.face_index] == d, 0].mean() for d in (3.0, 1.0))
+    assert float(other - one) > 0.4  # about log sqrt(3): fewer are larger, so that they meet
+    headed = sample_on_mesh(template, SamplingConfig(count=5001, head_share=0.3), density=density)
+    assert head_faces(template)[headed.face_index].sum() == round(0.3 * 5001)
+
+
 def test_every_face_with_a_stratum_of_area_has_a_sample(template):
     bound = sample_on_mesh(template, spread())
     areas = template.mesh.face_areas

@@ -35,12 +35,13 @@ def pair(size: int = 40) -> tuple[Rendering, Target]:
 
 def test_the_weighted_sum_of_all_terms():
     rendering, target = pair()
-    weights = ReconstructionWeights(dssim=0.3, perceptual=0.7, normal=0.11, alpha=0.5)
+    weights = ReconstructionWeights(dssim=0.3, perceptual=0.7, normal=0.11, alpha=0.5, l2=3.0)
     total, terms = reconstruction_loss(rendering, target, weights, perceptual=MeanDifference())
     l1 = (rendering.image - target.image).abs().mean()
     known = target.normals.float()[20:]
     expected = {
         "l1": float(l1),
+        "l2": float((rendering.image - target.image).square().mean()),
         "dssim": 1.0 - float(ssim(rendering.image, target.image)),
         "alpha": float((rendering.alpha - target.alpha).abs().mean()),
         "perceptual": 2.0 * float(l1),
@@ -48,13 +49,14 @@ def test_the_weighted_sum_of_all_terms():
         "psnr_crop": -10.0 * math.log10(float((rendering.image - target.image).square().mean())),
     }
     assert terms == pytest.approx(expected, rel=1e-5)
-    sum_of = expected["l1"] + 0.3 * expected["dssim"] + 0.5 * expected["alpha"]
+    sum_of = expected["l1"] + 3.0 * expected["l2"] + 0.3 * expected["dssim"] + 0.5 * expected["alpha"]
     assert float(total) == pytest.approx(sum_of + 0.7 * expected["perceptual"] + 0.11 * expected["normal"], rel=1e-5)
 
 
 def test_the_defaults_are_the_papers():
     weights = ReconstructionWeights()
-    assert (weights.dssim, weights.perceptual, weights.normal, weights.alpha) == (0.2, 0.01, 0.02, 0.0)
+    assert (weights.dssim, weights.perceptual, weights.normal) == (0.2, 0.01, 0.02)
+    assert weights.alpha == weights.l2 == 0.0
 
 
 def test_equal_images_cost_nothing():
@@ -88,7 +90,7 @@ def test_gradients_go_to_image_opacity_and_normals():
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["dssim", "perceptual", "normal", "alpha"])
+@pytest.mark.parametrize("name", ["dssim", "perceptual", "normal", "alpha", "l2"])
 def test_weights_have_to_be_numbers_from_zero_on(name, value):
     with pytest.raises(InputError, match=name):
         ReconstructionWeights(**{name: value})

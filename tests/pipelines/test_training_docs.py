@@ -32,6 +32,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
     return {
         "Gaussians": f"{preset.fit.sampling.count:,}",
         "Gaussians on the head, share": f"{preset.fit.sampling.head_share:.2g}",
+        "denser where photographs change": f"{preset.fit.detail:g}" if preset.fit.detail else "no",
         "rates of the fit: colours; places, pixels": f"{preset.fit.rates.dc:g}; {preset.fit.rates.offset:g}",
         "clothes held to skinning within, mm of the skin": (
             "-" if teacher.track is None else f"{1e3 * teacher.track.tight_reach:g}"
@@ -57,6 +58,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "cameras a pose": ", ".join(str(stage.views) for stage in stages),
         "rate of the networks": ", ".join(f"{stage.lr:g}" for stage in stages),
         "rate of the attributes, of the fit's": ", ".join(f"{stage.attributes:g}" for stage in stages),
+        "rate of the harmonics": ", ".join(f"{stage.rates.sh:g}" if stage.attributes else "-" for stage in stages),
         "penalties of large, of far Gaussians": "; ".join(
             f"{stage.scale_penalty:g}, {stage.offset_penalty:g}" if stage.attributes else "-" for stage in stages
         ),
@@ -66,6 +68,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
+        "squared differences of colours": f"{weight.l2:g}" if weight.l2 else "none",
         "blend shapes start from": "the surface" if compensate.init_from_track else "zero",
         "blend shapes hold neighbours together, weight": f"{compensate.coherence:,g}" if compensate.coherence else "-",
         "jaw drives the head": "yes" if preset.blend_shapes.jaw else "no",

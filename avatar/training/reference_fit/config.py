@@ -17,7 +17,8 @@ class FitConfig:
     """Choices of a reference fit.
 
     Attributes:
-        sampling: number of Gaussians and where they start.
+        sampling: number of Gaussians and where they start. detail: how much denser they lie where the photographs
+            change quickly, see `density_of_detail`; 0, as in the paper, one density.
         iterations: steps; each renders one view.
         rates: learning rates.
         dssim: share of `1 - SSIM` in the loss, the rest is L1.
@@ -32,6 +33,7 @@ class FitConfig:
     """
 
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    detail: float = 0.0
     iterations: int = 800
     rates: LearningRates = field(default_factory=LearningRates)
     dssim: float = 0.2
@@ -45,6 +47,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         for name, least, most in (
+            ("detail", 0.0, math.inf),
             ("iterations", 1, math.inf),
             ("dssim", 0.0, 1.0),
             ("alpha", 0.0, math.inf),

@@ -134,7 +134,7 @@ class FitTask(PhotometricTask):
             margin=config.margin,
             device=device,
         )
-        start = initial_gaussians(frame.rig, scene.vertices, scene.train, config.sampling)
+        start = initial_gaussians(frame.rig, scene.vertices, scene.train, config.sampling, detail=config.detail)
         self.fit_config, self.held_out = config, bool(scene.held_out)
         self.student = Student(StudentConfig(field=None), frame.rig, start, ())
         super().__init__(frame, self.student, config.photometric(), [], context)

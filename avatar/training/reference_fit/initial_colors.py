@@ -16,6 +16,7 @@ from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.rig.rig import Rig
+from avatar.training.reference_fit.picture_detail import changes, density_of_detail
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth
@@ -30,20 +31,40 @@ MIN_OPACITY = 0.99
 
 
 def initial_gaussians(
-    rig: Rig, vertices: Float[np.ndarray, "V 3"], views: Sequence[View], sampling: SamplingConfig
+    rig: Rig,
+    vertices: Float[np.ndarray, "V 3"],
+    views: Sequence[View],
+    sampling: SamplingConfig,
+    *,
+    detail: float = 0.0,
 ) -> BoundGaussians:
-    """Sample Gaussians on a template and colour them from whole views of it at `vertices`, metres."""
-    start = sample_on_mesh(rig.template, sampling).to(device=rig.device)
-    placed = world_from_frames(start, triangle_frames(rig.motion_to(vertices).rest, rig.faces))
-    dc, _ = colors_from_views(
+    """Sample Gaussians on a template and colour them from whole views of it at `vertices`, metres.
+
+    Args:
+        detail: how much denser they lie where the views change quickly, see `density_of_detail`.
+    """
+    start = sample_on_mesh(rig.template, sampling)
+    if detail:
+        rates, seen = _shown(rig, vertices, start, [changes(view) for view in views])
+        density = density_of_detail(rig.template, start.face_index.numpy(), rates.cpu().numpy(), seen, detail)
+        start = sample_on_mesh(rig.template, sampling, density=density)
+    return replace(start.to(device=rig.device), dc=_shown(rig, vertices, start, views)[0])
+
+
+def _shown(
+    rig: Rig, vertices: Float[np.ndarray, "V 3"], gaussians: BoundGaussians, views: Sequence[View]
+) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
+    """Colours of Gaussians on a template at `vertices` as views show them, and which of them any view shows."""
+    gaussians = gaussians.to(device=rig.device)
+    placed = world_from_frames(gaussians, triangle_frames(rig.motion_to(vertices).rest, rig.faces))
+    return colors_from_views(
         placed.means.double().cpu().numpy(),
         placed.normals.double().cpu().numpy(),
-        start.dc,
+        gaussians.dc,
         mesh=rig.template.mesh.with_vertices(vertices),
         views=views,
-        tolerance=np.where(_in_mouth(rig, start), MOUTH_TOLERANCE, DEPTH_TOLERANCE),
+        tolerance=np.where(_in_mouth(rig, gaussians), MOUTH_TOLERANCE, DEPTH_TOLERANCE),
     )
-    return replace(start, dc=dc)
 
 
 def _in_mouth(rig: Rig, gaussians: BoundGaussians) -> Bool[np.ndarray, " N"]:
