@@ -88,8 +88,7 @@ def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
     return replace(config, iterations=iterations, pretrain=pretrain)
 
 
-_PAPER_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
-_LEAN_WEIGHTS = replace(_PAPER_WEIGHTS, l2=5.0)
+_LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 
 
 @dataclass(frozen=True)
@@ -189,7 +188,8 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             rates=LearningRates(sh=1e-3),
             init_from_track=True,
             coherence=200.0,
-            weights=_LEAN_WEIGHTS,
+            # Not before: where textures are not in place yet, the mean of what cameras show is a blur.
+            weights=replace(_LEAN_WEIGHTS, l2=5.0),
             surface_normals=size.surface_normals,
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
@@ -208,12 +208,12 @@ def _paper_small() -> TrainingPreset:
         networks=network_preset("paper-small"),
         fit=FitConfig(sampling=SamplingConfig(count=50_000, head_share=70 / 270), iterations=600),
         teacher=FitTeacherConfig(
-            iterations=1500, pretrain=None, views=3, lr=2e-3, attributes=1.0, weights=_PAPER_WEIGHTS
+            iterations=1500, pretrain=None, views=3, lr=2e-3, attributes=1.0, weights=_LEAN_WEIGHTS
         ),
         bake=BakeConfig(
-            iterations=1200, semantic_map="mesh", views=3, lr=2e-3, code_lr_factor=5.0, weights=_PAPER_WEIGHTS
+            iterations=1200, semantic_map="mesh", views=3, lr=2e-3, code_lr_factor=5.0, weights=_LEAN_WEIGHTS
         ),
-        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_PAPER_WEIGHTS),
+        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_LEAN_WEIGHTS),
         blend_shapes=BlendShapeConfig(),
         control_points=2400,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -26,7 +27,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
     with torch.device("meta"):
         millions = sum(p.numel() for p in Teacher(network).parameters()) / 1e6
     stages, before = (teacher, bake, compensate), (teacher.pretrain, bake.pretrain)
-    weights = {stage.weights for stage in stages}
+    weights = {replace(stage.weights, l2=0.0) for stage in stages}
     assert len(weights) == 1
     (weight,) = weights
     return {
@@ -68,7 +69,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
-        "squared differences of colours": f"{weight.l2:g}" if weight.l2 else "none",
+        "squared differences of colours": ", ".join(f"{stage.weights.l2:g}" for stage in stages),
         "blend shapes start from": "the surface" if compensate.init_from_track else "zero",
         "blend shapes hold neighbours together, weight": f"{compensate.coherence:,g}" if compensate.coherence else "-",
         "jaw drives the head": "yes" if preset.blend_shapes.jaw else "no",
