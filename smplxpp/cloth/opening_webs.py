@@ -17,7 +17,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.core.topology import border_loops
+from smplxpp.core.topology import border_loops, face_adjacency, face_components
 from smplxpp.template.template import BODY_PART, Template
 
 # Metres from an opening's border: a web is as wide as the gap between a hem and what it hangs over.
@@ -72,4 +72,20 @@ def _webs_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, 
         found = found[body.query(behind).distance > 0] if len(found) else found
     web[:] = False
     web[found] = True
-    return web
+    return web | _crumbs(mesh, web)
+
+
+def _crumbs(mesh: TriangleMesh, web: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
+    """The pieces that webs alone join to the rest and that are smaller than these: holes in what was found of a web.
+
+    They would hang on the nearest cloth, as far below a hem as the leg is behind it.
+    """
+    left = np.flatnonzero(~web)
+    piece = np.full(mesh.face_count, -1)
+    piece[left] = face_components(mesh.faces[left])
+    pairs = face_adjacency(mesh.faces)[0]
+    across = web[pairs[:, 0]] != web[pairs[:, 1]]
+    beside = np.unique(piece[pairs[across]])
+    areas = np.bincount(piece[left], weights=mesh.face_areas[left], minlength=1)
+    small = [k for k in beside if k >= 0 and areas[k] < mesh.face_areas[web].sum()]
+    return np.isin(piece, small)

@@ -94,6 +94,21 @@ def test_a_web_under_a_hem_is_found_and_cut_off():
     assert np.isfinite(with_web.vertex_depth).all() and with_web.share()[-96:].min() == 1.0
 
 
+@pytest.mark.parametrize("moved", [0.05, -0.05])
+def test_a_dent_in_a_web_is_the_webs(moved):
+    flat = person(web=True)
+    web = find_opening_webs(flat)
+    ring = np.unique(flat.faces[web])
+    # Of its inner edge: no face around such a vertex touches the skirt.
+    inside = ring[~np.isin(ring, flat.faces[~web])]
+    edge = min(inside, key=lambda vertex: (flat.faces == vertex).any(axis=1).sum())
+    vertices = flat.vertices.copy()
+    vertices[edge, 1] += moved
+    dented = replace(flat, vertices=vertices)
+    assert (web & (np.abs(dented.mesh.face_normals[:, 1]) < 0.5)).any()
+    np.testing.assert_array_equal(find_opening_webs(dented), web)
+
+
 def test_a_skirt_without_a_web_has_none_and_nobody_takes_a_waist_for_one():
     assert not find_opening_webs(person()).any()
     assert not find_opening_webs(person(tight=False)).any()
