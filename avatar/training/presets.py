@@ -89,6 +89,9 @@ def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
 
 
 _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
+# Not before the compensation: where textures are not in place yet, the mean of what cameras show is a blur.
+_LAST_WEIGHTS = replace(_LEAN_WEIGHTS, l2=5.0)
+_DETAIL = 2.0
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         networks=network_preset(name),
         fit=FitConfig(
             sampling=SamplingConfig(count=size.gaussians, head_share=size.head_share),
-            detail=2.0,
+            detail=_DETAIL,
             iterations=size.fit,
             rates=size.rates,
         ),
@@ -188,8 +191,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             rates=LearningRates(sh=1e-3),
             init_from_track=True,
             coherence=200.0,
-            # Not before: where textures are not in place yet, the mean of what cameras show is a blur.
-            weights=replace(_LEAN_WEIGHTS, l2=5.0),
+            weights=_LAST_WEIGHTS,
             surface_normals=size.surface_normals,
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
@@ -206,14 +208,14 @@ def _paper_small() -> TrainingPreset:
     """
     return TrainingPreset(
         networks=network_preset("paper-small"),
-        fit=FitConfig(sampling=SamplingConfig(count=50_000, head_share=70 / 270), iterations=600),
+        fit=FitConfig(sampling=SamplingConfig(count=50_000, head_share=70 / 270), detail=_DETAIL, iterations=600),
         teacher=FitTeacherConfig(
             iterations=1500, pretrain=None, views=3, lr=2e-3, attributes=1.0, weights=_LEAN_WEIGHTS
         ),
         bake=BakeConfig(
             iterations=1200, semantic_map="mesh", views=3, lr=2e-3, code_lr_factor=5.0, weights=_LEAN_WEIGHTS
         ),
-        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_LEAN_WEIGHTS),
+        compensate=CompensateConfig(iterations=1200, lr=1e-3, weights=_LAST_WEIGHTS),
         blend_shapes=BlendShapeConfig(),
         control_points=2400,
     )
