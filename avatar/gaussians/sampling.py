@@ -78,13 +78,14 @@ def sample_on_mesh(
         density: positive factors of how densely each face is covered beside the others of its region; None: all 1.
 
     Raises:
-        InputError: a share for the head of a body that has no joint "head", or a region without a face to sample.
+        InputError: a share for the head of a body that has no joint "head", a region without a face to sample, or
+            densities that are not one positive number a face.
     """
     config = config or SamplingConfig()
     mesh = template.mesh
     weights = mesh.face_areas * 1.0 if config.spread_by == "area" else (mesh.face_areas > 0).astype(float)
     if density is not None:
-        weights *= density
+        weights *= _positive(density, mesh.face_count)
     weights[find_opening_webs(template)] = 0.0
     head = np.zeros(mesh.face_count, dtype=bool) if config.head_share is None else head_faces(template)
     if config.hidden_density < 1.0:
@@ -107,6 +108,13 @@ def sample_on_mesh(
     order = np.argsort(face, kind="stable")
     each = np.divide(expected, mesh.face_areas, out=np.zeros_like(expected), where=expected > 0)
     return _initial(template, face[order], barycentric[order], each, config)
+
+
+def _positive(density: Float[np.ndarray, " F"], count: int) -> Float[np.ndarray, " F"]:
+    if density.shape != (count,) or not (np.isfinite(density) & (density > 0)).all():
+        received = f"shape {density.shape}, from {density.min(initial=np.inf):g} to {density.max(initial=-np.inf):g}"
+        raise InputError("sampling: density", expected=f"{count} finite numbers above 0", received=received)
+    return density
 
 
 def head_faces(template: Template) -> Bool[np.ndarray, " F"]:

@@ -91,6 +91,7 @@ def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
 _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
 # Not before the compensation: where textures are not in place yet, the mean of what cameras show is a blur.
 _LAST_WEIGHTS = replace(_LEAN_WEIGHTS, l2=5.0)
+# Of 0 to 10 the best on three captures: docs/training.md, "Where Gaussians lie".
 _DETAIL = 2.0
 
 
@@ -185,8 +186,8 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             color_lr=size.compensate.lr,
             null_share=0.2,
             attributes=size.compensate.attributes,
-            scale_penalty=0.003 * size.penalties,
-            offset_penalty=0.1 * size.penalties,
+            scale_penalty=size.penalties * CompensateConfig.scale_penalty,
+            offset_penalty=size.penalties * CompensateConfig.offset_penalty,
             # What shines, hair above all, is not learned by then at the usual rate.
             rates=LearningRates(sh=1e-3),
             init_from_track=True,

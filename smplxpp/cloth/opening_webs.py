@@ -35,8 +35,8 @@ def find_opening_webs(template: Template) -> Bool[np.ndarray, " F"]:
     """Find the faces of a template's clothes that close an opening, in the T-pose.
 
     A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
-    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them. A body without an
-    inside has none.
+    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them. Small pieces that
+    only such faces join to the rest are webs, too. A body without an inside has none.
     """
     out = np.zeros(len(template.faces), dtype=bool)
     parts = [label.name for label in CLOTH_LABELS if label.name in template.part_names]
@@ -78,7 +78,7 @@ def _webs_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, 
 def _crumbs(mesh: TriangleMesh, web: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
     """The pieces that webs alone join to the rest and that are smaller than these: holes in what was found of a web.
 
-    They would hang on the nearest cloth, as far below a hem as the leg is behind it.
+    As cloth they would be carried by what is nearest, up to a decimetre away, and be torn when that swings.
     """
     left = np.flatnonzero(~web)
     piece = np.full(mesh.face_count, -1)
@@ -87,5 +87,5 @@ def _crumbs(mesh: TriangleMesh, web: Bool[np.ndarray, " M"]) -> Bool[np.ndarray,
     across = web[pairs[:, 0]] != web[pairs[:, 1]]
     beside = np.unique(piece[pairs[across]])
     areas = np.bincount(piece[left], weights=mesh.face_areas[left], minlength=1)
-    small = [k for k in beside if k >= 0 and areas[k] < mesh.face_areas[web].sum()]
-    return np.isin(piece, small)
+    small = (beside >= 0) & (areas[beside] < mesh.face_areas[web].sum())
+    return np.isin(piece, beside[small])

@@ -69,6 +69,16 @@ def test_density_moves_samples_within_a_region(template):
     assert head_faces(template)[headed.face_index].sum() == round(0.3 * 5001)
 
 
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_densities_have_to_be_one_positive_number_a_face(template, value):
+    density = np.ones(len(template.faces))
+    with pytest.raises(InputError, match="density"):
+        sample_on_mesh(template, spread(count=100), density=density[:-1])
+    density[3] = value
+    with pytest.raises(InputError, match="density"):
+        sample_on_mesh(template, spread(count=100), density=density)
+
+
 def test_every_face_with_a_stratum_of_area_has_a_sample(template):
     bound = sample_on_mesh(template, spread())
     areas = template.mesh.face_areas

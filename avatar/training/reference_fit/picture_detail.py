@@ -42,9 +42,10 @@ def density_of_detail(
     seen: Bool[np.ndarray, " N"],
     detail: float,
 ) -> Float64[np.ndarray, " F"]:
-    """Return how densely each face is to be covered: `1 + detail g / mean(g)`.
+    """Return how densely each face is to be covered: `1 + detail g / G`.
 
-    g is the root mean square of the changes at the places nearest to the face that some view saw, of the same part. A
+    g is the root mean square of the changes at the places nearest to the face that some view saw, of the same part, G
+    that of all places that some view saw. A
     Gaussian draws a patch of about one colour: over a surface that changes by g a metre, `1 / rho` a Gaussian, its mean
     squared error goes with `g^2 / rho`, whose sum over a given number of Gaussians is least where rho goes with g. The
     1 keeps what looks plain in one frame and one light from going bare.
