@@ -109,7 +109,8 @@ class _Size:
     """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations, rates.
 
     The compensation's rate is that of its mapping networks; those of U and C are in proportion. `penalties` multiplies
-    its penalties of large and far Gaussians.
+    its penalties of large and far Gaussians. `averaged` is the share of the steps whose mean bake and compensation end
+    with.
     """
 
     gaussians: int
@@ -125,6 +126,7 @@ class _Size:
     teacher: _Steps
     bake: _Steps
     compensate: _Steps
+    averaged: float = 0.2
     penalties: float = 1.0
     surface_normals: bool = False
 
@@ -174,6 +176,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             views=3,
             lr=size.bake.lr,
             null_share=0.2,
+            averaged=size.averaged,
             weights=_LEAN_WEIGHTS,
             surface_normals=size.surface_normals,
         ),
@@ -192,6 +195,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             rates=LearningRates(sh=1e-3),
             init_from_track=True,
             coherence=200.0,
+            averaged=size.averaged,
             weights=_LAST_WEIGHTS,
             surface_normals=size.surface_normals,
         ),
@@ -282,8 +286,9 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             # do not. So networks learn slowly after their pretraining, and colours fast.
             teacher=_Steps(250, 3e-4, 3.5),
             bake=_Steps(250, 3e-4, 2.0),
-            # Faster, what few frames teach the blend shapes of their poses costs new ones.
-            compensate=_Steps(500, 1.5e-4, 0.15),
+            # Faster networks learn more of few frames' poses than new ones bear.
+            compensate=_Steps(500, 1.5e-4, 1.0),
+            averaged=0.6,
             # Seven cameras of 250 pixels say less about folds than the surface that was followed.
             surface_normals=True,
         ),

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.tensor_file import require_finite, require_like
+from avatar.training.engine.mean_of_steps import MeanOfSteps
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
 
 Batch = TypeVar("Batch")
 _START_ANEW = "delete the file of its state, or give --force, to start anew"
@@ -37,6 +38,7 @@ class OptimiserConfig:
         warmup: steps over which the rates also rise linearly from `1 / warmup` to 1; 0 for none.
         betas, eps: Adam's.
         max_grad_norm: largest norm of all gradients together; longer ones are scaled down to it.
+        averaged: share of the steps, to the last, over which what is learned is averaged in the end (`MeanOfSteps`).
         amp: networks in bfloat16 on CUDA, where the task says so with `OptimizationTask.autocast`. bfloat16 has
             float32's range, so that no gradient needs scaling. Without effect on the CPU.
     """
@@ -47,6 +49,7 @@ class OptimiserConfig:
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-8
     max_grad_norm: float = math.inf
+    averaged: float = 0.0
     amp: bool = False
 
     def __post_init__(self) -> None:
@@ -54,6 +57,7 @@ class OptimiserConfig:
         require_at_least("optimiser: iterations", self.iterations, 1)
         require_at_least("optimiser: warmup", self.warmup, 0)
         require_positive("optimiser: eps", self.eps)
+        require_between("optimiser: averaged", self.averaged, 0.0, 1.0)
         require_positive("optimiser: max_grad_norm", self.max_grad_norm, finite=False)
         if not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise InputError("optimiser: betas", expected="two numbers in [0, 1)", received=repr(self.betas))
@@ -119,6 +123,7 @@ class OptimizationTask(ABC, Generic[Batch]):
             eps=config.eps,
             fused=True,
         )
+        self.mean = MeanOfSteps(self.learned, config.iterations, config.averaged)
 
     @abstractmethod
     def micro_batches(self, iteration: int) -> Sequence[Batch]:
@@ -170,11 +175,12 @@ class OptimizationTask(ABC, Generic[Batch]):
         if self.optimiser_config.max_grad_norm < math.inf:
             torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.max_grad_norm)
         self.optimiser.step()
+        self.mean.after(iteration)
         return {**_means(finite), "items": [self.name_of(item) for item in items]}
 
     def state(self) -> Mapping[str, Tensor]:
-        """Return parameters by `group.name`, and Adam's moments of each that has been moved."""
-        tensors = dict(self.learned)
+        """Return parameters by `group.name`, Adam's moments of each that has been moved, and the mean so far."""
+        tensors = {**self.learned, **self.mean.state()}
         for key, value in self.learned.items():
             for moment, content in self.optimiser.state.get(value, {}).items():
                 tensors[f"adam.{moment}.{key}"] = content
@@ -193,6 +199,7 @@ class OptimizationTask(ABC, Generic[Batch]):
                 wanted |= {f"adam.{moment}.{key}": shapes[moment] for moment in MOMENTS}
         require_like(tensors, wanted, subject="checkpoint", remedy=_START_ANEW)
         require_finite({name: tensors[name] for name in wanted}, subject="checkpoint", remedy=_START_ANEW)
+        self.mean.restore(tensors, remedy=_START_ANEW)
         with torch.no_grad():
             for key, value in self.learned.items():
                 value.copy_(tensors[key])

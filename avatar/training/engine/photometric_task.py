@@ -78,6 +78,7 @@ class PhotometricConfig:
             found there first.
         eps2d: see `rasterize`.
         scale_penalty, offset_penalty: weights of GaussianAvatars' penalties, where the attributes learn.
+        averaged: share of the steps, to the last, whose mean is what is learned, see `OptimiserConfig`.
         betas: Adam's. amp: networks in bfloat16 on CUDA. max_grad_norm: largest norm of the gradient.
         evaluations: how often held-out views are measured, evenly. evaluated: how many frames of either kind then.
         seed: of the order of frames and views and of all noise.
@@ -98,6 +99,7 @@ class PhotometricConfig:
     eps2d: float = 0.1
     scale_penalty: float = 0.003
     offset_penalty: float = 0.1
+    averaged: float = 0.0
     betas: tuple[float, float] = (0.9, 0.999)
     amp: bool = False
     max_grad_norm: float = float("inf")
@@ -129,6 +131,7 @@ class PhotometricConfig:
             schedule=self.schedule,
             betas=self.betas,
             eps=1e-15,
+            averaged=self.averaged,
             amp=self.amp,
             max_grad_norm=self.max_grad_norm,
         )

@@ -1,0 +1,62 @@
+"""The mean of what is learned over the last steps of a training (Polyak and Juditsky 1992; Izmailov et al. 2018)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from avatar.gaussians.tensor_file import require_finite, require_like
+
+EVERY = 10
+"""Steps from one that counts to the next: neighbours differ little, and a mean of every one costs time."""
+_PREFIX = "mean."
+
+
+class MeanOfSteps:
+    """Mean of parameters over the last `share` of the steps, which stand in their place when the last is done.
+
+    Adam takes steps of the same length however small a gradient is: what hardly shows in one image wanders about its
+    place until rates are down, and stays wherever it then happens to be. Its mean is in the middle.
+
+    Args:
+        learned: parameters by key, which steps change in place. iterations: T, all steps.
+        share: in [0, 1]; 0: no mean.
+    """
+
+    def __init__(self, learned: Mapping[str, Tensor], iterations: int, share: float) -> None:
+        self.learned, self.last = learned, iterations - 1
+        self.first = iterations - round(share * iterations)
+        self.mean: dict[str, Tensor] = {}
+
+    @torch.no_grad()
+    def after(self, iteration: int) -> None:
+        """Count the parameters in after a step, counted from 0; after the last one they become the mean."""
+        since = iteration - self.first
+        if since >= 0 and since % EVERY == 0:
+            if not since:
+                self.mean = {key: value.detach().clone() for key, value in self.learned.items()}
+            for key, mean in self.mean.items():
+                mean.lerp_(self.learned[key], 1.0 / (since // EVERY + 1))
+        if iteration == self.last:
+            for key, mean in self.mean.items():
+                self.learned[key].copy_(mean)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the mean so far by key; nothing before the first step that counts."""
+        return {_PREFIX + key: mean for key, mean in self.mean.items()}
+
+    def restore(self, tensors: Mapping[str, Tensor], *, remedy: str) -> None:
+        """Take what `state` gave, among other tensors.
+
+        Raises:
+            InputError: tensors that are missing, of another shape or type, or not finite; nothing was taken.
+        """
+        if not any(key.startswith(_PREFIX) for key in tensors):
+            self.mean = {}
+            return
+        wanted = {_PREFIX + key: value for key, value in self.learned.items()}
+        require_like(tensors, wanted, subject="checkpoint", remedy=remedy)
+        require_finite({key: tensors[key] for key in wanted}, subject="checkpoint", remedy=remedy)
+        self.mean = {key: torch.empty_like(value).copy_(tensors[_PREFIX + key]) for key, value in self.learned.items()}
