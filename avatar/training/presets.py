@@ -253,13 +253,13 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             track=TrackConfig().levels,
             body_motion_weight=1.0,
             tight_reach=0.0,
-            pretrain=500,
-            field_lr=5e-3,
+            pretrain=350,
+            field_lr=3e-3,
             fit=600,
             rates=LearningRates(),
             # At the usual rates Gaussians of hair end millimetres short of where they go, and heads a decibel.
-            teacher=_Steps(500, 2e-3, 3.0),
-            bake=_Steps(900, 1e-3, 3.0),
+            teacher=_Steps(350, 2e-3, 3.0),
+            bake=_Steps(700, 1e-3, 3.0),
             compensate=_Steps(3000, 1e-3, 2.0),
             # What leaks through from behind others moves fast Gaussians farther.
             penalties=5.0,
