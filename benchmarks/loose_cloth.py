@@ -5,15 +5,18 @@
 The garments of a trained RUN are simulated along the held-out frames of its capture, each row from its own start, and
 held against the true surfaces beside skinning and the student's field. Poses are those that the run itself uses. The
 truth is for measuring alone. Chaos: the spread of the simulated surface over starts moved by half a millimetre.
+`--draws N` also drives the clothes by the run's poses with N draws of a tracker's noise: one draw is luck.
 """
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean, median, stdev
 from typing import Annotated, Any
 
 import igl
@@ -31,6 +34,7 @@ from benchmarks.machine import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT
 from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.synth.tracker import tracker_noise
 from smplxpp.cloth import ClothDriver, ClothShape, Garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.poses import CausalSmoother
@@ -56,11 +60,19 @@ class LooseCloth:
     """Folder of its capture, with true surfaces of held-out frames."""
     params: Path | None = None
     """Poses that drive the clothes, as a tracker gives them; by default those of the run."""
+    draws: int = 0
+    """Draws of a tracker's noise (`smplxpp capture degrade`) on the poses, each measured; 2 or more, or none."""
     name: str = ""
     """Of the stored file; by default that of the capture."""
 
     def run(self) -> None:
-        """Print and store all rows."""
+        """Print and store all rows.
+
+        Raises:
+            InputError: one draw, or fewer than none.
+        """
+        if self.draws == 1 or self.draws < 0:
+            raise InputError("draws", expected="0 or at least 2: one draw is luck", received=str(self.draws))
         bench = _Bench(self.run_folder, self.capture, self.params)
         figures: dict[str, Any] = {
             "protocol": bench.protocol,
@@ -73,12 +85,37 @@ class LooseCloth:
         for name, shapes in bench.rows():
             figures["rows"][name] = bench.measured(shapes)
             print(f"{name:44s} {figures['rows'][name]}", flush=True)
+        figures["rows"] |= self._noisy(bench) if self.draws else {}
         figures["chaos_mm"] = bench.chaos()
         figures["milliseconds"] = bench.times()
         print(figures["chaos_mm"], figures["milliseconds"])
         command = "python -m benchmarks.loose_cloth --run RUN --capture DIR"
+        command += f" --params {self.params.name}" * (self.params is not None) + f" --draws {self.draws}" * (
+            self.draws > 0
+        )
         path = store_results(f"loose_cloth_{self.name or bench.sequence.capture.name}", command, figures)
         print(f"stored {path.name}")
+
+    def _noisy(self, bench: _Bench) -> dict[str, dict[str, float | None]]:
+        """Rows of `bench` with noise on its poses: every draw's simulation, mean and standard deviation over draws."""
+        poses = BodyParams.concatenate([bench.sequence.params(frame) for frame in bench.sequence.capture.frames])
+        skinned, simulated = [], {}
+        for seed in range(self.draws):
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "noisy.npz"
+                tracker_noise(poses, seed=seed).save(file)
+                noisy = _Bench(self.run_folder, self.capture, file)
+            shapes = dict(islice(noisy.rows(), 3))
+            skinned.append(noisy.measured(shapes["skinning"]))
+            row = f"simulated, poses with noise, draw {seed}"
+            simulated[row] = noisy.measured(shapes["simulated, cold start 0.7 s before"])
+            print(f"{row:44s} {simulated[row]}", flush=True)
+        found = {"skinning": skinned, "simulated": [*simulated.values()]}
+        return {
+            f"{name}, {what} of {self.draws} draws": _over(rows, of)
+            for name, rows in found.items()
+            for what, of in (("mean", mean), ("standard deviation", stdev))
+        } | simulated
 
 
 class _Bench:
@@ -220,6 +257,11 @@ def _same_points(
 
 def _moved(motion: Motion, displacements: torch.Tensor | None) -> Motion:
     return motion if displacements is None else replace(motion, rest=motion.rest + displacements)
+
+
+def _over(rows: Sequence[Mapping[str, float | None]], of: Callable[[list[float]], float]) -> dict[str, float | None]:
+    columns = {key: [value for row in rows if (value := row[key]) is not None] for key in rows[0]}
+    return {key: round(of(column), 2) if len(column) == len(rows) else None for key, column in columns.items()}
 
 
 def _rounded(quality: SurfaceQuality) -> dict[str, float | None]:

@@ -67,6 +67,9 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
             "yes" if all(stage.surface_normals for stage in stages) else "no"
         ),
         "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
+        "share of the last steps whose mean is kept": ", ".join(
+            f"{stage.averaged:g}" if stage.averaged else "none" for stage in stages
+        ),
         "perceptual term": f"{weight.perceptual:g}" if weight.perceptual else "none",
         "opacity term": f"{weight.alpha:g}" if weight.alpha else "none",
         "squared differences of colours": ", ".join(f"{stage.weights.l2:g}" for stage in stages),
