@@ -120,7 +120,6 @@ class _Size:
     body_motion_weight: float
     tight_reach: float
     pretrain: int
-    field_pretrain: int
     field_lr: float
     fit: int
     rates: LearningRates
@@ -168,7 +167,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
-            pretrain=replace(pretrain, iterations=size.field_pretrain, batch=12, lr=size.field_lr),
+            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=size.field_lr),
             images="photographs",
             semantic=0.0,
             attributes=size.bake.attributes,
@@ -254,15 +253,14 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             track=TrackConfig().levels,
             body_motion_weight=1.0,
             tight_reach=0.0,
-            pretrain=350,
-            field_pretrain=1000,
+            pretrain=500,
             field_lr=5e-3,
             fit=600,
             rates=LearningRates(),
             # At the usual rates Gaussians of hair end millimetres short of where they go, and heads a decibel.
-            teacher=_Steps(350, 2e-3, 3.0),
+            teacher=_Steps(500, 2e-3, 3.0),
             bake=_Steps(900, 1e-3, 3.0),
-            compensate=_Steps(3000, 1e-3, 2.0),
+            compensate=_Steps(2400, 1e-3, 2.0),
             # What leaks through from behind others moves fast Gaussians farther.
             penalties=5.0,
         ),
@@ -279,7 +277,6 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=4.0,
             tight_reach=0.02,
             pretrain=100,
-            field_pretrain=200,
             # At 5e-3 the field died in one of two trainings: no displacement at all after 100 steps.
             field_lr=3e-3,
             fit=150,

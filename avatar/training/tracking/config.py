@@ -56,7 +56,7 @@ class TrackConfig:
 
     levels: tuple[Level, ...] = (Level(2, 20, 5e-3), Level(1, 16, 4e-3), Level(0, 20, 2e-3))
     control_points: int = 2400
-    views: int = 3
+    views: int = 4
     smoothness: float = 80.0
     held: float = 1500.0
     body_motion_weight: float = 0.0
