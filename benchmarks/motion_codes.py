@@ -20,6 +20,7 @@ from typing import Annotated, Any, get_args
 import numpy as np
 import torch
 import tyro
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
@@ -164,6 +165,10 @@ class Bench:
                 lambda train, test: self._with_cloth(motions, self.field("pose", self.followed, train, test), test),
             )
         if from_truth:
+            yield (
+                "learned from the truth: ridge, pose",
+                lambda train, test: self._ridge(self.features.pose, train, test, self.true(train)),
+            )
             for drive in get_args(Drive):
                 yield (
                     f"learned from the truth: field, {drive}",
@@ -205,11 +210,18 @@ class Bench:
         level = torch.stack([self.followed[frame] for frame in train]).mean(0)
         return self._spread(level.expand(len(test), -1, -1), test)
 
-    def _ridge(self, features: Tensor, train: Sequence[int], test: Sequence[int]) -> Displacements:
-        """Ridge regression, its amount chosen by leaving blocks of the training frames out."""
+    def _ridge(
+        self,
+        features: Tensor,
+        train: Sequence[int],
+        test: Sequence[int],
+        known: Mapping[int, Tensor] | None = None,
+    ) -> Displacements:
+        """Ridge regression on `known`, else on what was followed; its amount leaves blocks of frames out."""
+        known = self.followed if known is None else known
         x, y = (
             features[[self._row(frame) for frame in train]],
-            torch.stack([self.followed[f] for f in train]).flatten(1),
+            torch.stack([known[frame] for frame in train]).flatten(1),
         )
         wrong = dict.fromkeys(RIDGES, 0.0)
         for block in np.array_split(np.arange(len(train)), 5):
@@ -259,8 +271,10 @@ class Bench:
         return {frame: self.rig.displaced(clothed[frame], rest.get(frame)) for frame in test}
 
     def true(self, frames: Sequence[int]) -> Mapping[int, Tensor]:
-        """Displacements that put the control points where they truly are; 0 for those whose place is not known."""
+        """Displacements that put the control points where they truly are; those whose place is not known move as the
+        nearest one of their part that is."""
         control = self.track.cage.vertices
+        nearest = self._nearest_known()
         out = {}
         for frame in frames:
             motion, truth = self.sequence.motion(frame), self._truth(frame)
@@ -271,8 +285,18 @@ class Bench:
                 turn, way = motion.world_from_rest[same.own, :, :3], motion.world_from_rest[same.own, :, 3]
                 place = torch.tensor(same.of(truth), dtype=torch.float32)
                 moved[same.own] = torch.linalg.solve(turn, place - way) - motion.rest[same.own]
-            out[frame] = moved[control]
+            out[frame] = moved[nearest][control]
         return out
+
+    def _nearest_known(self) -> np.ndarray:
+        """(V,) of each vertex the nearest one of its part in the T-pose whose true place is known, else itself."""
+        template = self.rig.template
+        found = np.arange(len(template.vertices))
+        for part, same in self.same.items():
+            of_part = np.flatnonzero(template.vertex_part == template.part_names.index(part))
+            if len(same.own):
+                found[of_part] = same.own[cKDTree(template.vertices[same.own]).query(template.vertices[of_part])[1]]
+        return found
 
 
 if __name__ == "__main__":
