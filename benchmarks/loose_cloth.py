@@ -90,9 +90,8 @@ class LooseCloth:
         figures["milliseconds"] = bench.times()
         print(figures["chaos_mm"], figures["milliseconds"])
         command = "python -m benchmarks.loose_cloth --run RUN --capture DIR"
-        command += f" --params {self.params.name}" * (self.params is not None) + f" --draws {self.draws}" * (
-            self.draws > 0
-        )
+        command += "" if self.params is None else f" --params {self.params.name}"
+        command += f" --draws {self.draws}" if self.draws else ""
         path = store_results(f"loose_cloth_{self.name or bench.sequence.capture.name}", command, figures)
         print(f"stored {path.name}")
 
