@@ -287,7 +287,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             teacher=_Steps(250, 3e-4, 3.5),
             bake=_Steps(250, 3e-4, 2.0),
             # Faster networks learn more of few frames' poses than new ones bear.
-            compensate=_Steps(500, 1.5e-4, 1.0),
+            compensate=_Steps(500, 1.5e-4, 2.0),
             averaged=0.6,
             # Seven cameras of 250 pixels say less about folds than the surface that was followed.
             surface_normals=True,
