@@ -184,6 +184,13 @@ PARTS = (
         "move the whole body, skinning as much as the simulation.",
     ),
     Part(
+        "loose_cloth_woman_casual_draws",
+        "The same, by draws of a tracker's noise",
+        "Template and garment of the exact run. Rows of draws: 1.5 degrees on every joint and 8 mm on the root, anew "
+        "by seed on the exact poses, as `smplxpp capture degrade` puts them there; not registered. The other rows are "
+        "of exact poses.",
+    ),
+    Part(
         "loose_cloth_person",
         "Loose clothes in motion that training did not show, `make demo`",
         "The skirt of the embedded person, tracked and refined poses at 10 frames a second, one held-out frame with a "
