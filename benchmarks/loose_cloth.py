@@ -102,7 +102,7 @@ class LooseCloth:
         for seed in range(self.draws):
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "noisy.npz"
-                tracker_noise(poses, seed=seed).save(file)
+                tracker_noise(poses, seed=seed, betas=0.0).save(file)
                 noisy = _Bench(self.run_folder, self.capture, file)
             shapes = dict(islice(noisy.rows(), 3))
             skinned.append(noisy.measured(shapes["skinning"]))
