@@ -52,6 +52,7 @@ class BundleConfig:
             "surface": "vertices float32, skin weights 16 bits, expressions and pose correctives 8 bits where they "
             f"move a vertex by more than {500 * self.basis_step:g} mm",
             "field": "float16, interpolation 8 bits",
+            "regression": "float16, angles float32",
             "gaussians": "float16; barycentric coordinates and opacities 16 bits, rotations and harmonics 8",
             "blend": f"8 bits in steps of {1000 * self.position_step:g} mm and {self.color_step:g}, without what a "
             "gate closes, networks float16",
@@ -96,6 +97,8 @@ def write_bundle(
     }
     if student.field is not None and student.codes is not None:
         pieces["field"] = (_field(student, cut, config), {})
+    if student.regression is not None:
+        pieces["regression"] = (_regression(student, cut, config), {})
     if student.blend_shapes is not None:
         usual = usual_coefficients(student, extras.motion)
         pieces["blend"] = (_blend(student.blend_shapes, order, usual, config), {})
@@ -243,6 +246,15 @@ def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
             f"{name}.last.bias": _numbers(network.last.bias),
         }
     return out | (floats if config.exact else halves(floats))
+
+
+def _regression(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
+    net, own = student.field, student.regression
+    assert net is not None and own is not None
+    kept = cut.vertices if net.rows is None else slice(None)
+    moved = {"level": _numbers(own.level)[kept], "basis": _numbers(own.basis)[kept]}
+    angles = {name: _numbers(getattr(own, name)) for name in ("rows", "center", "low", "high")}
+    return angles | (moved if config.exact else halves(moved))
 
 
 def _seen(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from avatar.formats.harmonics import sh_basis
@@ -76,6 +78,10 @@ def field(g: Graph, bundle: AvatarBundle, theta: str) -> str:
     """Return displacements of the vertices (V, 3): the field at its control points, interpolated."""
     t, sizes = bundle.tensors, bundle.sizes
     whole = Field(bundle)
+    neighbours, shares = whole.interpolation
+    if whole.regression is not None:
+        moved = _regressed(g, whole.regression, theta)
+        return g.sum(g("Mul", g.gather(moved, neighbours), shares[:, :, None]), 1)
     code = g.input("code", sizes["Z"], default=whole.null_code)
     sets = np.repeat(t["field.sets"], 3, axis=1)
     codes = g("Expand", g.reshape(code, 1, sizes["Z"]), g.constant([len(sets), sizes["Z"]], np.int64))
@@ -94,8 +100,16 @@ def field(g: Graph, bundle: AvatarBundle, theta: str) -> str:
     moved, cloth = network("body", np.arange(sizes["C"])), t["field.cloth"]
     if len(cloth):
         moved = g("Add", moved, g.spread(network("cloth", cloth), cloth, sizes["C"], 3))
-    neighbours, shares = whole.interpolation
     return g.sum(g("Mul", g.gather(moved, neighbours), shares[:, :, None]), 1)
+
+
+def _regressed(g: Graph, regression: Mapping[str, np.ndarray], theta: str) -> str:
+    """Return the control points' displacements (C, 3): `m + B A (clip(theta, low, high) - c)`."""
+    held = g("Min", g("Max", theta, regression["low"]), regression["high"])
+    turned = g.reshape(g("Sub", held, regression["center"]), len(regression["center"]), 1)
+    level, basis = regression["level"], regression["basis"]
+    moved = g("MatMul", basis.reshape(-1, basis.shape[2]), g("MatMul", regression["rows"], turned))
+    return g("Add", level, g.reshape(moved, len(level), 3))
 
 
 def known(g: Graph, bundle: AvatarBundle, theta: str) -> str | None:

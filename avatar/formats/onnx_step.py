@@ -19,8 +19,8 @@ def write_onnx(path: str | Path, bundle: AvatarBundle) -> None:
 
     Inputs, float32: `pose (J, 3)` axis-angle of all joints relative to their parents, hands complete (mean and PCA
     included), `transl (3)` metres, `expression (E)`, `eye (3)` the point that colours are seen from, and, where the
-    student has a field, `code (Z)`, which may be left out: the null code. Outputs: `means (N, 3)`, `quats (N, 4)` wxyz,
-    `scales (N, 3)`, `opacities (N)` and `colors (N, 3)`, sRGB towards the eye.
+    student has a field and no regression for new poses, `code (Z)`, which may be left out: the null code. Outputs:
+    `means (N, 3)`, `quats (N, 4)` wxyz, `scales (N, 3)`, `opacities (N)` and `colors (N, 3)`, sRGB towards the eye.
 
     Loose clothes are where field and skinning have them. Triangles without area, which the runtime gives some frame,
     give NaN here. Opset 17.

@@ -18,6 +18,7 @@ from avatar.gaussians.tensor_file import open_tensor_file, require_finite, requi
 from avatar.models.config_dict import config_to_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes, mapping_networks
 from avatar.models.networks.deformation_field import FieldConfig, FieldNetwork, show_null_code
+from avatar.models.networks.pose_regression import PoseRegression
 from avatar.models.networks.teacher import Teacher, TeacherConfig
 from avatar.models.stored_model import StoredModel
 from avatar.models.student import Student, StudentConfig
@@ -28,7 +29,8 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.json_file import as_integer, shown
 
-SCHEMA = 1
+SCHEMA = 2
+"""2: students may have a regression for new poses."""
 HEADER = "avatar"
 GAUSSIANS = "gaussians."
 KINDS = ("teacher", "student")
@@ -158,7 +160,11 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         raise InputError("still_body", expected="true or false", received=shown(still_body), remedy=_REMEDY)
     config = StudentConfig(field, shapes_config, control_points, still_body)
     known = None if "pose_gate.poses" not in stored.tensors else stored.poses("pose_gate.poses")
-    student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known)
+    regression = None
+    if field is not None and "regression.basis" in stored.tensors:
+        sizes = PoseRegression.shapes(*stored.directions("regression.basis"))
+        regression = PoseRegression(**{k: stored.require(f"regression.{k}", size) for k, size in sizes.items()})
+    student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known, regression=regression)
     if stored.about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
         show_null_code(student)
     return student

@@ -96,6 +96,13 @@ class StoredModel:
             raise InputError(name, expected="shape (T, 63)", received=f"shape {tuple(value.shape)}")
         return self.require(name, (rows, THETA))
 
+    def directions(self, name: str) -> tuple[int, int]:
+        """Read for how many points a regression's basis is, and of how many directions: no more than poses have."""
+        value = self.tensors[name]
+        if value.ndim != 3 or not 1 <= value.shape[2] <= THETA:
+            raise InputError(name, expected=f"shape (K, 3, r), r up to {THETA}", received=f"shape {tuple(value.shape)}")
+        return value.shape[0], value.shape[2]
+
     def blended(self, config: BlendShapeConfig, count: int) -> dict[str, Tensor | None]:
         """Return what blend shapes of so many Gaussians are made from beside their sizes, as their arguments."""
         active = self.tensors.get(f"{SHAPES}active")

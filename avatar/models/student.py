@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from dataclasses import dataclass, replace
 
@@ -19,8 +20,10 @@ from avatar.models.networks.control_points import choose_control_points, templat
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.networks.local_pose import seen_joints
 from avatar.models.networks.pose_gate import PoseGate
+from avatar.models.networks.pose_regression import PoseRegression
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
+from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
 
@@ -57,6 +60,8 @@ class Student(nn.Module):
         frames: the frames that have a code.
         blend_shapes: fitted to these Gaussians; None makes new ones where the configuration has them.
         known_poses: theta of the training frames, radians: far from them the body's blend shapes fade; None: nowhere.
+        regression: of the field's points, what poses without a code show in the field's place; None: the field's
+            null code.
     """
 
     def __init__(
@@ -68,6 +73,7 @@ class Student(nn.Module):
         *,
         blend_shapes: BlendShapes | None = None,
         known_poses: Float[Tensor, "T 63"] | None = None,
+        regression: PoseRegression | None = None,
     ) -> None:
         super().__init__()
         gaussians.check_topology(rig.faces, "template of the student")
@@ -79,6 +85,14 @@ class Student(nn.Module):
             blend_shapes = make_blend_shapes(config.blend_shapes, rig, gaussians)
         self.blend_shapes = blend_shapes
         self.pose_gate = None if known_poses is None else PoseGate(known_poses)
+        points = 0 if self.field is None else len(self.field.points)
+        if regression is not None and len(regression.level) != points:
+            raise InputError(
+                "regression of new poses",
+                expected=f"one of the field's {points} points",
+                received=f"one of {len(regression.level)}",
+            )
+        self.regression = regression
         self.to(rig.device)
 
     @property
@@ -87,10 +101,12 @@ class Student(nn.Module):
         return () if self.codes is None else self.codes.frames
 
     def displacements(self, motion: Motion) -> Float[Tensor, "V 3"] | None:
-        """Return the field's displacements in a pose, metres; None without a field."""
+        """Return the field's displacements in a pose, metres, the regression's in a new one; None without a field."""
         if self.field is None or self.codes is None:
             return None
         frame = motion.frame if motion.frame in self.codes.row else None
+        if frame is None and self.regression is not None:
+            return self.field.spread(self.regression(motion.pose[None]))[0]
         return self.field(motion.pose[None], self.codes([frame]))[0]
 
     def compensated(self, motion: Motion) -> BoundGaussians:
@@ -151,6 +167,7 @@ class Student(nn.Module):
             self.frames,
             blend_shapes=given,
             known_poses=self.pose_gate.poses if known_poses is None and self.pose_gate is not None else known_poses,
+            regression=copy.deepcopy(self.regression),
         )
         for mine, its in ((self.field, other.field), (self.codes, other.codes)):
             if mine is not None and its is not None:

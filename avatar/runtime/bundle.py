@@ -19,7 +19,8 @@ from smplxpp.core.files.package_file import read_package, write_package
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
 from smplxpp.core.params import BodyParams
 
-FORMAT, VERSION = "smplxpp-avatar", 1
+FORMAT, VERSION = "smplxpp-avatar", 2
+"""2: there may be a regression for poses without a code."""
 SUFFIX = ".avatar"
 GARMENTS, MOTION = "garments", "motion"
 _MANIFEST = "manifest.json"
@@ -275,6 +276,10 @@ def _check_sense(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: M
         require(bands % 6 == 0 and 0 <= bands <= 96, "field", "bands of sines and cosines", f"{bands} inputs")
         require(sizes["Y"] == inputs, "field of_frame", f"{inputs} inputs", sizes["Y"])
         require(sizes["T"] == len(about.frames) > 0, "field.codes", f"{len(about.frames)} codes", sizes["T"])
+    if "regression.level" in tensors:
+        require("field.points" in tensors, "regression", "a field whose points it moves", "none")
+        low, high = tensors["regression.low"], tensors["regression.high"]
+        require(bool((low <= high).all()), "regression.low", "at most `high`", "more")
     if "blend.head.values" in tensors:
         _check_blend(about, tensors, sizes, require)
 

@@ -84,6 +84,14 @@ PIECES: Mapping[str, Mapping[str, str]] = {
         "codes": "f T Z",
         **{f"{net}.{name}": spec for net in ("body", "cloth") for name, spec in _NETWORK.items()},
     },
+    "regression": {
+        "level": "f C 3",
+        "basis": "f C 3 a",
+        "rows": "f a 63",
+        "center": "f 63",
+        "low": "f 63",
+        "high": "f 63",
+    },
     "blend": {**_shapes("head"), **_shapes("body"), "part": "i? N"},
     "poses": {"known": "f D 63", "scale": "f"},
 }

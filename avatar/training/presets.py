@@ -135,7 +135,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
     """Make a preset for two cores: the surface is followed first, networks learn it before they see photographs.
 
     A teacher of minutes draws worse than the photographs are: the bake compares with those, and takes from the teacher
-    the followed surface and its answers about imagined poses. Several views a step, attributes that learn in every
+    the followed surface. Several views a step, attributes that learn in every
     stage, no perceptual term.
     """
     pretrain = PretrainConfig(
@@ -171,7 +171,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             images="photographs",
             semantic=0.0,
             attributes=size.bake.attributes,
-            imagined=48,
+            regression=True,
             code_lr_factor=5.0,
             views=3,
             lr=size.bake.lr,

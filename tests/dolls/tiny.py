@@ -63,7 +63,7 @@ def tiny_preset(iterations: int = 3) -> TrainingPreset:
             attributes=0.5,
             track=track,
         ),
-        bake=BakeConfig(**shared, lr=2e-3, views=2, pretrain=PretrainConfig(iterations=2, batch=3), imagined=2),
+        bake=BakeConfig(**shared, lr=2e-3, views=2, pretrain=PretrainConfig(iterations=2, batch=3), regression=True),
         compensate=CompensateConfig(**shared, lr=2e-3, poses_per_step=1, views=2),
         blend_shapes=BlendShapeConfig(head_shapes=2, body_shapes=3, width=8, jaw=True),
     )

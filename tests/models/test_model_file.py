@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 
 from avatar.models.model_file import HEADER, SCHEMA, load_avatar, save_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.pose_regression import PoseRegression
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
@@ -25,7 +26,7 @@ EYES = torch.tensor([[0.0, 0.8, 2.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8)
 KINDS = (
     *("teacher", "centred", "tracked", "student", "no field", "control points", "still body"),
-    *("shapes", "local", "gated", "pruned"),
+    *("regression", "shapes", "local", "gated", "pruned"),
 )
 
 
@@ -63,7 +64,7 @@ def make(kind: str, rig: Rig):
         config = StudentConfig(
             None if kind == "no field" else TINY_FIELD,
             shapes,
-            control_points=40 if kind in ("control points", "still body") else 0,
+            control_points=40 if kind in ("control points", "still body", "regression") else 0,
             still_body=kind == "still body",
         )
         model = Student(config, rig, varied(gaussians()), () if kind == "no field" else (0, 2, 3))
@@ -71,21 +72,36 @@ def make(kind: str, rig: Rig):
         for name, value in model.named_parameters():
             if not name.startswith("gaussians."):
                 value.add_(0.02 * torch.randn(value.shape))
+    if kind == "regression":
+        model.regression = random_regression(len(model.field.points))
     if kind == "pruned":
         model = model.with_blend_shapes(model.blend_shapes.pruned(torch.ones(3, 5), keep=0.3))
     return model
 
 
+def random_regression(points: int) -> PoseRegression:
+    """Three directions; angles beyond half a radian are held."""
+    sizes = PoseRegression.shapes(points, 3)
+    given = {name: 0.02 * torch.randn(size) for name, size in sizes.items()}
+    given |= {"rows": torch.randn(sizes["rows"]), "low": -0.5 * torch.ones(63), "high": 0.5 * torch.ones(63)}
+    return PoseRegression(**given)
+
+
 def look(model, rig) -> list[torch.Tensor]:
+    """What a frame of the training and a new pose show."""
     with torch.no_grad():
-        posed = model(rig.motion(dance().frame(3), frame=3), EYES)
+        seen = [model(rig.motion(dance().frame(k), frame=code), EYES) for k, code in ((3, 3), (4, None))]
     return [
-        posed.vertices,
-        posed.gaussians.means,
-        posed.gaussians.scales,
-        posed.gaussians.quats,
-        posed.gaussians.opacities,
-        posed.colors,
+        value
+        for posed in seen
+        for value in (
+            posed.vertices,
+            posed.gaussians.means,
+            posed.gaussians.scales,
+            posed.gaussians.quats,
+            posed.gaussians.opacities,
+            posed.colors,
+        )
     ]
 
 

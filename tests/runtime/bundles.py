@@ -22,7 +22,10 @@ from tests.cloth.test_driver import QUICK, garment, swaying
 from tests.dolls.dancing import dance, template
 from tests.models.test_model_file import make
 
-KINDS = ("student", "no field", "control points", "still body", "shapes", "local", "gated", "pruned", "whole")
+KINDS = (
+    *("student", "no field", "control points", "still body", "regression"),
+    *("shapes", "local", "gated", "pruned", "whole"),
+)
 EXACT = BundleConfig(exact=True)
 
 

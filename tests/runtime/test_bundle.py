@@ -96,7 +96,7 @@ def test_a_piece_that_was_changed_is_named(good, tmp_path):
 def test_a_newer_version_and_another_format_are_named(good, tmp_path):
     files = entries(good)
     for change, words in (
-        ({"version": VERSION + 1}, "version 2.*Update smplxpp"),
+        ({"version": VERSION + 1}, f"version {VERSION} or older.*Update smplxpp"),
         ({"format": "other"}, "another format"),
     ):
         manifest = json.loads(files["manifest.json"]) | change
@@ -175,6 +175,29 @@ def test_numbers_that_make_no_sense_are_refused(name, good, tmp_path):
     piece, change, words = CHANGES[name]
     with pytest.raises(InputError, match=words):
         load_bundle(rewritten(tmp_path / "a.avatar", _with(good, piece, change)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t.update(low=t["high"] + 1), r"regression\.low"),
+        (lambda t: t.update(rows=t["rows"][:1]), r"regression\.rows"),
+        (lambda t: t.update(level=t["level"][:-1]), r"regression\.level"),
+    ],
+)
+def test_a_regression_that_fits_nothing_is_refused(change, words, tmp_path):
+    write(tmp_path / "good.avatar", student("regression"), EXACT)
+    with pytest.raises(InputError, match=words):
+        load_bundle(rewritten(tmp_path / "a.avatar", _with(tmp_path / "good.avatar", "regression", change)))
+
+
+def test_a_regression_without_a_field_is_refused(tmp_path):
+    write(tmp_path / "good.avatar", student("regression"), EXACT)
+    files = entries(tmp_path / "good.avatar")
+    manifest = json.loads(files["manifest.json"])
+    del files[manifest["pieces"].pop("field")["file"]]
+    with pytest.raises(InputError, match="a field whose points it moves"):
+        load_bundle(rewritten(tmp_path / "a.avatar", files | {"manifest.json": json.dumps(manifest).encode()}))
 
 
 def test_garments_of_another_avatar_are_refused(tmp_path):

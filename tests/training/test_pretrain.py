@@ -24,7 +24,7 @@ from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
 from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.config import Level
 from smplxpp.core.errors import InputError
-from tests.dolls.dancing import dance, gaussians, sequence, template, write_dance
+from tests.dolls.dancing import gaussians, sequence, template, write_dance
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 from tests.dolls.toy import copied, same_state
 from tests.training.engine.test_photometric_tasks import BAKE, TEACHER
@@ -70,7 +70,7 @@ def make(kind: str, frames, track, config=CONFIG, **changes) -> OptimizationTask
         return PretrainTeacherTask(frames, make_teacher(frames, replace(APART, zero_output=False)), config, 0, None)
     teacher = make_teacher(frames, moved=0.05)
     student = Student(STUDENT, frames.rig, gaussians(), frames.train_frames)
-    options = {"code_lr_factor": 5.0, "null_share": 0.25, "imagined": 4, **changes}
+    options = {"code_lr_factor": 5.0, "null_share": 0.25, **changes}
     return PretrainFieldTask(frames, student, teacher, config, 0, **options)
 
 
@@ -98,7 +98,7 @@ def test_a_restored_state_goes_on_bit_for_bit(kind, frames, track):
 @pytest.mark.parametrize("kind", TASKS)
 def test_every_pose_comes_once_an_epoch_in_another_order(kind, frames, track):
     task = make(kind, frames, track)
-    poses = 8 if kind == "field" else 4
+    poses = len(frames.train_frames)
     per_epoch = poses // CONFIG.batch
     epochs = [
         [n for k in range(e * per_epoch, (e + 1) * per_epoch) for n in task.micro_batches(k)[0]] for e in range(6)
@@ -148,7 +148,7 @@ def test_the_teacher_comes_to_what_is_known(frames, track):
 
 
 def test_the_field_comes_to_the_teachers_displacements_at_its_points(frames, track):
-    task = make("field", frames, track, imagined=0, null_share=0.0)
+    task = make("field", frames, track, null_share=0.0)
     lookup = _MapLookup(task.teacher, task.student.field.points)
 
     def error() -> float:
@@ -165,32 +165,14 @@ def test_the_field_comes_to_the_teachers_displacements_at_its_points(frames, tra
     assert error() < 0.85 * before
 
 
-def test_imagined_poses_are_shown_with_the_null_code(frames, track, monkeypatch):
-    task, shown = make("field", frames, track, null_share=0.0), []
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_share_of_the_poses_is_shown_with_the_null_code(share, frames, track, monkeypatch):
+    task, shown = make("field", frames, track, null_share=share), []
     codes = task.student.codes.forward
     monkeypatch.setattr(task.student.codes, "forward", lambda which: shown.append(which) or codes(which))
-    task.loss((0, 4, 2, 7))
-    assert shown == [[0, None, 2, None]]
-    assert task.name_of((0, 4)) == "poses 0 imagined 0"
-    everything = make("field", frames, track, null_share=1.0)
-    monkeypatch.setattr(everything.student.codes, "forward", lambda which: shown.append(which) or codes(which))
-    everything.loss((0, 1))
-    assert shown[-1] == [None, None]
-
-
-def test_imagined_poses_lie_on_lines_between_those_of_the_frames(frames, track):
-    task, again = (make("field", frames, track) for _ in range(2))
-    bodies = [dance().frame(frame).body_pose[0] for frame in frames.train_frames]
-    poses = [task._motion(number).pose.double().numpy() for number in range(4, 7)]
-    np.testing.assert_array_equal(poses[0], again._motion(4).pose.double().numpy())
-    assert not np.allclose(poses[0], poses[1])
-    for pose in poses:
-        misses = []
-        for a in bodies:
-            for b in bodies:
-                way = (b - a) / max(np.linalg.norm(b - a), 1e-9)
-                misses.append(np.linalg.norm(pose - a - (pose - a) @ way * way))
-        assert min(misses) < 1e-6
+    task.loss((0, 3, 2))
+    assert shown == [[None] * 3 if share else [0, 3, 2]]
+    assert task.name_of((0, 3)) == "poses 0 3"
 
 
 def test_the_bakes_teacher_stays_as_it_is(frames, track):
@@ -253,7 +235,7 @@ def test_a_teacher_stopped_in_its_pretraining_ends_with_the_same_weights(frames,
 
 
 def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tmp_path):
-    config: BakeConfig = replace(BAKE, iterations=1, evaluations=1, imagined=2, pretrain=replace(CONFIG, iterations=2))
+    config: BakeConfig = replace(BAKE, iterations=1, evaluations=1, pretrain=replace(CONFIG, iterations=2))
     ends = []
     for folder, seconds in ((tmp_path / "whole", float("inf")), (tmp_path / "parts", ONE_STEP)):
         done = None

@@ -31,7 +31,7 @@ def test_the_small_recipe_is_the_papers():
     assert small.teacher.track is None and small.teacher.pretrain is None and small.networks.teacher.zero_output
     assert set(small.networks.teacher.network_configs()) == {"position", "colour", "other"}
     assert small.networks.field == paper.networks.field and small.blend_shapes == paper.blend_shapes
-    shared = ("images", "pretrain", "imagined", "nonrigid", "semantic", "semantic_map", "null_share", "attributes")
+    shared = ("images", "pretrain", "regression", "nonrigid", "semantic", "semantic_map", "null_share", "attributes")
     for name in shared:
         assert getattr(small.bake, name) == getattr(paper.bake, name), name
     for name in ("poses_per_step", "views", "attributes", "null_share", "init_from_track"):

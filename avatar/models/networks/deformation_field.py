@@ -174,7 +174,10 @@ class DeformationField(nn.Module):
 
     def forward(self, pose: Float[Tensor, "B T"], code: Float[Tensor, "B Z"]) -> Float[Tensor, "B V 3"]:
         """Return the displacements of all vertices, metres along the canonical axes; see `at_points`."""
-        moved = self.at_points(pose, code)
+        return self.spread(self.at_points(pose, code))
+
+    def spread(self, moved: Float[Tensor, "B K 3"]) -> Float[Tensor, "B V 3"]:
+        """Interpolate displacements of the points to all vertices."""
         if self.rows is None:
             return moved
         # Poses side by side are one table.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 
 from smplxpp.template.template import Template
 
@@ -19,11 +19,18 @@ def seen_joints(template: Template, steps: int) -> Bool[np.ndarray, "V 21"]:
     A skirt that has seen few poses would learn the arms of those poses by heart. Saito et al., "SCANimate" (2021),
     mask the pose by skin weights for the same reason.
     """
+    return joint_steps(template) <= steps
+
+
+def joint_steps(template: Template) -> Int64[np.ndarray, "V 21"]:
+    """Count, for each vertex, the steps along the skeleton from each joint of theta to the nearest that carries it."""
     parents = np.asarray(template.body.parents)
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True
     seen = template.weights.dense() > MIN_SKIN_WEIGHT
-    for _ in range(steps):
+    steps = np.where(seen, 0, len(parents))
+    for count in range(1, len(parents)):
         seen = seen @ near
-    return seen[:, 1 : BODY_JOINTS + 1]
+        steps = np.where(seen, np.minimum(steps, count), steps)
+    return steps[:, 1 : BODY_JOINTS + 1].astype(np.int64)

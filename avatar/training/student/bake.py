@@ -25,9 +25,11 @@ from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import PRETRAIN, Session
 from avatar.training.student.distillation import DistillationTargets
 from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.student.regress_poses import regress_poses
 from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.validation import require_at_least, require_between, require_choice
 
@@ -39,14 +41,16 @@ class BakeConfig(PhotometricConfig):
     Attributes:
         iterations: 30k in the paper. attributes: the paper refines them.
         pretrain: `L_non` alone before the iterations, without rendering; None in the paper.
-        imagined: poses between those of the training frames that the pretraining asks the teacher about.
         images: what renderings are compared with: the "teacher"'s, or "photographs".
         nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
         semantic_map: what shows the student's labels: its "mesh", as in the paper, whose gradients reach the field
             alone; or its "gaussians", which are drawn with the image.
         tau: radians a metre, of the semantic labels.
         code_lr_factor: Adam's step of the frame codes, as a multiple of `lr`.
-        null_share: of the poses that are shown with the null code, so that it means something.
+        null_share: of the poses that are shown as new ones: with the null code, so that it means something, or with
+            the regression.
+        regression: new poses have a regression from the pose to the surfaces of the training frames in the field's
+            place (`regress_poses`), made of the pretrained field first and of the trained one in the end.
         pose_noise: radians, standard deviation on the theta that the field sees; skinning has the true pose.
     """
 
@@ -54,7 +58,7 @@ class BakeConfig(PhotometricConfig):
     attributes: float = 0.5
     images: str = "teacher"
     pretrain: PretrainConfig | None = None
-    imagined: int = 0
+    regression: bool = False
     nonrigid: float = 0.1
     semantic: float = 1.0
     semantic_map: str = "gaussians"
@@ -67,7 +71,7 @@ class BakeConfig(PhotometricConfig):
         super().__post_init__()
         require_choice("bake: images", self.images, ("teacher", "photographs"))
         require_choice("bake: semantic_map", self.semantic_map, ("mesh", "gaussians"))
-        for name in ("imagined", "nonrigid", "semantic", "code_lr_factor", "pose_noise"):
+        for name in ("nonrigid", "semantic", "code_lr_factor", "pose_noise"):
             require_at_least(f"bake: {name}", getattr(self, name), 0.0)
         require_between("bake: null_share", self.null_share, 0.0, 1.0)
 
@@ -102,7 +106,7 @@ class BakeTask(PhotometricTask):
             ]
         super().__init__(sequence, student, config, groups, context)
         self.student, self.targets = student, None
-        if config.null_share:
+        if config.null_share and student.regression is None:
             show_null_code(student)
         if teacher is not None:
             self.targets = DistillationTargets(
@@ -177,6 +181,7 @@ def bake(
     teacher: TeacherAvatar | None,
 ) -> tuple[Student, Progress]:
     """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
+    together = session.distributed or Distributed()
     with fixed_seed(config.seed):
         made = Student(student, sequence.rig, gaussians, sequence.train_frames)
     if config.pretrain is not None and teacher is not None and made.field is not None:
@@ -189,17 +194,20 @@ def bake(
                 pretrain,
                 config.seed,
                 code_lr_factor=config.code_lr_factor,
-                null_share=config.null_share,
-                imagined=config.imagined,
+                null_share=0.0 if config.regression else config.null_share,
             ),
             pretrain,
         )
         if not progress.finished:
             return made.eval(), progress
         session = session.after(progress)
-        if config.null_share or config.imagined:
+        if config.regression:
+            made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))
+        elif config.null_share:
             show_null_code(made)  # on the processes that only waited for the pretraining, too
     followed = teacher.track if config.surface_normals and teacher is not None else None
     context = with_surface_normals(session.context, sequence, followed)
     progress = session.run(lambda: BakeTask(sequence, made, config, context, teacher=teacher), config)
+    if config.regression and made.field is not None:
+        made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))
     return made.eval(), progress

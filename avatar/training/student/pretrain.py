@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,12 +17,9 @@ from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.render.mesh_maps import vertex_normals
-from avatar.rig.rig import Motion
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
 
-BEYOND = 0.25
-"""Imagined poses reach beyond the two that they lie between by this share of the way."""
 HIDDEN = 0.01
 """Metres behind the maps' surface from which a point is not the one that they show."""
 
@@ -31,15 +27,12 @@ HIDDEN = 0.01
 class PretrainFieldTask(PretrainTask):
     """`L_non` where the field is evaluated: its displacements against the teacher's at the same points.
 
-    Those of a training frame are the surface that was followed, where there is one, else the teacher's maps. The
-    teacher can be asked about any pose. Imagined ones, on the lines between the poses of two training frames and a
-    little beyond, are shown with the null code, which so learns what lies between the frames.
+    Those of a training frame are the surface that was followed, where there is one, else the teacher's maps.
 
     Args:
         student: with a field. teacher: whose maps are learned.
         code_lr_factor: rate of the frame codes, as a multiple of the field's.
-        null_share: of the training poses that are shown with the null code too.
-        imagined: number of imagined poses.
+        null_share: of the poses that are shown with the null code.
     """
 
     def __init__(
@@ -52,7 +45,6 @@ class PretrainFieldTask(PretrainTask):
         *,
         code_lr_factor: float,
         null_share: float,
-        imagined: int,
     ) -> None:
         field, codes = student.field, student.codes
         assert field is not None and codes is not None, "a student with a field"
@@ -60,12 +52,11 @@ class PretrainFieldTask(PretrainTask):
             ParameterGroup("field", dict(field.named_parameters()), config.lr, config.lr_final_factor),
             ParameterGroup("codes", {"codes": codes.codes}, config.lr * code_lr_factor, config.lr_final_factor),
         ]
-        frames = sequence.train_frames
-        super().__init__(groups, config, len(frames) + imagined, seed)
+        super().__init__(groups, config, len(sequence.train_frames), seed)
         self.sequence, self.student, self.teacher = sequence, student, teacher
         self.field, self.codes = field, codes
         self.null_share = null_share
-        if null_share or imagined:
+        if null_share:
             show_null_code(student)
         self._lookup = _MapLookup(teacher, field.points)
         self._known = ByteCache(KNOWN_BYTES)
@@ -78,17 +69,13 @@ class PretrainFieldTask(PretrainTask):
 
     def name_of(self, item: tuple[int, ...]) -> str:
         """Return the poses of a batch."""
-        frames = self.sequence.train_frames
-        return "poses " + " ".join(str(frames[k]) if k < len(frames) else f"imagined {k - len(frames)}" for k in item)
+        return "poses " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
     def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of a batch of poses."""
         frames = self.sequence.train_frames
         draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
-        shown = [
-            frames[k] if k < len(frames) and draw >= self.null_share else None
-            for k, draw in zip(item, draws, strict=True)
-        ]
+        shown = [frames[k] if draw >= self.null_share else None for k, draw in zip(item, draws, strict=True)]
         pose, known, weight = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
         apart = (self.field.at_points(pose, self.codes(shown)) - known).abs().sum(-1)
         loss = (weight * apart).sum() / weight.sum() / self.teacher.config.position_scale
@@ -98,23 +85,15 @@ class PretrainFieldTask(PretrainTask):
         """Return theta (63,), displacements (K, 3) metres at the field's points, and how much each counts (K,)."""
 
         def make() -> tuple[Tensor, ...]:
-            motion, track = self._motion(number), self.teacher.track
-            if motion.frame is not None and track is not None:
-                found, counts = track.displacements(motion.frame), track.confidence(motion.frame)
+            frame, track = self.sequence.train_frames[number], self.teacher.track
+            motion = self.sequence.motion(frame)
+            if track is not None:
+                found, counts = track.displacements(frame), track.confidence(frame)
                 return motion.pose, found[self.field.points], counts[self.field.points]
-            imagined = self._lookup(self.teacher.displacement_maps([motion]))[0]
-            return motion.pose, imagined, imagined.new_ones(len(imagined))
+            found = self._lookup(self.teacher.displacement_maps([motion]))[0]
+            return motion.pose, found, found.new_ones(len(found))
 
         return self._known.get(number, make)
-
-    def _motion(self, number: int) -> Motion:
-        frames, sequence = self.sequence.train_frames, self.sequence
-        if number < len(frames):
-            return sequence.motion(frames[number])
-        noise = np.random.default_rng((self.seed, 5, number))
-        a, b = (sequence.params(frames[k]) for k in noise.integers(len(frames), size=2))
-        share = noise.uniform(-BEYOND, 1.0 + BEYOND)
-        return sequence.rig.motion(replace(a, body_pose=a.body_pose + share * (b.body_pose - a.body_pose)))
 
 
 class _MapLookup:

@@ -70,6 +70,19 @@ export interface Field {
   neighbours: Int32Array;
   weights: Float32Array;
   neighbourCount: number;
+  /** Of poses that are no frame of the training, in the networks' place; null: the networks with `code`. */
+  regression: Regression | null;
+}
+
+/** `level + basis rows (clip(theta, low, high) - center)`: (K, 3) metres, (K, 3, D) metres, (D, 63) and three of 63 radians. */
+export interface Regression {
+  level: Float32Array;
+  basis: Float32Array;
+  size: number;
+  rows: Float32Array;
+  center: Float32Array;
+  low: Float32Array;
+  high: Float32Array;
 }
 
 /** Blend shapes of one side, head or body: a small network gives their coefficients. */

@@ -4,6 +4,7 @@ import { Native, type Block } from "../native/memory.ts";
 import type { Avatar, Pose, RestShapes } from "./avatar.ts";
 import { BlendAdder } from "./blend.ts";
 import { FieldEvaluator } from "./field.ts";
+import { RegressionEvaluator } from "./regression.ts";
 
 /**
  * Numbers of a Gaussian for the renderers: centre 3, opacity, covariance 6 (xx xy xz yy yz zz), colour 3, and
@@ -41,7 +42,7 @@ export class Deformer {
   private readonly skeleton: { parents: Block<Int32Array>; turns: Block<Float64Array>; rest: Block<Float64Array>; place: Block<Float64Array> };
   private readonly features: Block<Float32Array> | null;
   private readonly shapes: { expressions: Basis; correctives: Basis | null; expression: Block<Float32Array> };
-  private readonly field: FieldEvaluator | null;
+  private readonly field: FieldEvaluator | RegressionEvaluator | null;
   private readonly blend: BlendAdder | null;
   private readonly surface: Block<Uint8Array>;
   private readonly bound: Block<Uint8Array>;
@@ -71,7 +72,7 @@ export class Deformer {
       expressions: basis(mesh.expressions), correctives: mesh.correctives && basis(mesh.correctives),
       expression: native.floats(mesh.expressions.size),
     };
-    this.field = field && new FieldEvaluator(native, field);
+    this.field = field && (field.regression ? new RegressionEvaluator(native, field.regression) : new FieldEvaluator(native, field));
     this.blend = avatar.blendShapes && new BlendAdder(native, avatar.blendShapes, avatar.known, N);
     this.rest = native.keep(mesh.vertices);
     this.posed = native.floats(3 * V);

@@ -36,6 +36,7 @@ const PIECES: Record<string, Record<string, string>> = {
     points: "f C 3", neighbours: "i V n <C", weights: "f V n", cloth: "i c <C", sets: "i S 21", member: "i C <S",
     codes: "f T Z", ...prefixed("body", NETWORK), ...prefixed("cloth", NETWORK),
   },
+  regression: { level: "f C 3", basis: "f C 3 a", rows: "f a 63", center: "f 63", low: "f 63", high: "f 63" },
   blend: { ...shapes("head"), ...shapes("body"), part: "i? N" },
   poses: { known: "f D 63", scale: "f" },
 };

@@ -10,7 +10,7 @@ import { sha256 } from "./sha256.ts";
 import { unpackTensors, type Piece } from "./tensors.ts";
 import { unzip } from "./zip.ts";
 
-const FORMAT = "smplxpp-avatar", VERSION = 1;
+const FORMAT = "smplxpp-avatar", VERSION = 2;
 /** Scale of every Gaussian along its normal, in mean edge lengths of its triangle. */
 const THICKNESS = 0.01;
 
@@ -154,6 +154,13 @@ function field(t: Tensors, nullCodeShown: boolean, vertices: number): Field {
     neighbours: t.ints("field.neighbours"),
     weights: normalised(t.floats("field.weights"), n),
     neighbourCount: n,
+    regression: t.has("regression.level")
+      ? {
+          level: t.floats("regression.level"), basis: t.floats("regression.basis"), size: t.sizes.a,
+          rows: t.floats("regression.rows"), center: t.floats("regression.center"),
+          low: t.floats("regression.low"), high: t.floats("regression.high"),
+        }
+      : null,
   };
 }
 

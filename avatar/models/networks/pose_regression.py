@@ -1,0 +1,56 @@
+"""The surface of new poses: a regression, linear in the pose, of the surfaces that training found in its frames."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avatar.rig.rig import THETA
+
+
+class PoseRegression(nn.Module):
+    """`dv(theta) = m + B A (clip(theta, low, high) - c)`: few directions of theta, linear as SMPL's pose correctives.
+
+    Beyond the angles that training saw a line leads anywhere: they are held at `low` and `high`.
+
+    Args:
+        level: m, metres along the canonical axes. basis: B, metres. rows: A, 1 / radian.
+        center: c, radians. low, high: radians.
+    """
+
+    level: Tensor
+    basis: Tensor
+    rows: Tensor
+    center: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        level: Float[Tensor, "K 3"],
+        basis: Float[Tensor, "K 3 r"],
+        rows: Float[Tensor, "r 63"],
+        center: Float[Tensor, " 63"],
+        low: Float[Tensor, " 63"],
+        high: Float[Tensor, " 63"],
+    ) -> None:
+        super().__init__()
+        given = {"level": level, "basis": basis, "rows": rows, "center": center, "low": low, "high": high}
+        for name, value in given.items():
+            self.register_buffer(name, value.to(torch.float32))
+
+    @staticmethod
+    def shapes(points: int, directions: int) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the arguments."""
+        basis = {"level": (points, 3), "basis": (points, 3, directions), "rows": (directions, THETA)}
+        return basis | dict.fromkeys(("center", "low", "high"), (THETA,))
+
+    def with_values(self, *, level: Float[Tensor, "K 3"], basis: Float[Tensor, "K 3 r"]) -> PoseRegression:
+        """Return the same directions with other displacements, which may carry gradients."""
+        return PoseRegression(level, basis, self.rows, self.center, self.low, self.high)
+
+    def forward(self, pose: Float[Tensor, "B 63"]) -> Float[Tensor, "B K 3"]:
+        """Return displacements of the points, metres."""
+        turned = torch.minimum(torch.maximum(pose, self.low), self.high) - self.center
+        return self.level + (turned @ self.rows.T @ self.basis.flatten(0, 1).T).unflatten(1, (-1, 3))

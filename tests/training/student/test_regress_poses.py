@@ -1,0 +1,102 @@
+"""Regressions from poses to surfaces: what is linear is found, what is noise is left, far joints count less."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.training.student.regress_poses import BEYOND, FADES, fit_pose_regression
+
+JOINTS, POINTS = 21, 40
+NEAR = 3
+"""Joints that carry the points; all others are four steps away."""
+
+
+def _steps() -> np.ndarray:
+    steps = np.full((POINTS, JOINTS), 4)
+    steps[:, :NEAR] = np.arange(NEAR)
+    return steps
+
+
+def _moved(poses: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Surfaces that are linear in the angles of the joints that carry them, centimetres of motion."""
+    rng = np.random.default_rng(seed)
+    weights, level = 0.02 * rng.normal(size=(POINTS, 3, 3 * NEAR)), 0.01 * rng.normal(size=(POINTS, 3))
+    return level + np.einsum("kxj,tj->tkx", weights, poses[:, : 3 * NEAR])
+
+
+def _poses(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.4, 0.4, (count, 63))
+
+
+def _said(regression, poses: np.ndarray) -> np.ndarray:
+    return regression(torch.tensor(poses, dtype=torch.float32)).numpy()
+
+
+PARTS = np.zeros(POINTS, dtype=np.int64)
+
+
+def test_what_is_linear_in_near_joints_is_found_from_few_poses():
+    poses, new = _poses(30, 1), _poses(20, 2)
+    regression, chosen = fit_pose_regression(poses, _moved(poses), _steps(), PARTS)
+    assert chosen[0].fade < 1.0 and chosen[0].error < 0.05 * chosen[0].of_mean
+    off, whole = (np.linalg.norm(x, axis=2).mean() for x in (_said(regression, new) - _moved(new), _moved(new)))
+    assert off < 0.03 * whole
+    # The other joints say nothing, and few directions are left of 63.
+    away = new.copy()
+    away[:, 3 * NEAR :] = 0.0
+    assert np.abs(_said(regression, away) - _said(regression, new)).max() < 2e-3
+    assert len(regression.rows) <= 30
+
+
+def test_where_poses_tell_nothing_the_mean_stands():
+    poses, rng = _poses(40, 1), np.random.default_rng(5)
+    noise = 0.01 * rng.normal(size=(40, POINTS, 3))
+    regression, chosen = fit_pose_regression(poses, noise, _steps(), PARTS)
+    assert chosen[0].error < 1.05 * chosen[0].of_mean
+    said = _said(regression, _poses(20, 2))
+    assert np.abs(said - noise.mean(0)).max() < 0.01 and np.square(said - noise.mean(0)).mean() < 0.1 * 0.01**2
+
+
+def test_parts_are_chosen_apart():
+    poses = _poses(40, 1)
+    surfaces = _moved(poses)
+    parts = np.repeat([3, 7], POINTS // 2)
+    noisy = np.where((parts == 7)[:, None], 0.01 * np.random.default_rng(5).normal(size=surfaces.shape), surfaces)
+    _, chosen = fit_pose_regression(poses, noisy, _steps(), parts)
+    assert set(chosen) == {3, 7} and chosen[3].amount < 0.01 * chosen[7].amount
+    assert all(one.fade in FADES for one in chosen.values())
+
+
+def test_the_order_of_points_does_not_matter():
+    poses, order = _poses(25, 1), np.random.default_rng(3).permutation(POINTS)
+    surfaces, steps = _moved(poses), _steps()
+    steps[::2] = steps[::2, ::-1]
+    a, _ = fit_pose_regression(poses, surfaces, steps, PARTS)
+    b, _ = fit_pose_regression(poses, surfaces[:, order], steps[order], PARTS)
+    np.testing.assert_allclose(_said(b, poses), _said(a, poses)[:, order], atol=2e-5)
+
+
+def test_few_directions_say_what_all_would():
+    poses = _poses(60, 1)
+    regression, _ = fit_pose_regression(poses, _moved(poses), _steps(), PARTS)
+    assert np.sqrt(np.square(_said(regression, poses) - _moved(poses)).sum(-1).mean()) < 2e-4
+
+
+def test_angles_are_held_a_quarter_of_their_range_beyond_training():
+    poses = _poses(30, 1)
+    regression, _ = fit_pose_regression(poses, _moved(poses), _steps(), PARTS)
+    reach = np.ptp(poses, axis=0)
+    np.testing.assert_allclose(regression.low.numpy(), poses.min(0) - BEYOND * reach, atol=1e-6)
+    np.testing.assert_allclose(regression.high.numpy(), poses.max(0) + BEYOND * reach, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_frame_or_two_give_a_mean_and_no_numbers_that_are_not_finite(count):
+    poses = _poses(count, 1)
+    regression, _ = fit_pose_regression(poses, _moved(poses), _steps(), PARTS)
+    said = _said(regression, _poses(5, 2))
+    assert np.isfinite(said).all()
+    if count == 1:
+        np.testing.assert_allclose(said, np.broadcast_to(_moved(poses), said.shape), atol=1e-6)
