@@ -38,17 +38,13 @@ class PoseRegression(nn.Module):
         super().__init__()
         given = {"level": level, "basis": basis, "rows": rows, "center": center, "low": low, "high": high}
         for name, value in given.items():
-            self.register_buffer(name, value.to(torch.float32))
+            self.register_buffer(name, value.detach().to(torch.float32, copy=True))
 
     @staticmethod
     def shapes(points: int, directions: int) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the arguments."""
         basis = {"level": (points, 3), "basis": (points, 3, directions), "rows": (directions, THETA)}
         return basis | dict.fromkeys(("center", "low", "high"), (THETA,))
-
-    def with_values(self, *, level: Float[Tensor, "K 3"], basis: Float[Tensor, "K 3 r"]) -> PoseRegression:
-        """Return the same directions with other displacements, which may carry gradients."""
-        return PoseRegression(level, basis, self.rows, self.center, self.low, self.high)
 
     def forward(self, pose: Float[Tensor, "B 63"]) -> Float[Tensor, "B K 3"]:
         """Return displacements of the points, metres."""

@@ -31,10 +31,3 @@ def test_angles_beyond_the_limits_are_held_there(regression):
     torch.testing.assert_close(at, beyond)
     theta[1, 4] = 0.4
     assert not torch.allclose(*regression(theta))
-
-
-def test_other_values_have_gradients_and_the_same_directions(regression):
-    level = torch.zeros(5, 3, requires_grad=True)
-    other = regression.with_values(level=level, basis=regression.basis)
-    other(torch.zeros(1, 63)).sum().backward()
-    assert torch.equal(level.grad, torch.ones(5, 3)) and torch.equal(other.rows, regression.rows)
