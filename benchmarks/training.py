@@ -226,8 +226,7 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
                     bake.pretrain,
                     0,
                     code_lr_factor=bake.code_lr_factor,
-                    null_share=bake.null_share,
-                    imagined=bake.imagined,
+                    null_share=0.0 if bake.regression else bake.null_share,
                 ).step
             )
         ),

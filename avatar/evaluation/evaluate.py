@@ -91,7 +91,7 @@ def evaluate_models(
     """Measure models on a capture: images, surface, speed and size, all by the same rules.
 
     Every frame is posed once a model, for all cameras of all sets and for the surface. A frame that was trained on
-    takes its own code where a model has codes; any other takes the null code. The head's boxes are those of the
+    takes its own code where a model has codes; any other is shown as new poses are. The head's boxes are those of the
     sequence's template, whatever a model's own is.
 
     Args:

@@ -40,7 +40,7 @@ class Motion:
     """One pose of a template, ready for the networks and for skinning; float32.
 
     Attributes:
-        frame: number of the training frame whose code the student takes; None for the null code.
+        frame: number of the training frame whose code the student takes; None for a new pose.
         pose: theta, radians. expression: coefficients. jaw: axis-angle, radians.
         rest: T-pose with this frame's expression and pose correctives, metres.
         world_from_rest: blended transforms of the vertices.
@@ -66,7 +66,7 @@ class Motion:
         return replace(self, cloth=None)
 
     def without_code(self) -> Motion:
-        """Return the same pose, driven by the null code."""
+        """Return the same pose without a frame's code, as models show new ones."""
         return replace(self, frame=None)
 
     def as_new(self) -> Motion:

@@ -161,7 +161,7 @@ class AvatarPlayer:
 
         Args:
             params: one frame; its shape is not looked at.
-            frame: of the training, whose code is taken; None, or one that has none: the null code.
+            frame: of the training, whose code is taken; None, or one that has none: a new pose.
             cloth: where loose clothes are, over the bundle's vertices; None: where field and skinning have them.
 
         Raises:

@@ -48,7 +48,7 @@ class RowResult:
 
 
 class WithoutCode(nn.Module):
-    """An avatar that is driven by the null code in every frame, as it is online."""
+    """An avatar that shows every frame as it shows new poses, as it does online."""
 
     rig: Rig
 

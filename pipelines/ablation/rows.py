@@ -36,7 +36,7 @@ class Row:
 
     Attributes:
         title: as tables have it. model: the stage that makes what is measured. note: what is different, in words.
-        null_code: the avatar is driven by the null code in every frame.
+        null_code: every frame is shown as a new pose is.
     """
 
     title: str
@@ -67,7 +67,7 @@ OPTION_ROWS: Mapping[str, Row] = {
     "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
     "ungated": Row("ungated", "ungated", "all blend shapes act on all Gaussians, as published"),
     "no-cloth": Row("w/o simulation", "no_cloth", "the field moves loose clothes in new poses too"),
-    "null-code": Row("null code", "null_code", "driven by the null code in every frame, as online", null_code=True),
+    "null-code": Row("null code", "null_code", "every frame shown as a new pose is, as online", null_code=True),
 }
 BASELINE_ROWS: Mapping[str, Row] = {
     "lbs": Row("LBS Gaussians", "lbs", "Gaussians on the template, which follows its joints alone; photographs"),

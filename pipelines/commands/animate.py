@@ -59,7 +59,7 @@ class Animate:
     outside: Literal["keep", "clamp"] = "keep"
     """Poses of a student beyond what its training saw: said and shown as they are, or held back joint by joint."""
     codes: Literal["null", "trained"] = "null"
-    """Codes of a student's field: the null code, as for any new motion, or those of its training, for a motion whose
+    """Codes of a student's field: none, as for any new motion, or those of its training, for a motion whose
     rows are the frames of the training by their numbers (with --cloth field, without --interpolate)."""
     interpolate: OptionalFloat = None
     """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""

@@ -39,7 +39,7 @@ class StudentFilm:
         cloth: what moves loose clothes: a simulation, the student's own field, or the joints alone.
         clamp: joints turn no farther than in training.
         numbered_from: number of the motion's first frame, where its frames are the training's: those that have a code
-            take it; None: the null code.
+            take it; None: as a new pose.
         relighting: the light that the person is shown in; None: that of the capture.
         below: metres below the highest point that the picture shows; None: the whole person.
     """

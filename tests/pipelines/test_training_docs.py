@@ -54,7 +54,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "the bake compares with": "the teacher's pictures" if bake.images == "teacher" else "photographs",
         "weights of `L_non`, `L_sem`": f"{bake.nonrigid:g}, {bake.semantic:g}",
         "labels of `L_sem` are drawn of": ("-" if not bake.semantic else f"the student's {_WORDS[bake.semantic_map]}"),
-        "imagined poses of the bake": f"{bake.imagined}" if bake.imagined else "none",
+        "new poses have a regression in the field's place": "yes" if bake.regression else "no",
         "poses a step": ", ".join(str(stage.poses_per_step) for stage in stages),
         "cameras a pose": ", ".join(str(stage.views) for stage in stages),
         "rate of the networks": ", ".join(f"{stage.lr:g}" for stage in stages),
@@ -66,7 +66,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "followed clothes give normals where a capture has none": (
             "yes" if all(stage.surface_normals for stage in stages) else "no"
         ),
-        "share of poses with the null code": f"-, {bake.null_share:g}, {compensate.null_share:g}",
+        "share of poses shown as new ones": f"-, {bake.null_share:g}, {compensate.null_share:g}",
         "share of the last steps whose mean is kept": ", ".join(
             f"{stage.averaged:g}" if stage.averaged else "none" for stage in stages
         ),

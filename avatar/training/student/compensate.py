@@ -37,7 +37,7 @@ class CompensateConfig(PhotometricConfig):
     Attributes:
         iterations: 100k, and poses_per_step: 4, in the paper.
         lr: of the mapping networks. position_lr: of U, pixels. color_lr: of C, colours in [0, 1].
-        null_share: of the poses that are shown with the null code.
+        null_share: of the poses that are shown as new ones.
         init_from_track: the blend shapes start from what the field left over of the surface that the teacher
             followed, see `init_blend_shapes`; False: from zero, as in the paper.
     """
