@@ -27,8 +27,9 @@ from avatar.data.cloth_motion import ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.surface_quality import mean_surface, surface_quality
 from avatar.models.model_file import load_avatar
-from avatar.models.networks.local_pose import seen_joints
+from avatar.models.networks.local_pose import joint_steps, seen_joints
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.training.student.regress_poses import fit_pose_regression
 from benchmarks.followed_surface import SamePoints
 from benchmarks.machine import store_results
 from benchmarks.motion_predictors import Drive, LearnConfig, MotionFeatures, Predictor, learn, ridge
@@ -154,6 +155,7 @@ class Bench:
         yield "mean of the training frames", self._mean
         yield "ridge, pose", lambda train, test: self._ridge(self.features.pose, train, test)
         yield "ridge, history", lambda train, test: self._ridge(self.features.history, train, test)
+        yield "the students' regression", lambda train, test: self._regression(self.followed, train, test)
         for drive in get_args(Drive):
             yield f"field, {drive}", lambda train, test, drive=drive: self.field(drive, self.followed, train, test)
         yield "student's field", self._student
@@ -168,6 +170,10 @@ class Bench:
             yield (
                 "learned from the truth: ridge, pose",
                 lambda train, test: self._ridge(self.features.pose, train, test, self.true(train)),
+            )
+            yield (
+                "learned from the truth: the students' regression",
+                lambda train, test: self._regression(self.true(train), train, test),
             )
             for drive in get_args(Drive):
                 yield (
@@ -231,6 +237,18 @@ class Bench:
         best = min(wrong, key=lambda amount: wrong[amount])
         found = ridge(x, y, features[[self._row(frame) for frame in test]], best)
         return self._spread(found.unflatten(1, (-1, 3)), test)
+
+    def _regression(self, known: Mapping[int, Tensor], train: Sequence[int], test: Sequence[int]) -> Displacements:
+        """What students show in new poses (`fit_pose_regression`), of the surfaces `known`."""
+        at, template = self.track.cage.vertices.numpy(), self.rig.template
+        regression, _ = fit_pose_regression(
+            self.features.pose[[self._row(frame) for frame in train]].numpy(),
+            torch.stack([known[frame] for frame in train]).numpy(),
+            template.vertices[at],
+            joint_steps(template)[at],
+            template.vertex_labels[at],
+        )
+        return self._spread(regression(self.features.pose[[self._row(frame) for frame in test]]), test)
 
     def field(
         self, drive: Drive, known: Mapping[int, Tensor], train: Sequence[int], test: Sequence[int]
