@@ -17,8 +17,8 @@ from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.params import BodyParams
 
 NOT_FILLED = (
-    "the displacement field is a network, or linear in more coefficients than 16: `ctrl_pt_basis` and `ctrl_pt_offsets` are zero, and "
-    "cloth follows the joints alone",
+    "the displacement field is a network, or linear in more coefficients than 16: `ctrl_pt_basis` and "
+    "`ctrl_pt_offsets` are zero, and cloth follows the joints alone",
     "blend shapes move every Gaussian, fade far from known poses, and are driven by the jaw; a feature network of "
     "leaky ReLUs over pose and expression cannot be that: `layers`, `color_basis`, `scaling_basis` and "
     "`rotation_basis` are zero",
