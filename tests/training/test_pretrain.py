@@ -234,8 +234,10 @@ def test_a_teacher_stopped_in_its_pretraining_ends_with_the_same_weights(frames,
     assert same_state(whole.state_dict(), parts.state_dict())
 
 
-def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tmp_path):
-    config: BakeConfig = replace(BAKE, iterations=1, evaluations=1, pretrain=replace(CONFIG, iterations=2))
+@pytest.mark.parametrize("regression", [False, True])
+def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(regression, frames, tmp_path):
+    pretrain = replace(CONFIG, iterations=2)
+    config: BakeConfig = replace(BAKE, iterations=1, evaluations=1, pretrain=pretrain, regression=regression)
     ends = []
     for folder, seconds in ((tmp_path / "whole", float("inf")), (tmp_path / "parts", ONE_STEP)):
         done = None
@@ -245,7 +247,21 @@ def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tm
             student, done = bake(frames, gaussians(), STUDENT, config, session, teacher=teacher)
         assert read_metrics(folder / PRETRAIN / METRICS_FILE)[-1]["iteration"] == 2
         ends.append(student.state_dict())
-    assert same_state(*ends)
+    assert same_state(*ends) and ("regression.level" in ends[0]) == regression
+
+
+def test_new_poses_of_a_bake_have_the_regression_and_its_frames_their_codes(frames, tmp_path):
+    config = replace(BAKE, iterations=2, evaluations=1, pretrain=CONFIG, regression=True)
+    student, _ = bake(frames, gaussians(), STUDENT, config, Session(tmp_path), teacher=make_teacher(frames, moved=0.05))
+    seen = frames.motion(2)
+    with torch.no_grad():
+        own, new = student.displacements(seen), student.displacements(seen.without_code())
+        coded = student.field(seen.pose[None], student.codes([2]))[0]
+        regressed = student.field.spread(student.regression(seen.pose[None]))[0]
+        mean = torch.stack([student.displacements(frames.motion(frame)) for frame in frames.train_frames]).mean(0)
+    assert torch.equal(own, coded) and torch.equal(new, regressed) and not torch.allclose(own, new, atol=1e-6)
+    still = student.regression(student.regression.center[None])
+    torch.testing.assert_close(student.field.spread(still)[0], mean, atol=1e-5, rtol=1e-3)
 
 
 def test_a_bake_without_a_teacher_has_nothing_to_pretrain_on(frames, tmp_path):
