@@ -250,9 +250,14 @@ def test_a_bake_stopped_in_its_pretraining_ends_with_the_same_weights(regression
     assert same_state(*ends) and ("regression.level" in ends[0]) == regression
 
 
-def test_new_poses_of_a_bake_have_the_regression_and_its_frames_their_codes(frames, tmp_path):
+def test_new_poses_of_a_bake_have_the_regression_and_its_frames_their_codes(frames, tmp_path, caplog):
     config = replace(BAKE, iterations=2, evaluations=1, pretrain=CONFIG, regression=True)
-    student, _ = bake(frames, gaussians(), STUDENT, config, Session(tmp_path), teacher=make_teacher(frames, moved=0.05))
+    with caplog.at_level("INFO", logger="avatar.training.student.regress_poses"):
+        teacher = make_teacher(frames, moved=0.05)
+        student, _ = bake(frames, gaussians(), STUDENT, config, Session(tmp_path), teacher=teacher)
+    labels = np.unique(frames.rig.template.vertex_labels[student.field.points.numpy()])
+    assert len(caplog.records) == 2 * len(labels)  # when the bake begins and when it ends
+    assert "mm off in training frames that are left out" in caplog.text
     seen = frames.motion(2)
     with torch.no_grad():
         own, new = student.displacements(seen), student.displacements(seen.without_code())
