@@ -135,8 +135,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
     """Make a preset for two cores: the surface is followed first, networks learn it before they see photographs.
 
     A teacher of minutes draws worse than the photographs are: the bake compares with those, and takes from the teacher
-    the followed surface. Several views a step, attributes that learn in every
-    stage, no perceptual term.
+    the followed surface. Several views a step, attributes that learn in every stage, no perceptual term.
     """
     pretrain = PretrainConfig(
         iterations=size.pretrain, batch=8, lr=1e-2, lr_final_factor=0.02, warmup=20, betas=(0.9, 0.99)
