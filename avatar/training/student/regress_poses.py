@@ -25,7 +25,8 @@ FRAMES = 256
 BEYOND = 0.25
 """Angles are believed beyond the training's by this share of their range."""
 BLOCKS = 5
-"""Of frames that follow each other, each left out once."""
+"""Of frames that follow each other, each left out once, and half as many beside it on either side: they are nearly its
+own, in all that sways slowly, and to foretell them says nothing of new poses."""
 FADES = (0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 """How much less a joint's angle is worth with every step along the skeleton: to choose from."""
 REACHES = (0.0, 0.02, 0.04)
@@ -154,7 +155,8 @@ def _chosen(
     wrong, of_mean = np.zeros((len(FADES), len(smooth), len(AMOUNTS))), 0.0
     smoothed = [one(surfaces) for one in smooth.values()]
     for block in blocks:
-        kept = np.setdiff1d(np.arange(len(poses)), block)
+        beside = len(block) // 2
+        kept = np.setdiff1d(np.arange(len(poses)), np.arange(block[0] - beside, block[-1] + 1 + beside))
         center, level = poses[kept].mean(axis=0), surfaces[kept].mean(axis=0)
         of_mean += float(((surfaces[block] - level) ** 2).sum())
         for f, fade in enumerate(FADES):
