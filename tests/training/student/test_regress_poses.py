@@ -118,7 +118,7 @@ def test_chance_from_point_to_point_is_smoothed_away():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_sways_slowly_of_its_own_is_not_taken_for_the_poses(seed):
-    """Neighbours in time are nearly the left-out frames: with them at hand anything smooth foretells anything smooth."""
+    """With its neighbours in time at hand anything smooth foretells a left-out frame from anything else."""
     rng = np.random.default_rng(seed)
 
     def swaying(count: int) -> np.ndarray:
