@@ -24,6 +24,8 @@ HALF = 1e-2
 """Metres of expected error at which a vertex counts half."""
 STILL = 1e-3
 """Metres: motion off the clothes much below this costs nearly nothing."""
+SWINGS = 5e-3
+"""Metres of motion at which clothes near the skin are half believed to hang there no longer: more costs little more."""
 
 
 class ControlCage(nn.Module):
@@ -68,14 +70,15 @@ class ControlCage(nn.Module):
 
         Args:
             reach: metres. Points of the clothes count too, on the skin as much as the body's, less with the distance
-                from it and not at all beyond; 0: none does.
+                from it and not at all beyond; 0: none does. Their d counts as `d S / (S + d)`, `S = SWINGS`: a shirt is
+                held, and a skirt that lies on the thighs in the T-pose is let go as soon as it swings.
         """
         count = max(int(self.off_clothes.sum()), 1)
-        moved = controls[self.off_clothes].square().sum(-1)
-        total = ((moved + STILL**2).sqrt() - STILL).sum() / count
+        moved = (controls.square().sum(-1) + STILL**2).sqrt() - STILL
+        total = moved[self.off_clothes].sum() / count
         if reach > 0.0:
             tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
-            total = total + (tight * ((controls.square().sum(-1) + STILL**2).sqrt() - STILL)).sum() / count
+            total = total + (tight * SWINGS * moved / (SWINGS + moved)).sum() / count
         return total
 
 

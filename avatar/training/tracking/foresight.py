@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import exp
@@ -20,8 +20,10 @@ from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 
+USUAL_FPS = 20.0
+"""Frames a second of captures that do not say."""
 FADING = 0.3
-"""Seconds in which what the simulation has wrong falls to 1/e: it swings as the cloth does, out of step."""
+"""Seconds in which what a forecast has wrong falls to 1/e: a simulation swings as the cloth does, out of step."""
 JUDGED = 4
 """Frames, the last ones, by which forecasts are judged."""
 PINNED = 0.014
@@ -33,6 +35,9 @@ DOUBT = 1e-3
 Solved = Mapping[int, tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"] | None]]
 """Displacements of frames, metres, and the share of every direction that pictures told of them; None: all."""
 
+Forecast = Callable[[int, Solved], Float[Tensor, "K 3"]]
+"""Displacements of a frame, metres, from those of the frames that are done."""
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedControls:
@@ -42,13 +47,11 @@ class SimulatedControls:
         displacements: (K, 3) by frame, metres along the axes of the T-pose, 0 off simulated clothes.
         share: in [0, 1]: how much of a control point's displacement the simulation can tell.
         part: of each control point, a number from 0 to P - 1; 0: not simulated.
-        fps: frames a second of the frames' numbers.
     """
 
     displacements: Mapping[int, Float[Tensor, "K 3"]]
     share: Float[Tensor, " K"]
     part: Int[Tensor, " K"]
-    fps: float
 
 
 def simulate_controls(
@@ -90,7 +93,6 @@ def simulate_controls(
         displacements,
         torch.tensor(share[rows], device=controls.device),
         torch.tensor(part[rows], device=controls.device),
-        fps,
     )
 
 
@@ -112,12 +114,14 @@ class Foresight:
         simulated: clothes; None: nothing is simulated.
         reference: frame in which the template is the surface: what was found there is an error of the Gaussians.
         error: that error where it is known before; None: from the frames that are done.
+        fps: frames a second of the frames' numbers.
     """
 
     extrapolation: float
     simulated: SimulatedControls | None = None
     reference: int | None = None
     error: Float[Tensor, "K 3"] | None = None
+    fps: float = USUAL_FPS
 
     @property
     def share(self) -> Float[Tensor, "*K 1 1"]:
@@ -133,27 +137,30 @@ class Foresight:
         Args:
             solved: the frames that are done, at least one, in the order in which they were found.
         """
-        return self._blended(frame, solved, self.extrapolation)
+        return self._blended(frame, solved, self._carried_on)
 
     def anchor(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return where a frame's displacements are held as far as pictures do not tell.
 
-        No motion is carried on: what nothing checks would go on for ever. Simulated clothes are believed wholly as long
-        as they were no worse than those of the frame before: cloth that stays behind would be taken for truth.
+        That is on skinning or on simulated clothes, with what the frame before differed from them, which fades: cloth
+        that nothing checks would go on for ever, or stay where chance had brought it. Simulated clothes are believed
+        wholly as long as they were no worse than skinning.
         """
-        return self._blended(frame, solved, 0.0, favour=2.0)
+        return self._blended(frame, solved, self._on_skinning, favour=2.0)
 
-    def _blended(self, frame: int, solved: Solved, extrapolation: float, favour: float = 1.0) -> Tensor:
-        carried, foreseen = self._forecasts(frame, solved, extrapolation)
+    def _blended(self, frame: int, solved: Solved, otherwise: Forecast, favour: float = 1.0) -> Tensor:
+        """Return the simulated forecast and another, each by how far it was from what was found."""
+        other = otherwise(frame, solved)
         if self.simulated is None:
-            return carried
+            return other
         wrong = []
         for one in self._judged(frame, solved):
-            a, b = self._forecasts(one, _until(one, solved), extrapolation)
             found, told = solved[one]
-            wrong.append((_seen(a - found, told), _seen(b - found, told)))
+            before = _until(one, solved)
+            a, b = (forecast(one, before) - found for forecast in (otherwise, self._simulated))
+            wrong.append((_seen(a, told), _seen(b, told)))
         trust = self.simulated.share * (favour * self._trust(wrong)).clamp(max=1.0)
-        return carried + trust[:, None] * (foreseen - carried)
+        return other + trust[:, None] * (self._simulated(frame, solved) - other)
 
     def shape(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return the shape about which a frame's displacements are smooth: between skinning's, 0, and the simulated.
@@ -194,23 +201,32 @@ class Foresight:
         side = [other for other in done[1:] if (other - first) * (frame - first) > 0]
         return sorted(side, key=lambda other: abs(other - frame))[:JUDGED]
 
-    def _forecasts(
-        self, frame: int, solved: Solved, extrapolation: float
-    ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]:
-        """A share of the motion before carried on, and the simulated one."""
-        near = min(solved, key=lambda other: abs(other - frame))
-        last = carried = solved[near][0]
+    def _carried_on(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
+        """A share of the motion between the two frames before, carried on."""
+        near = _nearest(frame, solved)
+        last = solved[near][0]
         behind = [other for other in solved if (other - near) * (near - frame) > 0]
-        if behind:
-            far = min(behind, key=lambda other: abs(other - near))
-            share = extrapolation * (frame - near) / (near - far)
-            carried = carried + share * (carried - solved[far][0])
-        if self.simulated is None:
-            return carried, carried
+        if not behind:
+            return last
+        far = min(behind, key=lambda other: abs(other - near))
+        return last + self.extrapolation * (frame - near) / (near - far) * (last - solved[far][0])
+
+    def _on_skinning(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
+        zero = torch.zeros_like(next(iter(solved.values()))[0])
+        return self._fading(frame, solved, zero, zero)
+
+    def _simulated(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
+        assert self.simulated is not None
         own = self.simulated.displacements
-        kept = exp(-abs(frame - near) / self.simulated.fps / FADING)
-        error = self._error(solved)
-        return carried, error + own[frame] + kept * (last - error - own[near])
+        return self._fading(frame, solved, own[frame], own[_nearest(frame, solved)])
+
+    def _fading(
+        self, frame: int, solved: Solved, there: Float[Tensor, "K 3"], before: Float[Tensor, "K 3"]
+    ) -> Float[Tensor, "K 3"]:
+        """A shape of the frame with what the nearest done one differs from its own, `before`, the less the later."""
+        near, error = _nearest(frame, solved), self._error(solved)
+        kept = exp(-abs(frame - near) / self.fps / FADING)
+        return error + there + kept * (solved[near][0] - error - before)
 
     def _error(self, solved: Solved) -> Tensor:
         """What was found where the template is the surface."""
@@ -219,6 +235,10 @@ class Foresight:
         if self.reference is None or self.reference not in solved:
             return torch.zeros_like(next(iter(solved.values()))[0])
         return solved[self.reference][0]
+
+
+def _nearest(frame: int, solved: Solved) -> int:
+    return min(solved, key=lambda other: abs(other - frame))
 
 
 def _until(frame: int, solved: Solved) -> Solved:

@@ -27,12 +27,10 @@ from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import BACK, Session
 from avatar.training.tracking.certainty import expected_distances, held_directions
 from avatar.training.tracking.config import LEVEL_END, Level, TrackConfig
-from avatar.training.tracking.foresight import Foresight, simulate_controls
+from avatar.training.tracking.foresight import USUAL_FPS, Foresight, simulate_controls
 from avatar.training.tracking.structure import picture_structure
 from smplxpp.core.errors import InputError
 
-USUAL_FPS = 20.0
-"""Frames a second of captures that do not say."""
 SEEN = 1
 """Halvings of the photographs, about, that say how much can be told."""
 
@@ -193,7 +191,7 @@ class TrackTask(PhotometricTask):
         own.copy_(self._structure(frame, start))
         if not done:
             return Begin(start, start, start, torch.zeros_like(own))
-        # What is not simulated has nothing to be held to: plain cloth would stay where it was.
+        # What is not simulated is not held: plain cloth that swings would stay where skinning has it.
         held, anchor = self.foresight.share * held_directions(own, self._normals), self.foresight.anchor(frame, done)
         start = start + torch.einsum("kij,kj->ki", held, anchor - start)
         return Begin(start, self.foresight.shape(frame, done), anchor, held)
@@ -263,7 +261,7 @@ def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig)
         poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
         reference = poses[config.reference].without_shape()
         simulated = simulate_controls(sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices)
-    return Foresight(config.extrapolation, simulated, config.reference)
+    return Foresight(config.extrapolation, simulated, config.reference, fps=fps or USUAL_FPS)
 
 
 def follow_surface(

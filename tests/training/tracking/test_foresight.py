@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import cos
+from math import cos, exp
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.training.tracking.config import Level, TrackConfig
-from avatar.training.tracking.foresight import Foresight, SimulatedControls, Solved, simulate_controls
+from avatar.training.tracking.foresight import FADING, Foresight, SimulatedControls, Solved, simulate_controls
 from avatar.training.tracking.track import TrackTask
 from smplxpp.capture import open_capture
 from smplxpp.core.labels import LOWER
@@ -35,7 +35,7 @@ def simulated(late: float = 0.0, *, scale: float = 1.0) -> SimulatedControls:
     """Three points of a part that can be simulated wholly, one that hangs where it begins, two of the body."""
     share = torch.tensor([1.0, 1.0, 1.0, 0.2, 0.0, 0.0])
     part = torch.tensor([1, 1, 1, 1, 0, 0])
-    return SimulatedControls({f: scale * share[:, None] * swung(f, late) for f in range(12)}, share, part, FPS)
+    return SimulatedControls({f: scale * share[:, None] * swung(f, late) for f in range(12)}, share, part)
 
 
 def solved(count: int) -> Solved:
@@ -47,36 +47,47 @@ def wrong(foresight: Foresight, frame: int = 8) -> float:
 
 
 def test_a_swing_that_motion_carried_on_misses_is_foreseen():
-    carried, foreseen = wrong(Foresight(1.0)), wrong(Foresight(1.0, simulated(), 0))
+    carried, foreseen = wrong(Foresight(1.0, fps=FPS)), wrong(Foresight(1.0, simulated(), 0, fps=FPS))
     assert foreseen < 0.1 * carried
-    late = wrong(Foresight(1.0, simulated(0.2), 0))
+    late = wrong(Foresight(1.0, simulated(0.2), 0, fps=FPS))
     assert foreseen < late < 0.6 * carried
 
 
 def test_simulations_that_were_wrong_are_not_believed():
     nonsense = simulated(3.0, scale=6.0)
-    shape, right = (Foresight(1.0, one, 0).shape(8, solved(8)) for one in (nonsense, simulated()))
+    shape, right = (Foresight(1.0, one, 0, fps=FPS).shape(8, solved(8)) for one in (nonsense, simulated()))
     assert shape[:3].norm(dim=-1).max() < 0.1 * nonsense.displacements[8][0].norm()
     torch.testing.assert_close(right[:3], swung(8)[:3], rtol=0.05, atol=0.0)
-    assert wrong(Foresight(1.0, nonsense, 0)) < 1.3 * wrong(Foresight(1.0))
+    assert wrong(Foresight(1.0, nonsense, 0, fps=FPS)) < 1.3 * wrong(Foresight(1.0, fps=FPS))
 
 
 def test_what_is_not_simulated_is_carried_on():
-    start = Foresight(1.0, simulated(), 0).start(8, solved(8))
-    carried = Foresight(1.0).start(8, solved(8))
+    start = Foresight(1.0, simulated(), 0, fps=FPS).start(8, solved(8))
+    carried = Foresight(1.0, fps=FPS).start(8, solved(8))
     assert torch.equal(start[4:], carried[4:])
     assert not torch.equal(start[:3], carried[:3])
+
+
+def test_anchors_fade_to_skinning_where_nothing_is_simulated():
+    drifted = {frame: (torch.tensor([0.01, 0.0, 0.0]).expand(POINTS, 3), None) for frame in range(4)}
+    anchor = Foresight(1.0, fps=FPS).anchor(5, drifted)
+    torch.testing.assert_close(anchor, exp(-2 / FPS / FADING) * drifted[3][0])
+    # What was found where the template is the surface is no motion and stays.
+    at_rest = Foresight(1.0, reference=0, fps=FPS).anchor(5, drifted)
+    torch.testing.assert_close(at_rest, drifted[3][0])
+    simulated_too = Foresight(1.0, simulated(), 0, fps=FPS).anchor(8, solved(8))
+    torch.testing.assert_close(simulated_too[:3], swung(8)[:3], rtol=1e-3, atol=0.0)
 
 
 def test_the_error_of_the_reference_stays_in_all_frames():
     error = torch.tensor([0.0, 0.01, 0.0])
     found = {frame: (one + error, None) for frame, (one, _) in solved(8).items()}
-    moved = Foresight(1.0, simulated(), 0).start(8, found)
-    torch.testing.assert_close(moved, Foresight(1.0, simulated(), 0).start(8, solved(8)) + error)
+    moved = Foresight(1.0, simulated(), 0, fps=FPS).start(8, found)
+    torch.testing.assert_close(moved, Foresight(1.0, simulated(), 0, fps=FPS).start(8, solved(8)) + error)
 
 
 def test_both_directions_from_the_reference_are_judged_apart():
-    foresight = Foresight(1.0, simulated(), 5)
+    foresight = Foresight(1.0, simulated(), 5, fps=FPS)
     found = {frame: (swung(frame), None) for frame in (5, 4, 6, 3, 7)}
     assert foresight._judged(8, found) == [7, 6] and foresight._judged(2, found) == [3, 4]
     forth = foresight.start(8, found)
@@ -93,7 +104,7 @@ def skirt() -> SimulatedControls:
 
 
 def test_a_skirt_is_simulated_through_every_second_frame(skirt):
-    assert sorted(skirt.displacements) == list(range(0, 12, 2)) and skirt.fps == 20.0
+    assert sorted(skirt.displacements) == list(range(0, 12, 2))
     controls = torch.arange(0, person().vertex_count, 7)
     of_skirt = torch.tensor(person().vertex_part)[controls] == person().part_names.index(LOWER.name)
     assert torch.equal(skirt.part > 0, of_skirt) and not skirt.share[~of_skirt].any() and skirt.share.max() == 1.0

@@ -113,6 +113,10 @@ def test_cloth_on_the_skin_counts_as_the_body_and_cloth_off_it_does_not(frames):
     assert cage.motion_off_clothes(moved) == 0.0 == cage.motion_off_clothes(moved, reach=0.5 * near)
     tight, tighter = (float(cage.motion_off_clothes(moved, reach=reach)) for reach in (2.0 * far, 20.0 * far))
     assert 0.0 < tight < tighter
+    # Cloth that has left the skin by centimetres pays hardly more for going on.
+    once, twice = (float(cage.motion_off_clothes(k * moved, reach=2.0 * far)) for k in (1.0, 2.0))
+    first = float(cage.motion_off_clothes(0.1 * moved, reach=2.0 * far))
+    assert tight == once and 0.0 < twice - once < 0.2 * first < first
     # What the body does weighs the same with it and without.
     body = torch.where(cage.off_clothes[:, None], torch.tensor(0.02), torch.tensor(0.0)).expand(-1, 3)
     assert cage.motion_off_clothes(body) == cage.motion_off_clothes(body, reach=20.0 * far)
