@@ -108,9 +108,10 @@ class _Steps:
 class _Size:
     """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations, rates.
 
-    The compensation's rate is that of its mapping networks; those of U and C are in proportion. `penalties` multiplies
-    its penalties of large and far Gaussians. `averaged` is the share of the steps whose mean bake and compensation end
-    with.
+    `pretrain` are the teacher's iterations before it sees photographs, `field` those of the student's field before the
+    bake. The compensation's rate is that of its mapping networks; those of U and C are in proportion. `penalties`
+    multiplies its penalties of large and far Gaussians. `averaged` is the share of the steps whose mean bake and
+    compensation end with.
     """
 
     gaussians: int
@@ -120,7 +121,7 @@ class _Size:
     body_motion_weight: float
     tight_reach: float
     pretrain: int
-    field_lr: float
+    field: _Steps
     fit: int
     rates: LearningRates
     teacher: _Steps
@@ -166,7 +167,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
-            pretrain=replace(pretrain, iterations=2 * size.pretrain, batch=12, lr=size.field_lr),
+            pretrain=replace(pretrain, iterations=size.field.iterations, batch=12, lr=size.field.lr),
             images="photographs",
             semantic=0.0,
             attributes=size.bake.attributes,
@@ -253,12 +254,12 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=1.0,
             # Plain shirts followed chance: photographs do not say where on the skin they lie.
             tight_reach=0.04,
-            pretrain=500,
-            field_lr=5e-3,
+            pretrain=350,
+            field=_Steps(1000, 5e-3),
             fit=600,
             rates=LearningRates(),
             # At the usual rates Gaussians of hair end millimetres short of where they go, and heads a decibel.
-            teacher=_Steps(500, 2e-3, 3.0),
+            teacher=_Steps(350, 2e-3, 3.0),
             bake=_Steps(900, 1e-3, 3.0),
             compensate=_Steps(2400, 1e-3, 2.0),
             # What leaks through from behind others moves fast Gaussians farther.
@@ -278,7 +279,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             tight_reach=0.02,
             pretrain=100,
             # At 3e-3 the field died in three of four trainings: no displacement at all. At 1e-3 it learns most.
-            field_lr=1e-3,
+            field=_Steps(200, 1e-3),
             fit=150,
             # Few steps, of one view each: colours learn fast or not at all.
             rates=LearningRates(dc=6e-3, offset=0.03),

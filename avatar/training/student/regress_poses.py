@@ -166,12 +166,14 @@ def _chosen(
                 # One decomposition serves all that is learned.
                 sizes, turned = np.linalg.eigh(x.T @ x)
                 left = asked @ turned
+                # |L D R - Y|^2 for all diagonal D of the amounts, from products without the points.
+                shrunk = 1.0 / (np.maximum(sizes, 0.0) + np.array(AMOUNTS)[:, None])
                 for r, learned in enumerate(smoothed):
                     y = learned[kept][:, points]
                     right = turned.T @ (x.T @ (y - y.mean(axis=0)).reshape(len(kept), -1))
-                    for a, amount in enumerate(AMOUNTS):
-                        found = (left / (np.maximum(sizes, 0.0) + amount)) @ right
-                        wrong[f, r, a] += float(((found - truth) ** 2).sum())
+                    squares = np.einsum("ai,ij,aj->a", shrunk, (left.T @ left) * (right @ right.T), shrunk)
+                    both = np.einsum("ti,ti->i", left, truth @ right.T)
+                    wrong[f, r] += squares - 2.0 * shrunk @ both + np.square(truth).sum()
     f, r, a = (int(k) for k in np.unravel_index(int(wrong.argmin()), wrong.shape))
     count = surfaces.shape[0] * surfaces.shape[1]
     error, of_mean = (float(np.sqrt(total / count)) for total in (wrong[f, r, a], of_mean))
