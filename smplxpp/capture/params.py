@@ -17,11 +17,15 @@ from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 # What has a row a frame, in the layouts that stack frames.
 _STACKED = (*ARRAY_NAMES, "poses", "trans")
+DAMAGED, ABSENT = -1, -2
 
 
 @dataclass(frozen=True, eq=False)
 class StackedParams:
     """An npz file whose row is the frame's number. Rows with NaN or infinity spoil themselves alone.
+
+    A row that is NaN throughout, as `smplxpp register` and refined poses have for frames that they were not asked for,
+    is no damage: the frame has no parameters.
 
     Attributes:
         path: the file.
@@ -35,15 +39,16 @@ class StackedParams:
 
     @cached_property
     def _rows(self) -> tuple[BodyParams, np.ndarray]:
-        """The good rows, and for every row its index among them (-1: bad)."""
+        """The good rows, and for every row its index among them (`DAMAGED`, `ABSENT`: none)."""
         arrays = safe_npz(self.path)
         matrices = {name: arrays[name] for name in _STACKED if name in arrays and np.ndim(arrays[name]) == 2}
         rows = max(map(len, matrices.values()), default=1)
         stacked = {name: array for name, array in matrices.items() if len(array) == rows and array.dtype.kind == "f"}
-        good = np.ones(rows, dtype=bool)
+        good, there = np.ones(rows, dtype=bool), np.full(rows, not stacked)
         if rows > 1:
             for array in stacked.values():
                 good &= np.isfinite(array).all(axis=1)
+                there |= ~np.isnan(array).all(axis=1)
         offsets = np.asarray(arrays.get("v_shape", ()))
         if rows > 1 and offsets.ndim == 3 and len(offsets) == rows:
             stacked["v_shape"] = offsets
@@ -51,17 +56,17 @@ class StackedParams:
         if not good.any():
             raise InputError(f"file {self.path}", expected="finite values", received="NaN or infinity in every row")
         params = params_from_content(kept, source=f"file {self.path}", layout=self.layout, body=self.body)
-        return params, np.where(good, np.cumsum(good) - 1, -1)
+        return params, np.where(good, np.cumsum(good) - 1, np.where(there, DAMAGED, ABSENT))
 
     def frames(self) -> Int64[np.ndarray, " F"]:
         """The frames that there are, ascending."""
-        return np.arange(len(self._rows[1]))
+        return np.flatnonzero(self._rows[1] != ABSENT)
 
     def read(self, frame: int) -> BodyParams:
         """Read the parameters of one frame.
 
         Raises:
-            InputError: NaN or infinity in it.
+            InputError: NaN or infinity in it, or nothing else.
         """
         params, index = self._rows
         if index[frame] < 0:
