@@ -88,6 +88,21 @@ def test_nan_in_one_frame_spoils_that_frame_alone(tmp_path):
     assert capture.without(problems).frames == (0,)
 
 
+def test_a_row_of_nothing_but_nan_is_a_frame_without_parameters(tmp_path):
+    """As registration and refinement write frames that they were not asked for."""
+    root = write_avatarrex(make_scene(), tmp_path / "subject")
+    arrays = dict(np.load(root / "smpl_params.npz"))
+    stacked = {name: array for name, array in arrays.items() if array.ndim == 2 and len(array) == 2}
+    assert "body_pose" in stacked
+    for array in stacked.values():
+        array[1] = np.nan
+    np.savez(root / "smpl_params.npz", **arrays)
+    capture = open_capture(root)
+    assert np.isfinite(capture.params(0).body_pose).all() and capture.params(1) is None
+    assert capture.recording.params.frames().tolist() == [0]
+    assert [problem.message for problem in find_problems(capture)] == ["frame 1: no body parameters"]
+
+
 def test_nan_in_a_frames_own_file(rig):
     path = rig / "params/000001.npz"
     arrays = dict(np.load(path))
