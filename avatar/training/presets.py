@@ -122,7 +122,6 @@ class _Size:
     tight_reach: float
     pretrain: int
     field: _Steps
-    field_batch: int
     fit: int
     rates: LearningRates
     teacher: _Steps
@@ -168,7 +167,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
-            pretrain=replace(pretrain, iterations=size.field.iterations, batch=size.field_batch, lr=size.field.lr),
+            pretrain=replace(pretrain, iterations=size.field.iterations, batch=4, lr=size.field.lr),
             images="photographs",
             semantic=0.0,
             attributes=size.bake.attributes,
@@ -256,9 +255,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             # Plain shirts followed chance: photographs do not say where on the skin they lie.
             tight_reach=0.04,
             pretrain=350,
-            # A third as many steps of twelve frames, at 5e-3, left a skirt 7.0 mm off what was followed, not 5.3.
             field=_Steps(3000, 3e-3),
-            field_batch=4,
             fit=600,
             rates=LearningRates(),
             # At the usual rates Gaussians of hair end millimetres short of where they go, and heads a decibel.
@@ -281,9 +278,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=4.0,
             tight_reach=0.02,
             pretrain=100,
-            # At 3e-3 the field died in three of four trainings: no displacement at all. At 1e-3 it learns most.
-            field=_Steps(200, 1e-3),
-            field_batch=12,
+            field=_Steps(600, 2e-3),
             fit=150,
             # Few steps, of one view each: colours learn fast or not at all.
             rates=LearningRates(dc=6e-3, offset=0.03),

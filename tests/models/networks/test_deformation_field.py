@@ -51,6 +51,20 @@ def test_starts_at_zero_with_a_gradient():
     assert field.body.last.weight.grad.abs().sum() > 0 and field.cloth.last.weight.grad.abs().sum() > 0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_points_and_frames_are_told_apart_from_the_start(seed):
+    """Else the last layer has nothing but a constant to learn with, and all dies that is pushed below zero."""
+    torch.manual_seed(seed)
+    network = DeformationField(FieldConfig(), torch.rand(200, 3) - 0.5, torch.ones(200, dtype=torch.bool)).body
+    said = []
+    network.last.register_forward_pre_hook(lambda module, given: said.append(given[0]))
+    points, (pose, code) = torch.rand(200, 3) - 0.5, drive(8)
+    network(positional_encoding(points, 6), torch.cat([0.3 * pose, 0.1 * code], dim=1)[:, None], None)
+    (last,) = said
+    assert last.flatten(0, 1).std(dim=0).mean() > 0.3 * last.mean() > 0.0
+    assert last.mean(dim=1).std(dim=0).mean() > 0.02 * last.mean()
+
+
 def test_equation_written_out():
     field = random_field()
     pose, code = drive(1)
