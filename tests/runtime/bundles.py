@@ -50,7 +50,10 @@ def student(kind: str) -> Student:
     with torch.no_grad():
         for name, value in it.named_parameters():
             if not name.startswith("gaussians."):
-                value.add_(0.05 * torch.randn(value.shape))
+                # Centimetres, not decimetres: what the hidden layers say is of the order of one.
+                value.add_(
+                    (0.005 if ".last." in name and name.startswith("field.") else 0.05) * torch.randn(value.shape)
+                )
     return it
 
 
