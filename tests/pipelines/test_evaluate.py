@@ -349,9 +349,8 @@ def test_the_fixture_from_its_build_to_the_page(tmp_path, capsys):
 def test_the_overview_shows_the_last_novel_view(evaluated, tmp_path):
     photograph, skinned, student = held_out_view(evaluated)
     assert photograph.shape == skinned.shape == student.shape and photograph.dtype == np.uint8
-    shown = [one for one in read_manifest(evaluated / "95_evaluate")["numbers"]["views"] if one["set"] == "novel_view"][
-        -1
-    ]
+    views = read_manifest(evaluated / "95_evaluate")["numbers"]["views"]
+    shown = [one for one in views if (one["set"], one.get("chosen")) == ("novel_view", "evenly")][-1]
     truth, rendered = read_tiles(evaluated / "95_evaluate" / shown["file"], 2)
     for found, expected in ((photograph, truth), (skinned, rendered[0]), (student, rendered[1])):
         np.testing.assert_array_equal(found, expected)
