@@ -167,6 +167,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
+            # Many steps of few frames: three times as many frames a step told a field less in the same time.
             pretrain=replace(pretrain, iterations=size.field.iterations, batch=4, lr=size.field.lr),
             images="photographs",
             semantic=0.0,

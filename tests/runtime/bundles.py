@@ -51,9 +51,8 @@ def student(kind: str) -> Student:
         for name, value in it.named_parameters():
             if not name.startswith("gaussians."):
                 # Centimetres, not decimetres: what the hidden layers say is of the order of one.
-                value.add_(
-                    (0.005 if ".last." in name and name.startswith("field.") else 0.05) * torch.randn(value.shape)
-                )
+                size = 0.005 if name.startswith("field.") and ".last." in name else 0.05
+                value.add_(size * torch.randn(value.shape))
     return it
 
 
