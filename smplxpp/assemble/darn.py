@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Int, Int64
+from jaxtyping import Int
 
 from smplxpp.assemble.build import CanonicalPart
 from smplxpp.assemble.patch import Patch, patch_loop
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.topology import border_loops, edge_groups
+from smplxpp.core.topology import border_loops
 from smplxpp.core.validation import require_at_least
-
-# Of a border's mean edge: copies of a vertex that are nearer to each other than this have not drawn apart.
-_TOGETHER = 0.1
 
 
 @dataclass(frozen=True)
@@ -78,85 +76,19 @@ def darn(
     Nobody saw that cloth: a patch is the least surface over its border (`smplxpp.assemble.patch`), weights and colours
     are harmonic between those of the border. Vertices and faces of the part keep their numbers, new ones follow, with
     -1 for the scan's vertex. Borders that cannot be closed (`patch_loop`) stay open.
-
-    Where a cut touches itself, one vertex of the scan became two. Those that the T-pose leaves together are one again:
-    a patch between them would have faces without area. The first stays, numbers behind the second move up.
     """
     config = config or DarnConfig()
-    apart = one_of = np.arange(part.mesh.vertex_count)
-    patches: list[tuple[np.ndarray, Patch]] = []
-    closed = 0
+    patches = []
     for loop in holes:
-        for joined in (_rejoined(part, loop), apart):
-            over = _patches(part.mesh, joined, loop, config.width)
-            if over is not None:
-                one_of = np.where(joined == apart, one_of, joined)
-                patches, closed = patches + over, closed + 1
-                break
+        with suppress(InputError):
+            patch = patch_loop(part.mesh, loop)
+            if patch.width(part.mesh.vertices[loop]) <= config.width:
+                patches.append((loop, patch))
     area = sum(patch.area(part.mesh.vertices[loop]) for loop, patch in patches)
-    said = Darning(len(holes), closed, sum(len(patch.faces) for _, patch in patches), area)
-    if (one_of != apart).any():
-        part = replace(part, mesh=TriangleMesh(part.mesh.vertices, one_of[part.mesh.faces]))
+    said = Darning(len(holes), len(patches), sum(len(patch.faces) for _, patch in patches), area)
     for loop, patch in patches:
         part = _with_patch(part, loop, patch)
-    return (_without_unused(part) if (one_of != apart).any() else part), said
-
-
-def _rejoined(part: CanonicalPart, loop: Int[np.ndarray, " L"]) -> Int64[np.ndarray, " N"]:
-    """For every vertex the one that it is: itself, or the loop's first at its place that comes from the same vertex."""
-    joined = np.arange(part.mesh.vertex_count)
-    rim, scan = part.mesh.vertices[loop], part.scan_index[loop]
-    reach = _TOGETHER * row_lengths(np.roll(rim, -1, axis=0) - rim).mean()
-    for later in range(1, len(loop)):
-        same = np.flatnonzero((scan[:later] == scan[later]) & (scan[later] >= 0))
-        near = same[row_lengths(rim[same] - rim[later]) < reach]
-        if len(near):
-            joined[max(loop[later], loop[near[0]])] = min(loop[later], loop[near[0]])
-    return joined[joined]
-
-
-def _patches(
-    mesh: TriangleMesh, one_of: Int64[np.ndarray, " N"], loop: Int[np.ndarray, " L"], width: float
-) -> list[tuple[np.ndarray, Patch]] | None:
-    """What closes a loop once its vertices are those of `one_of`; None where not all of it can be, within `width`."""
-    joined = TriangleMesh(mesh.vertices, one_of[mesh.faces])
-    if edge_groups(joined.faces)[2].max() > 2:
-        return None
-    patches = []
-    for piece in _simple_loops(one_of[loop]):
-        try:
-            patch = patch_loop(joined, piece)
-        except InputError:
-            return None
-        if patch.width(mesh.vertices[piece]) > width:
-            return None
-        patches.append((piece, patch))
-    return patches
-
-
-def _simple_loops(loop: Int[np.ndarray, " L"]) -> list[Int[np.ndarray, " _"]]:
-    """A loop that meets itself, as loops that do not; there and back again along one edge is none."""
-    loops: list[list[int]] = []
-    path: list[int] = []
-    for vertex in loop.tolist():
-        if vertex in path:
-            at = path.index(vertex)
-            loops.append(path[at:])
-            path = path[:at]
-        path.append(vertex)
-    return [np.array(piece) for piece in [*loops, path] if len(piece) > 2]
-
-
-def _without_unused(part: CanonicalPart) -> CanonicalPart:
-    mesh, used = part.mesh.submesh(np.arange(part.mesh.face_count))
-    by_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
-    return replace(
-        part,
-        mesh=mesh,
-        weights=replace(part.weights, **{name: getattr(part.weights, name)[used] for name in by_vertex}),
-        vertex_colors=part.vertex_colors[used],
-        scan_index=part.scan_index[used],
-    )
+    return part, said
 
 
 def _with_patch(part: CanonicalPart, loop: Int[np.ndarray, " L"], patch: Patch) -> CanonicalPart:

@@ -22,6 +22,9 @@ from smplxpp.core.validation import require_at_least
 REACH = 2.0
 """How wide the sides of a fold are, in distances from the body."""
 
+_WIDENINGS = 4
+"""Rings by which a cut is widened at most where it touches itself; sides part as two vertices after that."""
+
 
 @dataclass(frozen=True)
 class WebConfig:
@@ -87,14 +90,32 @@ def cut_webs(
 ) -> tuple[TriangleMesh, Int[np.ndarray, " N"]]:
     """Leave out faces and the specks that this leaves; the borders are openings like a hem.
 
+    Where cuts meet in a vertex, the smaller of its sides goes too: as two vertices at one place of the scan they would
+    leave a border that touches itself, and what closes it (`smplxpp.assemble.darn`) would have faces without area.
+
     Returns the rest, manifold, and for each of its vertices the vertex of `part` that it is.
     """
     config = config or WebConfig()
     left, source = part.submesh(~web)
+    for _ in range(_WIDENINGS):
+        faces, of_kept = manifold_corners(left.faces)
+        narrow = _smaller_sides(faces, of_kept)
+        if not narrow.any():
+            break
+        left, kept = left.submesh(~narrow)
+        source = source[kept]
     left, of_left = left.submesh(drop_specks(left, area_fraction=config.speck_area))
-    # Where two cuts meet in a vertex, its sides part.
     faces, of_kept = manifold_corners(left.faces)
     return TriangleMesh(left.vertices[of_kept], faces), source[of_left][of_kept]
+
+
+def _smaller_sides(faces: Int[np.ndarray, "M 3"], old: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " M"]:
+    """Faces about every old vertex that has become several, but those about the one of them with the most faces."""
+    count = np.bincount(faces.ravel(), minlength=len(old))
+    by_size = np.lexsort((np.arange(len(old)), -count, old))
+    smaller = np.zeros(len(old), dtype=bool)
+    smaller[by_size[1:]] = old[by_size[1:]] == old[by_size[:-1]]
+    return np.asarray(smaller[faces].any(axis=1))
 
 
 def _valleys(

@@ -13,7 +13,6 @@ from smplxpp.core.labels import UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.core.topology import border_loops
-from smplxpp.metrics.quality import mesh_quality
 
 ROWS, COLUMNS, CELL = 21, 40, 0.01
 
@@ -101,71 +100,6 @@ def test_a_hole_that_cannot_be_closed_stays(tube):
     )
     darned, said = darn(crossed, [hole])
     assert darned is crossed and (said.holes, said.closed) == (1, 0)
-
-
-def manifold(mesh: TriangleMesh) -> bool:
-    quality = mesh_quality(mesh)
-    return quality.nonmanifold_edges == quality.nonmanifold_vertices == 0
-
-
-def pinched(tube: CanonicalPart, apart: float, right: int = 11) -> tuple[CanonicalPart, CanonicalPart]:
-    """The tube without two blocks that touch in a corner, which is two vertices `apart` from each other, as a cut
-    leaves it; the same with the corner as one vertex."""
-    part = without(tube, ((6, 10), (3, 7)), ((10, 14), (7, right)))
-    (corner,) = np.flatnonzero(part.scan_index == 100 + 10 * COLUMNS + 7)
-    faces, copy = part.mesh.faces.copy(), part.mesh.vertex_count
-    around = np.flatnonzero((faces == corner).any(axis=1))
-    columns = part.mesh.vertices[faces[around]].mean(axis=1) - part.mesh.vertices[corner]
-    upper = around[columns[:, 1] > 0]
-    faces[upper] = np.where(faces[upper] == corner, copy, faces[upper])
-    vertices = np.concatenate([part.mesh.vertices, part.mesh.vertices[[corner]] + [0.0, apart, 0.0]])
-    dense = part.weights.dense()
-    return (
-        replace(
-            part,
-            mesh=TriangleMesh(vertices, faces),
-            weights=SkinWeights.from_dense(np.concatenate([dense, dense[[corner]]])),
-            vertex_colors=np.concatenate([part.vertex_colors, part.vertex_colors[[corner]]]),
-            scan_index=np.concatenate([part.scan_index, part.scan_index[[corner]]]),
-        ),
-        part,
-    )
-
-
-def test_a_cut_that_touches_itself_is_closed_without_slivers(tube):
-    part, whole = pinched(tube, 1e-5)
-    holes = holes_of(part, tube)
-    assert [len(hole) for hole in holes] == [32]
-    darned, said = darn(part, holes)
-    assert (said.holes, said.closed) == (1, 1) and len(border_loops(darned.mesh.faces)) == 2
-    assert manifold(darned.mesh) and darned.mesh.face_areas.min() > 0.05 * CELL**2
-    count = whole.mesh.vertex_count
-    np.testing.assert_array_equal(darned.mesh.vertices[:count], whole.mesh.vertices)
-    np.testing.assert_array_equal(darned.scan_index[:count], whole.scan_index)
-    np.testing.assert_array_equal(darned.weights.dense()[:count], whole.weights.dense())
-    lengths = {len(x) for x in (darned.weights.matched, darned.vertex_colors, darned.mesh.vertices, darned.scan_index)}
-    assert lengths == {darned.mesh.vertex_count}
-    assert said.area == pytest.approx(32 * CELL**2, rel=0.2)
-
-
-def test_sides_that_have_drawn_apart_stay_two(tube):
-    part, _ = pinched(tube, 0.3 * CELL)
-    darned, said = darn(part, holes_of(part, tube))
-    assert (said.holes, said.closed) == (1, 1) and manifold(darned.mesh)
-    np.testing.assert_array_equal(darned.mesh.vertices[: part.mesh.vertex_count], part.mesh.vertices)
-
-
-def test_sides_stay_two_where_one_of_the_two_holes_would_stay_open(tube):
-    """A corner where four borders meet would not be manifold."""
-    part, _ = pinched(tube, 1e-5, right=27)
-    holes = holes_of(part, tube)
-    widths = [darn(part, holes, config=DarnConfig(width=width))[1].closed for width in (0.01, 0.03)]
-    assert widths == [0, 1]
-    # Both within: joined. The small hole alone within: as two vertices, the whole within or not.
-    for width in np.linspace(0.01, 0.03, 21):
-        darned, said = darn(part, holes, config=DarnConfig(width=float(width)))
-        assert manifold(darned.mesh)
-        assert said.closed or darned is part
 
 
 @pytest.mark.parametrize("width", [-1.0, np.nan, np.inf])

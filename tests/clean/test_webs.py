@@ -146,6 +146,24 @@ def test_a_cut_leaves_manifold_openings_and_names_its_vertices(body):
     assert len(border_loops(cloth.faces)) == 1 and len(border_loops(left.faces)) == 2
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_cuts_that_meet_in_a_vertex_are_one(mirrored):
+    """Two squares that touch in a corner: no vertex becomes two, and no more goes than the faces of one side there."""
+    plane = sheet(np.stack([np.linspace(0, 0.4, 41), np.zeros(41)], axis=1))
+    x, y = plane.face_centers[:, 0], plane.face_centers[:, 1]
+    low, high = y.min(), y.max()
+    middle = 0.01 * round(50 * (low + high))
+    y = low + high - y if mirrored else y
+    web = np.zeros(plane.face_count, dtype=bool)
+    for left_x, top in ((0.15, middle), (0.20, middle + 0.05)):
+        web |= (x > left_x) & (x < left_x + 0.05) & (y > top - 0.05) & (y < top)
+    left, source = cut_webs(plane, web)
+    assert len(np.unique(source)) == len(source)
+    assert 0 < (~web).sum() - left.face_count <= 5
+    assert len(border_loops(plane.faces)) == 1 and len(border_loops(left.faces)) == 2
+    np.testing.assert_array_equal(left.vertices, plane.vertices[source])
+
+
 def test_specks_that_a_cut_leaves_go_with_it():
     plane = sheet(np.stack([np.linspace(0, 0.4, 41), np.zeros(41)], axis=1))
     ring = np.abs(np.linalg.norm(plane.face_centers - [0.2, 0.2, 0.0], axis=1) - 0.03) < 0.012
