@@ -130,6 +130,12 @@ PARTS = (
         ablation_lines,
     ),
     Part(
+        "ablation_talking_tracked",
+        "Forty seconds of talking, tracked: the student against trained skinning",
+        TALKING.replace("exact inputs", "inputs as trackers give them, registered and refined") + "Measured as above.",
+        ablation_lines,
+    ),
+    Part(
         "held_out_poses_talking",
         "Forty seconds of talking: what the student's pictures of new poses hang on",
         TALKING + "PSNR of the person, and of the pixels of each label, in dB, means over the views: one held-out "
