@@ -23,6 +23,9 @@ def ablation_lines(figures: Mapping[str, Any]) -> list[str]:
         "novel_pose.perceptual": "perceptual",
         "novel_pose.psnr_head": "head, PSNR",
         "novel_pose.images": "images",
+        "refined.novel_pose.psnr": "novel poses refined on training cameras, PSNR",
+        "refined.novel_pose.perceptual": "perceptual",
+        "refined.novel_pose.psnr_head": "head, PSNR",
         "surface.training.p2s": "P2S",
         "surface.training.head.p2s": "P2S head",
         "surface.training.skin.p2s": "P2S skin",
@@ -56,6 +59,8 @@ _COMPARED = (
     "novel_pose.psnr",
     "novel_view.psnr_head",
     "novel_pose.psnr_head",
+    "refined.novel_pose.psnr",
+    "refined.novel_pose.psnr_head",
     "surface.training.skin.p2s",
     "surface.training.lower.p2s",
 )
@@ -65,7 +70,8 @@ def _against(one: Mapping[str, float], other: Mapping[str, float], key: str, tit
     """Return two rows' figure in words, and which is better."""
     better = one[key] > other[key] if "psnr" in key else one[key] < other[key]
     digits = 1 if "psnr" in key else 2
-    where = ("novel poses, " if "pose" in key else "novel views, ") if "head" in key else ""
+    of = "refined poses, " if "refined" in key else "novel poses, " if "pose" in key else "novel views, "
+    where = of if "head" in key else ""
     verdict = "better" if better else "**worse**"
     return f"{where}{title} {one[key]:.{digits}f} against {other[key]:.{digits}f} ({verdict})"
 

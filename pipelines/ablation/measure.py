@@ -22,7 +22,9 @@ from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.cloth import ClothStage, clothed_sequence
 from pipelines.stages.evaluate import surface_digest
+from pipelines.stages.evaluate_poses import of_held_out_poses, refined_digest, refined_poses
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
+from smplxpp.capture import Capture
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.json_file import as_integer, as_number
 
@@ -71,8 +73,10 @@ def closure(stage: ModelStage) -> list[ModelStage]:
     return list({found.name: found for found in walk(stage)}.values())
 
 
-def row_stage(trainer: Trainer, name: str, row: Row, model: ModelStage, config: EvaluationConfig) -> Stage:
-    """What decides the figures of a row whose model is trained."""
+def row_stage(
+    trainer: Trainer, name: str, row: Row, model: ModelStage, config: EvaluationConfig, refined: Capture | None
+) -> Stage:
+    """What decides the figures of a row whose model is trained; `refined`: the capture with refined held-out poses."""
     trained = trainer.path(model)
     record = trainer.found(model)
     assert record is not None
@@ -83,6 +87,7 @@ def row_stage(trainer: Trainer, name: str, row: Row, model: ModelStage, config: 
             **trainer.scene.digests,
             "model": record.manifest["files"][model.file],
             "capture/surfaces": surface_digest(trainer.scene.capture, config.protocol),
+            **refined_digest(trainer.run, refined),
         },
         code=(__name__, type(model).__module__),
         libraries=TRAINING,
@@ -108,7 +113,8 @@ def measure_row(
     Args:
         known: what is known of the inputs, for the report. in_time: whether there is time left.
     """
-    stage = row_stage(trainer, name, row, model, config)
+    again = refined_poses(trainer.run, trainer.scene.capture)
+    stage = row_stage(trainer, name, row, model, config, again)
     simulated = next((one for one in closure(model) if isinstance(one, ClothStage)), None)
     if decide(trainer.run, stage, force=force) != "skip" and not in_time:
         return None
@@ -125,13 +131,24 @@ def measure_row(
             files={row.title: player},
             progress=progress,
         )
-        replace(evaluation.report, inputs=known).save(folder / REPORT_FILE)
+        report = replace(evaluation.report, inputs=known)
+        if again is not None and (held_out := of_held_out_poses(config, again)) is not None:
+            there = clothed_sequence(_seeing(trainer, again), CLOTHED, simulated)
+            refined = evaluate_models({row.title: shown}, there, held_out, progress=progress).report
+            report = replace(report, refined_poses=refined.models)
+        report.save(folder / REPORT_FILE)
         _keep_pictures(folder / PICTURES, evaluation)
         return StageOutput()
 
     with own_run_folder(trainer.run / ROWS_FOLDER, (name,)):
         record = run_stage(trainer.run, stage, work, force=force)
     return _result(trainer, row, model, record)
+
+
+def _seeing(trainer: Trainer, capture: Capture) -> Trainer:
+    """The same run, its capture with other poses."""
+    scene = replace(trainer.scene, capture=capture)
+    return Trainer(trainer.run, scene, trainer.options, trainer.together, scale=trainer.scale)
 
 
 def _result(trainer: Trainer, row: Row, model: ModelStage, record: StageRecord) -> RowResult:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avatar.evaluation.protocol import SETS
 from avatar.evaluation.report import SURFACE_SETS, EvalReport
-from avatar.evaluation.summary import summary_figures
+from avatar.evaluation.summary import REFINED_POSES, summary_figures
 from avatar.evaluation.tables import Column, FigureTable
 from pipelines.ablation.measure import RowResult
 from smplxpp.core.labels import CLOTH_LABELS
+
+NOVEL_POSE = "novel_pose"
+REFINED = "refined."
+"""Begins the names of figures in held-out poses that were refined on training cameras."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,9 @@ class AblationResult:
         models = {title: model for report in reports for title, model in report.models.items()}
         alone = next((report.skinning_alone for report in reports if report.skinning_alone), {})
         conventions = {name: text for report in reports for name, text in report.conventions.items()}
-        return EvalReport(reports[0].capture, reports[0].metric, models, alone, conventions, reports[0].inputs)
+        refined = {title: model for report in reports for title, model in report.refined_poses.items()}
+        first = reports[0]
+        return EvalReport(first.capture, first.metric, models, alone, conventions, first.inputs, refined)
 
 
 def ablation_table(result: AblationResult) -> FigureTable:
@@ -46,6 +52,12 @@ def ablation_table(result: AblationResult) -> FigureTable:
             Column(f"{name}.psnr", "PSNR", SETS[name], 2, "higher"),
             Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),
             Column(f"{name}.perceptual", metric, SETS[name], 4, "lower"),
+        ]
+    if any(r.report.refined_poses for r in result.rows.values()):
+        group = f"{SETS[NOVEL_POSE]}{REFINED_POSES}"
+        columns += [
+            Column(f"{REFINED}{NOVEL_POSE}.psnr", "PSNR", group, 2, "higher"),
+            Column(f"{REFINED}{NOVEL_POSE}.perceptual", metric, group, 4, "lower"),
         ]
     for name, title in SURFACE_SETS.items():
         group = f"{title}, mm"
@@ -69,6 +81,13 @@ def _caption(result: AblationResult, capture: str) -> str:
 
 
 def row_figures(result: RowResult) -> dict[str, float | None]:
-    """Every mean figure of a row, see `summary_figures`; `minutes` and `iterations` of training."""
+    """Every mean figure of a row, see `summary_figures`; `minutes` and `iterations` of training.
+
+    Those of views in refined poses begin with `REFINED`.
+    """
     figures = summary_figures(result.report.models[result.row.title])
+    again = result.report.refined_poses.get(result.row.title)
+    if again is not None:
+        views = summary_figures(replace(again, surfaces={}))
+        figures |= {f"{REFINED}{key}": value for key, value in views.items() if key.split(".")[0] in again.views}
     return {**figures, "minutes": result.seconds / 60.0, "iterations": float(result.iterations)}

@@ -32,13 +32,19 @@ from pipelines.figures.evaluation import surface_picture, write_tiles
 from pipelines.runs import gates
 from pipelines.runs.checks import Check
 from pipelines.runs.digests import TRAINING, sha256_file
-from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS, REFINED_HELD_OUT_PARAMS
+from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
 from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
 from pipelines.stages.evaluate_inputs import input_protocol
-from pipelines.stages.evaluate_poses import exact_params, pose_errors, refined_poses
+from pipelines.stages.evaluate_poses import (
+    exact_params,
+    of_held_out_poses,
+    pose_errors,
+    refined_digest,
+    refined_poses,
+)
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.scene_digests import params_digest
@@ -109,7 +115,7 @@ def evaluate(
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
             "capture/surfaces": surface_digest(scene.capture, config.protocol),
             **clothes.digests,
-            **({} if again is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}),
+            **refined_digest(run, again),
             **({} if exact is None else {"capture/exact parameters": params_digest(exact)}),
         },
         code=(__name__,),
@@ -118,10 +124,9 @@ def evaluate(
     )
 
     def _of_refined(capture: Capture) -> dict[str, ModelFigures]:
-        sets = tuple(name for name in view_sets(capture, config.protocol) if name.startswith("novel_pose"))
-        if not sets:
+        held_out = of_held_out_poses(config, capture)
+        if held_out is None:
             return {}
-        held_out = replace(config, protocol=replace(config.protocol, sets=sets), speed_pictures=0, shown=0)
         there = clothes.sequence(capture, device=device)
         return evaluate_models(loaded, there, held_out, progress=progress).report.models
 

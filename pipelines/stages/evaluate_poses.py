@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int64
 
+from avatar.evaluation.evaluate import EvaluationConfig
+from avatar.evaluation.protocol import view_sets
+from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture, open_capture
@@ -94,6 +97,19 @@ def refined_poses(run: Path, capture: Capture) -> Capture | None:
         return None
     source = _HeldOutFrom(own, StackedParams(path), frozenset(capture.splits.novel_pose_frames))
     return replace(capture, recording=replace(capture.recording, params=source))
+
+
+def refined_digest(run: Path, refined: Capture | None) -> dict[str, str]:
+    """What `refined_poses` was read from, as an input of a stage."""
+    return {} if refined is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}
+
+
+def of_held_out_poses(config: EvaluationConfig, capture: Capture) -> EvaluationConfig | None:
+    """The part of an evaluation that hangs on held-out poses, without speed and pictures; None where there is none."""
+    sets = tuple(name for name in view_sets(capture, config.protocol) if name.startswith("novel_pose"))
+    if not sets:
+        return None
+    return replace(config, protocol=replace(config.protocol, sets=sets), speed_pictures=0, shown=0)
 
 
 @dataclass(frozen=True, eq=False)

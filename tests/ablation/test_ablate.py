@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from benchmarks import machine
 from benchmarks.ablation import AblationBenchmark
 from pipelines.cli import main
 from smplxpp.core.errors import InputError
-from tests.dolls.swaying import HEIGHT, WIDTH, write_moving_capture, write_moving_run
+from smplxpp.core.params import BodyParams
+from tests.dolls.swaying import ANGLES, HEIGHT, WIDTH, params, write_moving_capture, write_moving_run
 
 QUICK = (
     *("--preset", "demo", "--iterations-share", "0.01", "--gaussians", "400", "--every", "3", "--device", "cpu"),
@@ -63,6 +65,33 @@ def test_table_figures_and_pictures(finished, capsys, capture):
     assert ablate(finished, capture) == 0
     assert "w/o Gau Non." in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("manifest.json")}
+
+
+def test_held_out_poses_that_a_run_refined_are_measured_beside_the_given_ones(tmp_path, capture):
+    run = write_moving_run(tmp_path / "run")
+    assert ablate(run, capture) == 0
+    results = run / "ablation" / "results.json"
+    given = json.loads(results.read_text())
+    assert not any(key.startswith("refined.") for key in given["rows"]["lbs"]["figures"])
+    trained = {path: path.stat().st_mtime_ns for path in (run / "ablation").glob("*/*.safetensors")}
+    poses = [params(frame) for frame in range(len(ANGLES))]
+    away = [replace(one, transl=one.transl + (0.05, 0.0, 0.0)) for one in poses]
+    (run / "66_refine").mkdir()
+    BodyParams.concatenate(away).save(run / "66_refine" / "params_held_out.npz")
+    assert ablate(run, capture) == 0
+    again = json.loads(results.read_text())
+    assert trained == {path: path.stat().st_mtime_ns for path in (run / "ablation").glob("*/*.safetensors")}
+    for name in ROWS:
+        figures, title = again["rows"][name]["figures"], again["rows"][name]["title"]
+        same = {key: value for key, value in figures.items() if not key.startswith("refined.")}
+        assert same == given["rows"][name]["figures"]
+        assert figures["refined.novel_pose.images"] == figures["novel_pose.images"]
+        assert figures["refined.novel_pose.psnr"] < figures["novel_pose.psnr"] - 0.3  # somebody who stands elsewhere
+        assert set(again["evaluation"]["refined_poses"][title]["views"]) == {"novel_pose"}
+        assert again["evaluation"]["models"][title] == given["evaluation"]["models"][title]
+    with open(run / "ablation" / "table.csv") as file:
+        (row,) = [row for row in csv.DictReader(file) if row[""] == "LBS Gaussians"]
+    assert float(row["refined.novel_pose.psnr"]) == again["rows"]["lbs"]["figures"]["refined.novel_pose.psnr"]
 
 
 def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, capture, capsys):
