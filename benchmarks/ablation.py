@@ -21,7 +21,7 @@ from pipelines.commands.options import OptionalPath
 from pipelines.runs.layout import ABLATION
 from smplxpp.core.errors import InputError
 
-SHOWN = ("psnr", "ssim", "perceptual", "psnr_head", "images", "frames", "spread")
+SHOWN = ("psnr", "ssim", "perceptual", "psnr_head", "psnr_head_alone", "images", "frames", "spread")
 """Ends of the figures of views that are stored; those of surfaces and of training all are."""
 
 

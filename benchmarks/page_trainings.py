@@ -16,16 +16,19 @@ def ablation_lines(figures: Mapping[str, Any]) -> list[str]:
         "novel_view.ssim": "SSIM",
         "novel_view.perceptual": "perceptual",
         "novel_view.psnr_head": "head, PSNR",
+        "novel_view.psnr_head_alone": "head alone",
         "novel_view.images": "images",
         "novel_pose.psnr": "novel poses, PSNR",
         "novel_pose.psnr.spread": "SD",
         "novel_pose.ssim": "SSIM",
         "novel_pose.perceptual": "perceptual",
         "novel_pose.psnr_head": "head, PSNR",
+        "novel_pose.psnr_head_alone": "head alone",
         "novel_pose.images": "images",
         "refined.novel_pose.psnr": "novel poses refined on training cameras, PSNR",
         "refined.novel_pose.perceptual": "perceptual",
         "refined.novel_pose.psnr_head": "head, PSNR",
+        "refined.novel_pose.psnr_head_alone": "head alone",
         "surface.training.p2s": "P2S",
         "surface.training.head.p2s": "P2S head",
         "surface.training.skin.p2s": "P2S skin",
@@ -41,7 +44,7 @@ def ablation_lines(figures: Mapping[str, Any]) -> list[str]:
     there = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows.values())}
     about = {name: value for name, value in figures.items() if name != "rows"}
     return [
-        "PSNR of the person in dB, head: of its box; P2S in mm, of training frames first.",
+        "PSNR of the person in dB; head: of its box; alone: of what shows it. P2S in mm, of training frames first.",
         "",
         *table(("row", "what", *there.values()), [(n, r["what"], *(r.get(k) for k in there)) for n, r in rows.items()]),
         "Full against skinning trained on photographs (`LBS Gaussians`): "

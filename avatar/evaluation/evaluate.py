@@ -31,6 +31,7 @@ from avatar.metrics.view_quality import (
     ViewQuality,
     eight_bit,
     head_box,
+    head_shown,
     head_vertices,
     view_quality,
 )
@@ -136,6 +137,7 @@ class _Run:
         self.gallery = Gallery(sets, config.shown)
         self.meshes: dict[str, ShownSurface] = {}
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
+        self._template_head = _faces_of_head(sequence.rig)
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
         self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
 
@@ -147,6 +149,7 @@ class _Run:
         skinned = sequence.rig.pose(sequence.motion(frame).without_cloth())
         corners = skinned[self._head].double().cpu().numpy()
         heads = [head_box(corners, view.camera) for view in views]
+        shown = [self._head_shown(skinned, view) for view in views]
         truth = alone = None
         if any(frame in frames for frames in self.truths.values()):
             truth = sequence.capture.truth_mesh(frame)
@@ -162,8 +165,8 @@ class _Run:
         for name, model in self.models.items():
             with at_rest(model):
                 posed = model(_motion(model, sequence, frame), camera_centers)
-                for index, (view, head) in enumerate(zip(views, heads, strict=True)):
-                    pictures[index][name] = self._see(name, posed, index, view=view, frame=frame, head=head)
+                for index, view in enumerate(views):
+                    pictures[index][name] = self._see(name, posed, index, view, frame, (heads[index], shown[index]))
             if truth is not None and alone is not None:
                 if model.rig.template is sequence.rig.template and torch.equal(posed.vertices, skinned):
                     self.surfaces[name][frame] = alone
@@ -198,13 +201,28 @@ class _Run:
         report = EvalReport(self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions)
         return Evaluation(report, self.gallery.views(), tuple(self.meshes[name] for name in self.truths))
 
+    def _head_shown(self, skinned: Float[Tensor, "V 3"], view: View) -> Bool[Tensor, "H W"] | None:
+        """Return the pixels that show the head of the skinned template; None for a body without a head."""
+        if self._template_head is None:
+            return None
+        rig = self.sequence.rig
+        return head_shown(_mesh(skinned, rig), self._template_head, view.camera).to(self.sequence.device)
+
     def _see(
-        self, name: str, posed: PosedAvatar, index: int, *, view: View, frame: int, head: Box | None
+        self,
+        name: str,
+        posed: PosedAvatar,
+        index: int,
+        view: View,
+        frame: int,
+        head: tuple[Box | None, Bool[Tensor, "H W"] | None],
     ) -> UInt8[np.ndarray, "H W 3"]:
         """Draw one view of a model and compare it, for every set that has the view; return the picture."""
         background = self.sequence.background
         drawn = render_view(posed, index, view, background, eps2d=self.config.eps2d)
-        quality = view_quality(view, drawn.image, drawn.alpha, background, head=head, metric=self.metric)
+        quality = view_quality(
+            view, drawn.image, drawn.alpha, background, head=head[0], head_pixels=head[1], metric=self.metric
+        )
         for part in self._sets_of(view, frame):
             self.views[name][part][view_key(view.name, frame)] = quality
         return eight_bit(drawn.image).numpy()

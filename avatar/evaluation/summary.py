@@ -98,6 +98,7 @@ def image_table(report: EvalReport, name: str, *, refined: bool = False) -> Figu
         Column(f"perceptual{SPREAD}", SPREAD_TITLE, "whole image", 4),
         Column("psnr_head", "PSNR", "head", 2, "higher"),
         Column(f"psnr_head{SPREAD}", SPREAD_TITLE, "head", 2),
+        Column("psnr_head_alone", "alone", "head", 2, "higher"),
         Column("ssim_head", "SSIM", "head", 4, "higher"),
         Column("perceptual_head", metric, "head", 4, "lower"),
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
 from avatar.data.views import View
@@ -17,6 +17,8 @@ from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
 from avatar.losses.psnr import psnr_from_mse
 from avatar.losses.ssim import ssim
 from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
 OPACITY_THRESHOLD = 0.02
@@ -27,7 +29,8 @@ CONVENTION = (
     "PSNR: over pixels where mask or rendered opacity exceed 0.02. Image: over all pixels. "
     "SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, mean over all pixels. "
     "Head: the box of the head's vertices as the skinned template projects them, 8 % wider on every side; PSNR of the "
-    "first kind within it, SSIM of the crop as an image of its own."
+    "first kind within it, SSIM of the crop as an image of its own; collar and shoulders are in it. "
+    "Head alone: PSNR over the pixels of the first kind where the skinned template shows its head."
 )
 PERCEPTUAL_CONVENTION = "of the whole image, and of the head's crop where it has at least 32 pixels a side."
 Box = tuple[int, int, int, int]
@@ -45,6 +48,7 @@ class ViewQuality:
         ssim_head: SSIM of the box alone, zero padded as an image is; None as `psnr_head`.
         perceptual: distance of the whole composited images; None without a metric.
         perceptual_head: of the box alone; None too where it is under 32 pixels a side.
+        psnr_head_alone: as `psnr`, over the pixels that show the head; None where none does.
     """
 
     psnr: float
@@ -54,6 +58,7 @@ class ViewQuality:
     ssim_head: float | None = None
     perceptual: float | None = None
     perceptual_head: float | None = None
+    psnr_head_alone: float | None = None
 
 
 def view_quality(
@@ -63,6 +68,7 @@ def view_quality(
     background: Float32[Tensor, " 3"],
     *,
     head: Box | None,
+    head_pixels: Bool[Tensor, "H W"] | None = None,
     metric: PerceptualDistance | None = None,
 ) -> ViewQuality:
     """Compare a rendered image with the view's.
@@ -70,20 +76,22 @@ def view_quality(
     Args:
         image: sRGB, clamped to [0, 1] here as a screen would. alpha: rendered opacity.
         background: sRGB that both are on.
-        head: x0, y0, x1, y1 in pixels.
+        head: x0, y0, x1, y1 in pixels. head_pixels: those that show the head, see `head_shown`.
         metric: perceptual distance to measure too.
     """
     real = view.composited(background)
     image = image.clamp(0.0, 1.0)
     error = (image - real).square()
     person = (view.opacity() > OPACITY_THRESHOLD) | (alpha > OPACITY_THRESHOLD)
-    psnr_head = ssim_head = perceptual_head = None
+    psnr_head = ssim_head = perceptual_head = psnr_head_alone = None
     if head is not None:
         part = (slice(head[1], head[3]), slice(head[0], head[2]))
         if bool(person[part].any()):
             psnr_head = psnr_from_mse(float(error[part][person[part]].mean()))
             ssim_head = float(ssim(image[part].contiguous(), real[part].contiguous()))
             perceptual_head = _distance(metric, image[part], real[part])
+    if head_pixels is not None and bool((alone := person & head_pixels).any()):
+        psnr_head_alone = psnr_from_mse(float(error[alone].mean()))
     return ViewQuality(
         psnr=psnr_from_mse(float(error[person].mean())),
         psnr_image=psnr_from_mse(float(error.mean())),
@@ -92,6 +100,7 @@ def view_quality(
         ssim_head=ssim_head,
         perceptual=_distance(metric, image, real),
         perceptual_head=perceptual_head,
+        psnr_head_alone=psnr_head_alone,
     )
 
 
@@ -142,6 +151,12 @@ def head_box(points: Float[np.ndarray, "N 3"], camera: Camera) -> Box | None:
     x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
     x1, y1 = np.minimum(np.ceil(high + margin), (camera.width, camera.height)).astype(int)
     return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None
+
+
+def head_shown(mesh: TriangleMesh, head: Bool[np.ndarray, " F"], camera: Camera) -> Bool[Tensor, "H W"]:
+    """Return the pixels whose nearest face of a posed mesh is one of its head's."""
+    face = rasterize_mesh(mesh, camera).face_id
+    return torch.from_numpy((face >= 0) & head[np.maximum(face, 0)])
 
 
 def eight_bit(image: Float32[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:

@@ -10,7 +10,9 @@ import torch
 
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
-from avatar.metrics.view_quality import ViewQuality, eight_bit, mean_quality, view_quality
+from avatar.metrics.view_quality import ViewQuality, eight_bit, head_shown, mean_quality, view_quality
+from smplxpp.core.camera import Camera
+from smplxpp.core.mesh import TriangleMesh
 from tests.dolls.standing import doll
 
 BLACK = torch.zeros(3)
@@ -52,6 +54,36 @@ def test_colours_outside_the_screen_are_clamped_first():
     it = view()
     image = it.composited(BLACK) - (it.opacity() == 0)[..., None] * 3.0
     assert view_quality(it, image, it.opacity(), BLACK, head=None).psnr_image == pytest.approx(120.0)
+
+
+def test_the_head_alone_counts_neither_its_box_nor_what_is_not_the_person():
+    it = view()
+    person = it.opacity() > 0.02
+    shown = torch.zeros_like(person)
+    shown[10:40, 10:40] = True
+    real = it.composited(BLACK)
+    beside = torch.where((person & ~shown)[..., None], 0.5, real)
+    quality = view_quality(it, beside, it.opacity(), BLACK, head=(5, 5, 50, 50), head_pixels=shown)
+    assert quality.psnr_head_alone == pytest.approx(120.0) and quality.psnr_head < 40.0
+    off = torch.where((person & shown)[..., None], real + torch.where(real > 0.5, -0.1, 0.1), real)
+    quality = view_quality(it, off, it.opacity(), BLACK, head=None, head_pixels=shown)
+    assert quality.psnr_head_alone == pytest.approx(20.0, abs=1e-4) and quality.psnr_head is None
+    nothing = torch.zeros_like(person)
+    assert view_quality(it, off, it.opacity(), BLACK, head=None, head_pixels=nothing).psnr_head_alone is None
+
+
+def test_the_head_is_shown_where_its_faces_are_nearest():
+    # Two squares in front of a camera that looks along z: the nearer one hides the left half of the farther one.
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    far = np.column_stack((0.8 * corners, np.full(4, 2.0)))
+    near = np.column_stack((0.2 * corners - (0.2, 0.0), np.full(4, 1.0)))
+    square = np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = TriangleMesh(np.concatenate((far, near)), np.concatenate((square, square + 4)))
+    camera = Camera(np.array([[50.0, 0, 25], [0, 50, 25], [0, 0, 1]]), np.eye(4), 50, 50)
+    head = head_shown(mesh, np.array([True, True, False, False]), camera).numpy()
+    assert head[25, 35] and not head[25, 15] and not head[25, 2]
+    assert not head_shown(mesh, np.array([False] * 4), camera).any()
+    assert head_shown(mesh, np.array([True] * 4), camera).numpy()[25, 15]
 
 
 def test_means_are_over_the_views_that_have_a_figure():

@@ -26,12 +26,14 @@ def _places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 
 def with_foreign_numbers(record: StageRecord, count: int, *, seed: int = 0) -> Iterator[StageRecord]:
-    """The record as it would be read with one entry missing or of another kind: so many of all that there are."""
+    """The record as it would be read with one entry missing or of another kind: so many, of all parts alike."""
     draw = random.Random(seed)
-    places = list(_places(record.manifest["numbers"]))
+    places: dict[Any, list[tuple[Any, ...]]] = {}
+    for path in _places(record.manifest["numbers"]):
+        places.setdefault(path[0], []).append(path)
     for _ in range(count):
         numbers = copy.deepcopy(record.manifest["numbers"])
-        *above, last = draw.choice(places)
+        *above, last = draw.choice(places[draw.choice(list(places))])
         holder = numbers
         for key in above:
             holder = holder[key]

@@ -157,7 +157,7 @@ def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path
 def test_numbers_of_another_program_are_told_in_the_place_of_the_sections(evaluated):
     record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
     for make in (evaluation_figures, evaluation_views):
-        read, told = sections_of(with_foreign_numbers(record, 20), make, evaluation_key_numbers)
+        read, told = sections_of(with_foreign_numbers(record, 60), make, evaluation_key_numbers)
         assert read and told
 
 
