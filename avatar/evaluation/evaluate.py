@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
+from avatar.evaluation.as_new import AsNew, new_motion
 from avatar.evaluation.gallery import Gallery, ShownSurface, ShownView
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
@@ -290,7 +291,7 @@ def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
 
 def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
     """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
-    motion = sequence.motion(frame)
+    motion = new_motion(sequence, frame) if isinstance(model, AsNew) else sequence.motion(frame)
     if model.rig.template is sequence.rig.template:
         return motion if simulates(model) else motion.without_cloth()
     return model.rig.motion(_params(sequence, frame), frame=motion.frame)
@@ -301,7 +302,8 @@ def simulates(model: AvatarModel) -> bool:
 
     Gaussians that follow the joints alone are the baseline that simulation is held against.
     """
-    return isinstance(model, Student) and model.field is not None
+    shown = model.model if isinstance(model, AsNew) else model
+    return isinstance(shown, Student) and shown.field is not None
 
 
 def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -> None:

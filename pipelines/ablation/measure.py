@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor, nn
 
+from avatar.evaluation.as_new import AsNew
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.report import EvalReport, view_key
-from avatar.rig.posed import AvatarModel, PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.posed import AvatarModel
 from pipelines.ablation.rows import Row
 from pipelines.figures import encode_png
 from pipelines.runs.digests import TRAINING
@@ -47,19 +46,6 @@ class RowResult:
     folder: Path
     seconds: float
     iterations: int
-
-
-class WithoutCode(nn.Module):
-    """An avatar that shows every frame as it shows new poses, as it does online."""
-
-    rig: Rig
-
-    def __init__(self, model: AvatarModel) -> None:
-        super().__init__()
-        self.model, self.rig = model, model.rig
-
-    def forward(self, motion: Motion, camera_centers: Tensor) -> PosedAvatar:
-        return self.model(motion.without_code(), camera_centers)
 
 
 def closure(stage: ModelStage) -> list[ModelStage]:
@@ -123,7 +109,7 @@ def measure_row(
         player = folder / PLAYER_FILE
         model.write_player(player, trainer.model(model))
         loaded = model.read_by(trainer, player)
-        shown: AvatarModel = WithoutCode(loaded) if row.null_code else loaded
+        shown: AvatarModel = AsNew(loaded) if row.null_code else loaded
         evaluation = evaluate_models(
             {row.title: shown},
             clothed_sequence(trainer, CLOTHED, simulated),

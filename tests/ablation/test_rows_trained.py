@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.evaluation.as_new import AsNew
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
@@ -17,7 +18,6 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.processes import Distributed
 from pipelines.ablation import measure
 from pipelines.ablation.ablate import AblationRun, ablate
-from pipelines.ablation.measure import WithoutCode
 from pipelines.ablation.rows import PAPER_ROWS, PRUNED_SHARE, ablation_rows, ablation_stages
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.models import Trainer, TrainOptions
@@ -178,7 +178,7 @@ def test_a_pruned_student_is_smaller_and_the_null_codes_row_is_full_told_nothing
     camera_centers = torch.tensor([[0.0, 0.5, 2.0]])
     with torch.no_grad():
         full.codes.codes += 1.0  # three steps leave most of them at zero
-        null, known = WithoutCode(full)(motion, camera_centers), full(motion, camera_centers)
+        null, known = AsNew(full)(motion, camera_centers), full(motion, camera_centers)
         assert torch.equal(null.vertices, full(motion.without_code(), camera_centers).vertices)
     assert not torch.equal(null.vertices, known.vertices)
 

@@ -7,10 +7,18 @@ import shutil
 
 import pytest
 
+from avatar import EvaluationConfig
+from avatar.data.cloth_motion import ClothMotions
+from avatar.data.sequence import AvatarSequence
+from avatar.evaluation.as_new import AsNew
+from avatar.evaluation.evaluate import evaluate_models
 from pipelines.runs.layout import GARMENTS, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.stage import read_manifest
+from pipelines.stages.evaluate import load_model
+from pipelines.stages.evaluate_config import MODEL_FILES
 from smplxpp.body import load_params
-from smplxpp.cloth.garment_file import save_garments
+from smplxpp.capture import open_capture
+from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import PART, person
 from tests.dolls.skirted import garment, write_skirted
@@ -89,3 +97,24 @@ def test_a_damaged_file_of_garments_is_refused(trained, capture, tmp_path, capsy
     run = shutil.copytree(trained, tmp_path / "run")
     (run / GARMENTS).write_bytes(b"not a file of garments")
     assert "Train again" in refused(capsys, run, capture, *FEW)
+
+
+def test_a_student_shown_as_new_is_itself_in_new_poses_and_simulated_in_those_of_the_training(trained, capture):
+    opened = open_capture(capture)
+    motions = ClothMotions(
+        person(),
+        load_garments(trained / GARMENTS, person()),
+        params=opened.params,
+        frames=opened.frames,
+        fps=opened.fps,
+    )
+    sequence = AvatarSequence(opened, person(), cloth=motions)
+    student = load_model("student", trained / MODEL_FILES["student"], sequence.rig)
+    config = EvaluationConfig(metric="none", samples=4000, speed_pictures=0, shown=0)
+    report = evaluate_models({"own": student, "as new": AsNew(student)}, sequence, config).report
+    own, new = report.models["own"], report.models["as new"]
+    assert new.views["novel_pose"] == own.views["novel_pose"] and new.surfaces["held_out"] == own.surfaces["held_out"]
+    still = evaluate_models({"as new": AsNew(student)}, AvatarSequence(opened, person()), config).report.models[
+        "as new"
+    ]
+    assert new.views["novel_view"] not in (own.views["novel_view"], still.views["novel_view"])
