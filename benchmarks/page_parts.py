@@ -68,7 +68,7 @@ PARTS = (
     Part("detection_masks_person", "Masks of the embedded person", MASKS),
     Part(
         "ablation_woman_casual_every_frame",
-        "Full against trained skinning on a synthetic woman",
+        "Rows of the ablation on a synthetic woman, every held-out frame",
         WOMAN + EVERY_FRAME + "The perceptual distance is ST-LPIPS, which is not LPIPS.",
         ablation_lines,
     ),
