@@ -138,7 +138,6 @@ class _Run:
         self.gallery = Gallery(sets, config.shown)
         self.meshes: dict[str, ShownSurface] = {}
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
-        self._template_head = _faces_of_head(sequence.rig)
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
         self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
 
@@ -204,10 +203,15 @@ class _Run:
 
     def _head_shown(self, skinned: Float[Tensor, "V 3"], view: View) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the head of the skinned template; None for a body without a head."""
-        if self._template_head is None:
-            return None
         rig = self.sequence.rig
-        return head_shown(_mesh(skinned, rig), self._template_head, view.camera).to(self.sequence.device)
+        head = self._faces_of_head(rig)
+        return None if head is None else head_shown(_mesh(skinned, rig), head, view.camera).to(rig.device)
+
+    def _faces_of_head(self, rig: Rig) -> Bool[np.ndarray, " F"] | None:
+        """Return `_faces_of_head` of a rig, found once."""
+        if id(rig) not in self._head_faces:
+            self._head_faces[id(rig)] = _faces_of_head(rig)
+        return self._head_faces[id(rig)]
 
     def _see(
         self,
@@ -240,13 +244,11 @@ class _Run:
         return [part for part, one in self.sets.items() if (view.name, frame) in one.views]
 
     def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
-        if id(rig) not in self._head_faces:
-            self._head_faces[id(rig)] = _faces_of_head(rig)
         return surface_quality(
             mesh,
             rig.template.vertex_labels,
             truth,
-            head=self._head_faces[id(rig)],
+            head=self._faces_of_head(rig),
             samples=self.config.samples,
             seed=self.config.seed,
         )

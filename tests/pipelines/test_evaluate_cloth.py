@@ -114,7 +114,6 @@ def test_a_student_shown_as_new_is_itself_in_new_poses_and_simulated_in_those_of
     report = evaluate_models({"own": student, "as new": AsNew(student)}, sequence, config).report
     own, new = report.models["own"], report.models["as new"]
     assert new.views["novel_pose"] == own.views["novel_pose"] and new.surfaces["held_out"] == own.surfaces["held_out"]
-    still = evaluate_models({"as new": AsNew(student)}, AvatarSequence(opened, person()), config).report.models[
-        "as new"
-    ]
+    plain = AvatarSequence(opened, person())
+    still = evaluate_models({"as new": AsNew(student)}, plain, config).report.models["as new"]
     assert new.views["novel_view"] not in (own.views["novel_view"], still.views["novel_view"])
