@@ -44,8 +44,7 @@ ABLATION_OF_DEMO = (
     f"{TRACKED_INPUTS} The embedded person (`data/fixtures/person`), preset `demo`, 22k Gaussians: 13 frames of 7 "
     "cameras are trained on. Thirteen images of one camera carry the novel views, three the novel poses, and the "
     "surface of a single held-out frame is known: differences of a tenth of a decibel say nothing. Minutes are of a "
-    "shared machine. The perceptual distance is ST-LPIPS, which is not LPIPS. In the row `null code` no clothes were "
-    "simulated yet."
+    "shared machine. The perceptual distance is ST-LPIPS, which is not LPIPS."
 )
 DISTILLATION = (
     "The paper's own distillation, in which the student learns from the teacher's images, with L_non to the teacher "
