@@ -8,8 +8,8 @@ from benchmarks.page_tables import reconstruction_lines, registration_lines
 from benchmarks.page_trainings import ablation_lines, build_lines, training_lines
 from benchmarks.page_words import (
     ABLATION_OF_DEMO,
+    ABLATION_OF_WOMAN,
     DETECTION,
-    EVERY_FOURTH,
     EVERY_FRAME,
     FOLLOWED,
     MASKS,
@@ -73,12 +73,6 @@ PARTS = (
         ablation_lines,
     ),
     Part(
-        "ablation_woman_casual",
-        "Ablation on a synthetic woman",
-        WOMAN + EVERY_FOURTH + "No perceptual distance was measured. Templates had the scan's webs still.",
-        ablation_lines,
-    ),
-    Part(
         "training_woman_casual_cpu",
         "Training on a synthetic woman",
         WOMAN + EVERY_FRAME + "The perceptual distance is ST-LPIPS, which is not LPIPS.",
@@ -108,6 +102,12 @@ PARTS = (
         "ablation_person_demo_tracked",
         "Ablation on the embedded person, all rows: tracked inputs",
         ABLATION_OF_DEMO,
+        ablation_lines,
+    ),
+    Part(
+        "ablation_woman_casual_demo_tracked",
+        "Rows of the ablation on a synthetic woman, preset `demo`: tracked inputs",
+        ABLATION_OF_WOMAN,
         ablation_lines,
     ),
     Part(

@@ -22,7 +22,7 @@ from avatar.training.presets import TrainingPreset
 from pipelines.ablation.measure import PICTURES, closure, measure_row
 from pipelines.ablation.rows import Row, ablation_stages
 from pipelines.ablation.table import AblationResult, ablation_table, row_figures
-from pipelines.figures import caption, encode_png, row
+from pipelines.figures import caption, contact_sheet, encode_png
 from pipelines.runs.layout import ABLATION
 from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
@@ -33,6 +33,8 @@ from smplxpp.core.files.image_file import open_image
 from smplxpp.core.files.json_values import jsonable
 
 RESULTS_FILE = "results.json"
+COLUMNS = 7
+"""Pictures beside each other in a sheet of rows: all of them in one line could be read by scrolling alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +180,13 @@ def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiti
     if result.rows:
         for suffix, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label="tab:ablation"))):
             atomic_write_text(folder / f"table.{suffix}", text)
-        _write_strips(folder, result)
+        _write_sheets(folder, result)
     atomic_write_text(folder / RESULTS_FILE, json.dumps(results, indent=1))
     return AblationOutcome(folder, table, results, waiting)
 
 
-def _write_strips(folder: Path, result: AblationResult) -> None:
-    """A strip a view: the photograph, then what each row shows, under their titles."""
+def _write_sheets(folder: Path, result: AblationResult) -> None:
+    """A sheet a view: the photograph, then what each row shows, under their titles."""
     first = next(iter(result.rows))
     for path in sorted(result.rows[first].folder.glob("*.png")):
         pictures: list[np.ndarray] = []
@@ -197,7 +199,7 @@ def _write_strips(folder: Path, result: AblationResult) -> None:
                 pictures.append(caption(photograph, "photograph"))
             pictures.append(caption(rendered, one.row.title))
         (folder / PICTURES).mkdir(exist_ok=True)
-        atomic_write_bytes(folder / PICTURES / path.name, encode_png(row(pictures, gap=4)))
+        atomic_write_bytes(folder / PICTURES / path.name, encode_png(contact_sheet(pictures, columns=COLUMNS, gap=4)))
 
 
 def _read(path: Path) -> np.ndarray:

@@ -40,7 +40,7 @@ def finished(tmp_path_factory, capture):
     return run
 
 
-def test_table_figures_and_pictures(finished, capsys, capture):
+def test_table_figures_and_pictures(finished, capsys, capture, monkeypatch):
     folder = finished / "ablation"
     with open(folder / "table.csv") as file:
         rows = list(csv.DictReader(file))
@@ -59,12 +59,16 @@ def test_table_figures_and_pictures(finished, capsys, capture):
         shown = np.asarray(strip)[:HEIGHT, :WIDTH]
     with Image.open(capture / "rgbs" / "Held" / "Held_rgb000004.png") as photograph:
         assert np.array_equal(shown, np.asarray(photograph))
-    # The same again trains nothing, and prints the same table.
+    # The same again trains nothing, and prints the same table; its pictures go on in a second line where one is full.
+    monkeypatch.setattr("pipelines.ablation.ablate.COLUMNS", 2)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("manifest.json")}
     capsys.readouterr()
     assert ablate(finished, capture) == 0
     assert "w/o Gau Non." in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("manifest.json")}
+    with Image.open(folder / "pictures" / "novel_pose_Held_000004.png") as sheet:
+        assert sheet.width == 2 * WIDTH + 4 and sheet.height > 2 * HEIGHT
+        assert np.array_equal(np.asarray(sheet)[:HEIGHT, :WIDTH], shown)
 
 
 def test_held_out_poses_that_a_run_refined_are_measured_beside_the_given_ones(tmp_path, capture):
