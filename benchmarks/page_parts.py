@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from benchmarks.page_part import Part
+from benchmarks.page_parts_ablation import ALL_ROWS, TALKING_PERSON, WOMAN_EXACT
 from benchmarks.page_parts_played import PLAYED
 from benchmarks.page_tables import reconstruction_lines, registration_lines
-from benchmarks.page_trainings import ablation_lines, build_lines, training_lines
+from benchmarks.page_trainings import build_lines, training_lines
 from benchmarks.page_words import (
-    ABLATION_OF_DEMO,
-    ABLATION_OF_WOMAN,
     DETECTION,
     EVERY_FRAME,
     FOLLOWED,
@@ -66,12 +65,7 @@ PARTS = (
     ),
     Part("detection_masks_woman_casual", "Masks of a woman in a wide skirt", MASKS),
     Part("detection_masks_person", "Masks of the embedded person", MASKS),
-    Part(
-        "ablation_woman_casual_every_frame",
-        "Rows of the ablation on a synthetic woman, every held-out frame",
-        WOMAN + EVERY_FRAME + "The perceptual distance is ST-LPIPS, which is not LPIPS.",
-        ablation_lines,
-    ),
+    *WOMAN_EXACT,
     Part(
         "training_woman_casual_cpu",
         "Training on a synthetic woman",
@@ -98,18 +92,7 @@ PARTS = (
         training_lines,
     ),
     Part("training_person_demo", "Training of `make demo`", PERSON, training_lines),
-    Part(
-        "ablation_person_demo_tracked",
-        "Ablation on the embedded person, all rows: tracked inputs",
-        ABLATION_OF_DEMO,
-        ablation_lines,
-    ),
-    Part(
-        "ablation_woman_casual_demo_tracked",
-        "Rows of the ablation on a synthetic woman, preset `demo`: tracked inputs",
-        ABLATION_OF_WOMAN,
-        ablation_lines,
-    ),
+    *ALL_ROWS,
     Part(
         "cloth_from_pose_woman_casual",
         "What a pose tells of a skirt",
@@ -122,19 +105,7 @@ PARTS = (
         TALKING + MOTION_CODES + " The shirt is simulated by the house's own solver, as in the capture's making: that "
         "row says how far the template's garment carries, not how far real cloth is from ours.",
     ),
-    Part(
-        "ablation_talking",
-        "Forty seconds of talking: the student against trained skinning",
-        TALKING + "Measured on every trained-on and every held-out frame of the held-out camera. The perceptual "
-        "distance is ST-LPIPS, which is not LPIPS. No surface was measured.",
-        ablation_lines,
-    ),
-    Part(
-        "ablation_talking_tracked",
-        "Forty seconds of talking, tracked: the student against trained skinning",
-        TALKING.replace("exact inputs", "inputs as trackers give them, registered and refined") + "Measured as above.",
-        ablation_lines,
-    ),
+    *TALKING_PERSON,
     Part(
         "held_out_poses_talking",
         "Forty seconds of talking: what the student's pictures of new poses hang on",

@@ -36,18 +36,6 @@ TRACKED_INPUTS = (
     "**Nothing here is exact**: body parameters as a tracker gives them, estimated labels, normals estimated or none, "
     "as the words below say."
 )
-ABLATION_OF_DEMO = (
-    f"{TRACKED_INPUTS} The embedded person (`data/fixtures/person`), preset `demo`, 22k Gaussians: 13 frames of 7 "
-    "cameras are trained on. Thirteen images of one camera carry the novel views, three the novel poses, and the "
-    "surface of a single held-out frame is known: differences of a tenth of a decibel say nothing. Minutes are of a "
-    "shared machine. The perceptual distance is ST-LPIPS, which is not LPIPS."
-)
-ABLATION_OF_WOMAN = (
-    f"{TRACKED_INPUTS} The capture `woman_casual` after `smplxpp capture degrade`, registered and refined; 12 cameras "
-    "and 48 frames are trained on. Preset `demo`, 22k Gaussians, so that all rows take two hours of one core: what "
-    "tells rows apart, not how good they get. Every second frame is measured: 48 images carry the novel views, 12 the "
-    "novel poses. The perceptual distance is ST-LPIPS, which is not LPIPS."
-)
 DISTILLATION = (
     "The paper's own distillation, in which the student learns from the teacher's images, with L_non to the teacher "
     "and with L_sem, is behind the figures of `paper-small` alone; the preset `paper` was never trained by us."
