@@ -14,7 +14,8 @@ _DEMO = (
 _EMBEDDED = (
     "The embedded person (`data/fixtures/person`), preset `demo`, 22k Gaussians: 13 frames of 7 cameras are trained "
     "on. Thirteen images of one camera carry the novel views, three the novel poses, and the surface of a single "
-    f"held-out frame is known: differences of a tenth of a decibel say nothing. Minutes are of a shared machine. {_METRIC}"
+    "held-out frame is known: differences of a tenth of a decibel say nothing. Minutes are of a shared machine. "
+    f"{_METRIC}"
 )
 _EXACT = "All inputs are exact. "
 _BEHIND = (
@@ -47,8 +48,8 @@ ALL_ROWS = (
         "ablation_woman_casual_demo_tracked",
         "Rows of the ablation on a synthetic woman, preset `demo`: tracked inputs",
         f"{TRACKED_INPUTS} The capture `woman_casual` after `smplxpp capture degrade`, registered and refined; 12 "
-        f"cameras and 48 frames are trained on. {_DEMO}Every second frame is measured: 48 images carry the novel views, 12 "
-        f"the novel poses. {_METRIC}",
+        f"cameras and 48 frames are trained on. {_DEMO}Every second frame is measured: 48 images carry the novel "
+        f"views, 12 the novel poses. {_METRIC}",
         ablation_lines,
     ),
     Part(
