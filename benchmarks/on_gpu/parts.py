@@ -22,14 +22,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 
 from benchmarks.on_gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
+from benchmarks.on_gpu.views import enlarge, fitted
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.capture import open_capture
-from smplxpp.core.camera import Camera
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.template.template import Template
@@ -99,6 +97,24 @@ def template(job: Job, note: Note) -> None:
     note(faces=len(_template(job).faces))
 
 
+def demo(job: Job, note: Note) -> None:
+    """The preset `demo`: a surface that is followed, loose clothes that are simulated; and its evaluation."""
+    begin = time.perf_counter()
+    size = ("--iterations-share", 0.01) if job.toy else ()
+    answer = _train(job, "demo", "demo", "--cloth", "auto", *size)
+    note(**_stages(answer), seconds=time.perf_counter() - begin, **_memory(job))
+    begin = time.perf_counter()
+    views = ("--every", 8, "--samples", 300) if job.toy else ()
+    run = ("evaluate", job.work / "demo", "--capture", job.capture, "--device", job.device, "--no-report")
+    report = command(*run, *views)
+    student = report["models"]["student"]
+    note(
+        views={name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
+        counts=student["counts"],
+        seconds_of_evaluation=time.perf_counter() - begin,
+    )
+
+
 def fit(job: Job, note: Note) -> None:
     """The reference fit."""
     size = ("--gaussians", 300, "--iterations", 2) if job.toy else ("--max-minutes", 0.6 * job.seconds / 60)
@@ -111,7 +127,7 @@ def training(job: Job, note: Note) -> None:
     """The preset `gpu` from the fit to the student: once for its steps' speed, then as long as the time allows."""
     preset, first = ("demo", 1e-9) if job.toy else ("gpu", 5e-4)
     begin = time.perf_counter()
-    short = _train(job, "training_short", preset, "--iterations-share", first)
+    short = _train(job, "training_short", preset, "--cloth", "none", "--iterations-share", first)
     seconds = time.perf_counter() - begin
     note(preset=preset, short=_stages(short) | {"share": first, "seconds": seconds}, **_memory(job))
     if job.toy:
@@ -122,7 +138,7 @@ def training(job: Job, note: Note) -> None:
     if share <= first:
         note(longer="no time left")
         return
-    longer = _train(job, "training", preset, "--iterations-share", share)
+    longer = _train(job, "training", preset, "--cloth", "none", "--iterations-share", share)
     note(longer=_stages(longer) | {"share": share, "finished": longer["finished"]}, **_memory(job))
 
 
@@ -131,7 +147,7 @@ def paper_step(job: Job, note: Note) -> None:
     size, preset = ((60, 80), "demo") if job.toy else ((1500, 2000), "paper")
     capture = enlarge(job.capture, job.work / "large", size)
     note(preset=preset, width=size[0], height=size[1])
-    answer = _train(replace(job, capture=capture), "paper", preset, "--iterations-share", 1e-9)
+    answer = _train(replace(job, capture=capture), "paper", preset, "--cloth", "none", "--iterations-share", 1e-9)
     note(**_stages(answer), **_memory(job))
 
 
@@ -170,7 +186,7 @@ def student(job: Job, note: Note) -> None:
                 rows[name]["graph_error"] = str(error)[:500]
         for way, work in ways.items():
             for width, height in sizes:
-                seen = _fitted(camera, width, height)
+                seen = fitted(camera, width, height)
                 rows[name][f"{way} {width}x{height}"] = frames_a_second(work, motions, seen, pictures=pictures)
                 note(rows=rows)
     note(rows=rows, **_memory(job))
@@ -202,7 +218,7 @@ def nccl(job: Job, note: Note) -> None:
 
 
 PARTS: dict[str, Callable[[Job, Note], None]] = {
-    part.__name__: part for part in (mapping, template, fit, training, paper_step, student, nccl)
+    part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl)
 }
 """In the order of what matters."""
 
@@ -225,60 +241,13 @@ def command(*arguments: object) -> dict[str, Any]:
     return answer
 
 
-def enlarge(source: Path, folder: Path, size: tuple[int, int], *, frames: int = 2, cameras: int = 3) -> Path:
-    """A few views of a capture, cut to the shape of `size` (width, height) and enlarged to it, in our own layout.
-
-    The last camera is held out.
-    """
-    capture = open_capture(source)
-    about: dict[str, Any] = {"cameras": []}
-    chosen = [*capture.splits.train_cameras[: cameras - 1], *capture.splits.novel_view_cameras[:1]]
-    shown = capture.splits.train_frames[:frames]
-    for name in chosen:
-        box, camera = _cut(capture.cameras[name], size)
-        for frame in shown:
-            pictures = {"rgb": capture.image(name, frame), "mask": capture.mask(name, frame)}
-            for tag, image in pictures.items():
-                assert image is not None, f"{name} has no mask of frame {frame}"
-                path = folder / f"{tag}s" / name / f"{name}_{tag}{frame:06d}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                eight = image if image.dtype == np.uint8 else np.round(255.0 * image).astype(np.uint8)
-                Image.fromarray(eight).crop(box).resize(size, Image.Resampling.BICUBIC).save(path)
-        R, T = camera.cam_from_world[:3, :3].tolist(), camera.cam_from_world[:3, 3].tolist()
-        about["cameras"].append({"name": name, "w": size[0], "h": size[1], "K": camera.K.tolist(), "R": R, "T": T})
-    (folder / "params").mkdir(parents=True, exist_ok=True)
-    for frame in shown:
-        params = capture.params(frame)
-        assert params is not None
-        params.save(folder / "params" / f"{frame:06d}.npz")
-    atomic_write_text(folder / "cameras.json", json.dumps(about))
-    atomic_write_text(folder / "capture.json", json.dumps({"name": "large", "novel_views": chosen[cameras - 1 :]}))
-    return folder
-
-
-def _cut(camera: Camera, size: tuple[int, int]) -> tuple[tuple[int, int, int, int], Camera]:
-    """The largest box (left, top, right, bottom) with the shape of `size`, and the camera of it, enlarged."""
-    unit = min(camera.width / size[0], camera.height / size[1])
-    width, height = round(unit * size[0]), round(unit * size[1])
-    left, top = (camera.width - width) // 2, (camera.height - height) // 2
-    K = camera.K.copy()
-    K[:2, 2] -= left, top
-    K[:2] *= np.array([[size[0] / width], [size[1] / height]])
-    return (left, top, left + width, top + height), replace(camera, K=K, width=size[0], height=size[1])
-
-
-def _fitted(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with the largest part of its image that has the shape of another size."""
-    return _cut(camera, (width, height))[1]
-
-
 def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]:
     """A training in a run of its own with the template of the job's."""
     run = job.work / name
     (run / TEMPLATE).parent.mkdir(parents=True, exist_ok=True)
     (run / TEMPLATE).write_bytes((job.run / TEMPLATE).read_bytes())
     toy = ("--gaussians", 300) if job.toy else ()
-    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report", "--cloth", "none")
+    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report")
     return command("train", *where, "--preset", preset, *toy, *options)
 
 

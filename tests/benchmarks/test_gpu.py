@@ -10,7 +10,8 @@ import torch
 
 from benchmarks import gpu
 from benchmarks.gpu import GpuBenchmark, run_part
-from benchmarks.on_gpu.parts import PARTS, Job, enlarge
+from benchmarks.on_gpu.parts import PARTS, Job
+from benchmarks.on_gpu.views import enlarge
 from smplxpp.capture import open_capture
 from tests.dolls.dancing import write_dance, write_dance_run
 
@@ -43,6 +44,12 @@ def test_every_part_has_a_share_of_the_time():
 
 def test_the_fit_is_measured(job):
     assert found_by("fit", job)["iterations_done"] == 2
+
+
+def test_the_demo_is_trained_and_measured(job):
+    found = found_by("demo", job)
+    assert list(found["stages"]) == ["fit", "teacher", "cloth", "bake", "compensate"]
+    assert found["counts"]["novel_view"]["images"] >= 1 and found["views"]["novel_pose"]["psnr"] > 0
 
 
 @pytest.mark.parametrize("part", ["training", "paper_step"])
