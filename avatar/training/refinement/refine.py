@@ -39,7 +39,7 @@ class Refinement:
         before, after: loss of every frame with the final colours, 0 to 1 (`Photometer.firm_loss`).
         turned: degrees that each of the joints has turned, `joints` their names. moved: millimetres of translation.
         kept: frames that keep their start, which the photographs like better.
-        gaussians: with the colours that were learned.
+        gaussians: with the colours that were learned, on the CPU.
         cameras: corrected `cam_from_world` by name; empty where cameras were taken for right.
         history: what the passes saw.
     """
@@ -69,7 +69,7 @@ def refine_poses(
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
 
     Only training cameras are looked at. The shape of the body is the template's and stays. A frame whose photographs
-    like its start better keeps it.
+    like its start better keeps it. All is computed on the CPU, whatever the sequence's device.
 
     Args:
         sequence: whose parameters are the registered start; its images are read at full size.
@@ -88,7 +88,8 @@ def refine_poses(
     posed = scene.posed
     vertices = posed.place(_state(posed, reference_start), 0).vertices.detach().double().numpy()
     whole = [read_view(sequence.capture, name, first) for name in _cameras(sequence, first)]
-    gaussians = initial_gaussians(sequence.rig, vertices, whole, replace(config.sampling, seed=config.seed))
+    sampling = replace(config.sampling, seed=config.seed)
+    gaussians = initial_gaussians(sequence.rig, vertices, whole, sampling).to(device="cpu")
     progress = _Progress(told, config, len(chosen))
     view = _training_views(sequence)
     begun = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
@@ -112,7 +113,8 @@ def refine_held_out(
     what poses cost and what the model costs.
 
     Args:
-        gaussians: with the colours of a refinement of training frames. frames: some held-out frames, None: all.
+        gaussians: with the colours of a refinement of training frames, on the CPU.
+        frames: some held-out frames, None: all.
 
     Raises:
         InputError: frames that are not held out, none, or one without parameters or photographs.

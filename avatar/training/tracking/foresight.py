@@ -124,9 +124,9 @@ class Foresight:
     fps: float = USUAL_FPS
 
     @property
-    def share(self) -> Float[Tensor, "*K 1 1"]:
+    def share(self) -> Float[Tensor, "K 1 1"] | float:
         """How much of the displacements is simulated; 0 where nothing is."""
-        return torch.zeros(1, 1) if self.simulated is None else self.simulated.share[:, None, None]
+        return 0.0 if self.simulated is None else self.simulated.share[:, None, None]
 
     def start(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return what a frame begins with.

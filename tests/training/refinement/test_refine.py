@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.training.refinement.align import Alignment
 from avatar.training.refinement.config import Level, RefineConfig
@@ -14,6 +15,7 @@ from avatar.training.refinement.refine import Refinement, refine_held_out, refin
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from tests.dolls.gesturing import NOVEL_POSES, disturbed, gestures, sequence, template, write_gestures
+from tests.pretended_cuda import pretended_cuda
 
 CONFIG = RefineConfig(
     sampling=SamplingConfig(count=2500, head_share=None, sh_degree=0, opacity=0.95),
@@ -88,6 +90,16 @@ def test_the_same_seed_gives_the_same_bits(frames):
     for name, array in one.params.as_dict().items():
         np.testing.assert_array_equal(array, two.params.as_dict()[name])
     assert not np.array_equal(one.params.transl, refine_poses(frames, replace(QUICK, seed=1)).params.transl)
+
+
+def test_a_sequence_on_cuda_is_refined_on_the_cpu(frames):
+    with pretended_cuda():
+        moved = AvatarSequence(frames.capture, template(), device="cuda")
+        there = refine_poses(moved, QUICK)
+        apart = refine_held_out(moved, there.gaussians, QUICK)
+    assert there.gaussians.dc.device.type == apart.gaussians.dc.device.type == "cpu"
+    here = refine_poses(frames, QUICK)
+    np.testing.assert_allclose(there.params.body_pose, here.params.body_pose, atol=1e-4)
 
 
 def test_held_out_cameras_are_never_read_and_held_out_frames_are_refused(frames, monkeypatch):
