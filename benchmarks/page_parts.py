@@ -301,8 +301,8 @@ PARTS = (
         "gpu_again",
         "On a GPU: gsplat against the reference, and the preset `demo`",
         "The same kind of machine, two hours later; the parts that are not in the table before. `demo` had 80 "
-        "seconds, of which its fit took 12, its teacher with the surface that it follows 51 and its clothes 0.4; its bake "
-        "was stopped.",
+        "seconds, of which its fit took 12, its teacher with the surface that it follows 51 and its clothes 0.4; its "
+        "bake was stopped.",
     ),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),
     Part("capture_loader", "Reading captures", "Written for the measurement; no data set of others was read."),
