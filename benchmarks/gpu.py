@@ -30,15 +30,16 @@ from benchmarks.on_gpu.parts import PARTS, ROOT, TEMPLATE, Job
 SHARES = {
     "mapping": 2.0,
     "template": 0.7,
-    "demo": 4.0,
+    "demo": 6.0,
     "fit": 1.0,
     "training": 3.0,
     "paper_step": 2.0,
     "student": 1.3,
     "nccl": 0.5,
+    "cpu": 5.0,
 }
 """Of the time, by part: gsplat compiles its kernels in the first."""
-NEEDS_TEMPLATE = ("demo", "fit", "training", "paper_step", "student")
+NEEDS_TEMPLATE = ("demo", "fit", "training", "paper_step", "student", "cpu")
 FAILED, NO_DEVICE = 1, 2
 LAST_WORDS = 2_000
 """Characters of a part's output that are kept when it fails."""
@@ -91,7 +92,8 @@ class GpuBenchmark:
         return 0 if all(result["state"] == "done" for result in figures["parts"].values()) else FAILED
 
     def _store(self, figures: dict[str, Any], work: Path) -> Path:
-        command = f"python -m benchmarks.gpu --minutes {self.minutes:g}" + self.dry_run * " --dry-run"
+        parts = f" --parts {' '.join(self.parts)}" if self.parts else ""
+        command = f"python -m benchmarks.gpu --minutes {self.minutes:g}{parts}" + self.dry_run * " --dry-run"
         return store_results("gpu", command, figures, folder=work if self.dry_run else RESULTS)
 
 

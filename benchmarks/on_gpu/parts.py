@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -26,7 +27,7 @@ import torch
 
 from benchmarks.on_gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
 from benchmarks.on_gpu.views import enlarge, fitted
-from pipelines.runs.layout import TEMPLATE
+from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
 from smplxpp.capture import open_capture
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_values import jsonable
@@ -99,20 +100,12 @@ def template(job: Job, note: Note) -> None:
 
 def demo(job: Job, note: Note) -> None:
     """The preset `demo`: a surface that is followed, loose clothes that are simulated; and its evaluation."""
-    begin = time.perf_counter()
-    size = ("--iterations-share", 0.01) if job.toy else ()
-    answer = _train(job, "demo", "demo", "--cloth", "auto", *size)
-    note(**_stages(answer), seconds=time.perf_counter() - begin, **_memory(job))
-    begin = time.perf_counter()
-    views = ("--every", 8, "--samples", 300) if job.toy else ()
-    run = ("evaluate", job.work / "demo", "--capture", job.capture, "--device", job.device, "--no-report")
-    report = command(*run, *views)
-    student = report["models"]["student"]
-    note(
-        views={name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
-        counts=student["counts"],
-        seconds_of_evaluation=time.perf_counter() - begin,
-    )
+    _to_the_end(job, note, "demo")
+
+
+def cpu(job: Job, note: Note) -> None:
+    """The preset `cpu` on the GPU, in the same way."""
+    _to_the_end(job, note, "cpu")
 
 
 def fit(job: Job, note: Note) -> None:
@@ -218,7 +211,7 @@ def nccl(job: Job, note: Note) -> None:
 
 
 PARTS: dict[str, Callable[[Job, Note], None]] = {
-    part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl)
+    part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl, cpu)
 }
 """In the order of what matters."""
 
@@ -241,11 +234,32 @@ def command(*arguments: object) -> dict[str, Any]:
     return answer
 
 
+def _to_the_end(job: Job, note: Note, preset: str) -> None:
+    """A whole training, and the evaluation of its student."""
+    begin = time.perf_counter()
+    size = ("--iterations-share", 0.01) if job.toy else ()
+    answer = _train(job, preset, "demo" if job.toy else preset, "--cloth", "auto", *size)
+    note(**_stages(answer), seconds=time.perf_counter() - begin, **_memory(job))
+    begin = time.perf_counter()
+    views = ("--every", 8, "--samples", 300) if job.toy else ()
+    run = ("evaluate", job.work / preset, "--capture", job.capture, "--device", job.device, "--no-report")
+    report = command(*run, *views)
+    student = report["models"]["student"]
+    note(
+        views={name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
+        counts=student["counts"],
+        seconds_of_evaluation=time.perf_counter() - begin,
+    )
+
+
 def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]:
-    """A training in a run of its own with the template of the job's."""
+    """A training in a run of its own with the template of the job's, and what a build knows beside it."""
     run = job.work / name
-    (run / TEMPLATE).parent.mkdir(parents=True, exist_ok=True)
-    (run / TEMPLATE).write_bytes((job.run / TEMPLATE).read_bytes())
+    for stage in BUILD_STAGES:
+        if (job.run / stage).is_dir():
+            shutil.copytree(job.run / stage, run / stage, dirs_exist_ok=True)
+    if (job.run / BUILD_FILE).is_file():
+        shutil.copyfile(job.run / BUILD_FILE, run / BUILD_FILE)
     toy = ("--gaussians", 300) if job.toy else ()
     where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report")
     return command("train", *where, "--preset", preset, *toy, *options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -34,6 +35,8 @@ from smplxpp.core.spread import spread
 from smplxpp.core.validation import require_known
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
+
+log = logging.getLogger(__name__)
 
 OUTLINE_FRAMES, OUTLINE_CAMERAS = 16, 4
 """Training frames, and cameras of each, whose masks decide whether a part is simulated."""
@@ -136,20 +139,22 @@ def find_garments(
     if config.parts is not None:
         require_known("loose parts", config.parts, [name for name in template.part_names if name != "body"])
     wanted = clothes if config.parts is None else list(config.parts)
+    if not wanted:
+        return [], [], {}, []
     if reference is None:
-        return [], [], {}, ["the run does not say in which pose its template was scanned: nothing is simulated"]
+        return [], [], {}, [_told("the run does not say in which pose its template was scanned: nothing is simulated")]
     if config.parts is None and track is None:
-        return [], [], {}, ["nothing was followed through the frames: no part is simulated unless it is named"]
+        return [], [], {}, [_told("nothing was followed through the frames: no part is simulated unless it is named")]
     fps = sequence.capture.fps
-    if wanted and track is not None and fps is None:
-        return [], [], {}, ["the capture does not say how many frames a second it has: nothing is simulated"]
+    if track is not None and fps is None:
+        return [], [], {}, [_told("the capture does not say how many frames a second it has: nothing is simulated")]
     garments, found = [], []
     for k, part in enumerate(wanted):
         session.report(Progress(k, len(wanted), 0.0, 0.0))
         try:
             garment = cut_garment(template, part, reference, config.garment)
         except InputError as error:
-            said.append(str(error))
+            said.append(_told(str(error)))
             continue
         if track is not None and fps is not None:
             followed = followed_particles(sequence, track, garment, fps)
@@ -162,6 +167,12 @@ def find_garments(
                 continue
         garments.append(garment)
     return garments, found, outlines, said
+
+
+def _told(sentence: str) -> str:
+    """Warn of what cannot be done: without its simulation a loose part looks worse in every view."""
+    log.warning("loose clothes: %s", sentence)
+    return sentence
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,9 @@ def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     work = tmp_path / "work"
     options = {"capture": job.capture, "run_folder": tmp_path / "none", "work": work, "dry_run": True}
     assert GpuBenchmark(parts=("fit", "nccl"), minutes=15.0, **options).run() == 1
-    stored = json.loads((work / "gpu.json").read_text())["figures"]
+    written = json.loads((work / "gpu.json").read_text())
+    assert written["command"] == "python -m benchmarks.gpu --minutes 15 --parts fit nccl --dry-run"
+    stored = written["figures"]
     assert stored["parts"]["fit"]["state"] == "failed" and "template" in stored["parts"]["fit"]["error"]
     assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]
 

@@ -52,7 +52,7 @@ def test_named_parts_are_simulated_whatever_was_followed(sequence, tmp_path):
         find(sequence, tmp_path, reference=standing(), config=replace(CONFIG, parts=("cape",)))
 
 
-def test_what_cannot_be_done_is_said(sequence, tmp_path):
+def test_what_cannot_be_done_is_said(sequence, tmp_path, caplog):
     nothing = find(sequence, tmp_path, reference=standing())
     assert nothing[0] == [] and "named" in nothing[3][0]
     unknown = find(sequence, tmp_path, track=followed(moved()))
@@ -64,6 +64,8 @@ def test_what_cannot_be_done_is_said(sequence, tmp_path):
     wide = AvatarSequence(sequence.capture, person(tight=False))
     loose = find(wide, tmp_path, track=followed(moved()), reference=standing())
     assert loose[0] == [] and PART in loose[3][0]
+    words = [f"loose clothes: {told[3][0]}" for told in (nothing, unknown, unsaid, loose)]
+    assert [(record.levelname, record.message) for record in caplog.records] == [("WARNING", word) for word in words]
 
 
 def test_outlines_are_of_silhouettes_against_masks(sequence):
