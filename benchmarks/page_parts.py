@@ -300,23 +300,23 @@ PARTS = (
     Part(
         "gpu_again",
         "On a GPU: gsplat against the reference",
-        "The same kind of machine, two hours later. `demo` was stopped in its bake at 80 seconds; it was trained to "
-        "its end after that, below.",
+        "The same kind of machine, two hours later. `demo` was stopped in its bake at 80 seconds; it was trained "
+        "to its end after that, below.",
     ),
     Part(
         "gpu_demo",
         "On a GPU: the preset `demo` to its end",
         "The embedded person, exact inputs, images of 256x320, a template without budgets; the surface is "
-        "followed, the skirt simulated. On a CPU (one thread) the same commands gave 22.93 dB in novel views and 20.68 in "
-        "novel poses. gsplat's kernels were compiled before, in a minute.",
+        "followed, the skirt simulated. On a CPU (one thread) the same commands gave 22.93 dB in novel views and "
+        "20.68 in novel poses. gsplat's kernels were compiled before, in a minute.",
     ),
     Part(
         "gpu_trainings",
         "On a GPU: `demo` and `cpu` without a simulated skirt",
         "As before, but beside the template nothing of its build was known, so that the skirt was not simulated, "
         "neither for the surface that is followed nor in new poses: `demo` loses 1.2 dB of novel views and 1.6 of "
-        "novel poses by that. On a CPU (one thread) the same had 21.72 and 19.07 dB in `demo`, 22.29 and 17.95 in `cpu`, in 20 "
-        "minutes with other jobs beside it.",
+        "novel poses by that. On a CPU (one thread) the same had 21.72 and 19.07 dB in `demo`, 22.29 and 17.95 in "
+        "`cpu`, in 20 minutes with other jobs beside it.",
     ),
     Part("networks", "Networks of teacher and student", "Untrained weights; milliseconds of a pass and of a step."),
     Part("capture_loader", "Reading captures", "Written for the measurement; no data set of others was read."),
