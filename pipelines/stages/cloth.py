@@ -135,26 +135,21 @@ def find_garments(
     template = sequence.rig.template
     said: list[str] = []
     outlines: dict[str, Outlines] = {}
-    clothes = [label.name for label in CLOTH_LABELS if label.name in template.part_names]
     if config.parts is not None:
         require_known("loose parts", config.parts, [name for name in template.part_names if name != "body"])
-    wanted = clothes if config.parts is None else list(config.parts)
-    if not wanted:
-        return [], [], {}, []
-    if reference is None:
-        return [], [], {}, [_told("the run does not say in which pose its template was scanned: nothing is simulated")]
-    if config.parts is None and track is None:
-        return [], [], {}, [_told("nothing was followed through the frames: no part is simulated unless it is named")]
+    wanted = _wanted(template, config)
     fps = sequence.capture.fps
-    if track is not None and fps is None:
-        return [], [], {}, [_told("the capture does not say how many frames a second it has: nothing is simulated")]
+    why = why_none(template, config, pose_known=reference is not None, followed=track is not None, fps=fps)
+    if why is not None or reference is None:
+        return [], [], {}, [] if why is None else [why]
     garments, found = [], []
     for k, part in enumerate(wanted):
         session.report(Progress(k, len(wanted), 0.0, 0.0))
         try:
             garment = cut_garment(template, part, reference, config.garment)
         except InputError as error:
-            said.append(_told(str(error)))
+            said.append(str(error))
+            log.warning("loose clothes: %s", error)
             continue
         if track is not None and fps is not None:
             followed = followed_particles(sequence, track, garment, fps)
@@ -169,10 +164,30 @@ def find_garments(
     return garments, found, outlines, said
 
 
-def _told(sentence: str) -> str:
-    """Warn of what cannot be done: without its simulation a loose part looks worse in every view."""
-    log.warning("loose clothes: %s", sentence)
-    return sentence
+def why_none(
+    template: Template, config: ClothConfig, *, pose_known: bool, followed: bool, fps: float | None
+) -> str | None:
+    """Return why no part of the clothes can be simulated, known before anything is trained; None: parts may be.
+
+    Args:
+        pose_known: of the scan, in which the template is the surface. followed: the surface is, or will be.
+    """
+    if not _wanted(template, config):
+        return None
+    if not pose_known:
+        return "the run does not say in which pose its template was scanned: nothing is simulated"
+    if config.parts is None and not followed:
+        return "nothing was followed through the frames: no part is simulated unless it is named"
+    if followed and fps is None:
+        return "the capture does not say how many frames a second it has: nothing is simulated"
+    return None
+
+
+def _wanted(template: Template, config: ClothConfig) -> list[str]:
+    """The parts to look at: those named, or all clothes."""
+    if config.parts is not None:
+        return list(config.parts)
+    return [label.name for label in CLOTH_LABELS if label.name in template.part_names]
 
 
 @dataclass(frozen=True)

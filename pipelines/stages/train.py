@@ -23,6 +23,7 @@ from pipelines.runs.layout import (
     BIND_STAGE,
     CLOTH_STAGE,
     COMPENSATE_STAGE,
+    PARAMS,
     REFINE_STAGE,
     TEACHER_STAGE,
     TEMPLATE,
@@ -30,7 +31,7 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
 from pipelines.stages.bind import BindStage
-from pipelines.stages.cloth import ClothConfig, ClothStage
+from pipelines.stages.cloth import ClothConfig, ClothStage, why_none
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
@@ -152,6 +153,7 @@ def train(
         names = [name for name in scene.template.part_names if name != BODY_PART]
         require_known("loose parts", config.cloth.parts, names)
         load_params_of_run(run)
+    _tell_of_clothes(run, scene, config, steps)
     records: dict[str, StageRecord] = {}
     how = config.refine
     if "refine" in steps and how is not None:
@@ -186,6 +188,17 @@ def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: Trai
             report(Progress(done, total, 0.0, 0.0))
 
         return refine(run, inputs, config, force=options.force, told=told)
+
+
+def _tell_of_clothes(run: Path, scene: TrainScene, config: TrainConfig, steps: tuple[str, ...]) -> None:
+    """Warn before all work where a preset that follows the surface cannot simulate: loose clothes look worse then."""
+    follows = config.teacher and config.preset.teacher.track is not None
+    if config.cloth is None or not follows or not {"teacher", "cloth"} & set(steps):
+        return
+    known = (run / PARAMS).is_file()
+    why = why_none(scene.template, config.cloth, pose_known=known, followed=follows, fps=scene.capture.fps)
+    if why is not None:
+        log.warning("loose clothes: %s", why)
 
 
 def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ...]) -> None:

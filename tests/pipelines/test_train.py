@@ -17,11 +17,14 @@ from avatar.training.presets import TRAINING_PRESETS
 from avatar.training.student.bake import BakeTask
 from pipelines.cli import main
 from pipelines.figures.comparison import read_strip
+from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
+from tests.cloth.persons import person
 from tests.dolls.dancing import HELD_OUT, template, write_dance, write_dance_run
+from tests.dolls.skirted import write_skirted
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,6 +115,21 @@ def test_a_template_without_loose_clothes_simulates_nothing_and_has_nothing_to_s
     numbers = read_manifest(trained / "83_cloth")["numbers"]
     assert numbers["loose"] == numbers["said"] == []
     assert load_garments(trained / "83_cloth" / "garments.npz", template()) == []
+
+
+def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so_first(tmp_path, caplog):
+    run, capture = tmp_path / "run", write_skirted(tmp_path / "skirted")
+    (run / TEMPLATE).parent.mkdir(parents=True)
+    person().save(run / TEMPLATE)
+    with caplog.at_level("INFO"):
+        assert train(run, capture, "--until", "cloth") == 0
+    words = [(record.levelname, record.message) for record in caplog.records]
+    (said,) = read_manifest(run / "83_cloth")["numbers"]["said"]
+    assert "which pose" in said and words.count(("WARNING", f"loose clothes: {said}")) == 1
+    assert words.index(("WARNING", f"loose clothes: {said}")) < min(
+        k for k, (_, word) in enumerate(words) if word.startswith("70_bind")
+    )
+    assert load_garments(run / "83_cloth" / "garments.npz", person()) == []
 
 
 def test_training_without_simulation_has_no_such_stage(fitted, capture, capsys):
