@@ -61,7 +61,7 @@ class FollowedSurface:
     """Follow, measure, store."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
-    """Run with a template and a reference fit."""
+    """Run with a template and a fit."""
     capture: Path
     """Folder of its capture, with true surfaces whose vertices are the same points in all frames."""
     every: tuple[int, ...] = (1, 2, 3)
@@ -123,7 +123,7 @@ class Bench:
     """A run's scene, opened once.
 
     Args:
-        run: with template and reference fit. folder: of the capture. part: that is measured.
+        run: with template and fit. folder: of the capture. part: that is measured.
     """
 
     def __init__(self, run: Path, folder: Path, part: str) -> None:
@@ -206,7 +206,7 @@ class Bench:
 
     @torch.no_grad()
     def _psnr(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> float:
-        """Mean dB over held-out views of some training frames, of the reference fit's Gaussians on the surface."""
+        """Mean dB over held-out views of some training frames, of the fit's Gaussians on the surface."""
         avatar = TrackedAvatar(sequence.rig, gaussians, track.cage.count)
         found = []
         for frame in spread_inside(sequence.train_frames, LOOKED_AT):

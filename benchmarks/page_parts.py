@@ -174,8 +174,8 @@ PARTS = (
         "true surface: one frame is little.",
     ),
     Part(
-        "fit_reference",
-        "Reference fit",
+        "fit",
+        "Fit",
         "One frame (0) of `woman_casual`, 12 cameras trained on and 2 held out, whole views of 384x640, so two images "
         "carry each row; exact inputs; photographs alone, no surface is learned.",
     ),

@@ -1,7 +1,7 @@
 """A capture's photographs with one part repainted: other patterns on cloth that moves as it did.
 
 The true surface says which pixels are the part's and which points of the cloth they show; the pattern is evaluated
-there and lit by one lamp. The reference fit's Gaussians on the part get the same paint, as a fit to the repainted
+there and lit by one lamp. The fit's Gaussians on the part get the same paint, as a fit to the repainted
 photographs would give them.
 """
 
@@ -57,7 +57,7 @@ class RepaintedSequence(AvatarSequence):
         self._painted: dict[tuple[str, int], View] = {}
 
     def gaussians(self, bound: BoundGaussians) -> BoundGaussians:
-        """Return Gaussians of the reference fit in the new paint."""
+        """Return Gaussians of the fit in the new paint."""
         template = self.rig.template
         mesh = TriangleMesh(self._posed, template.faces)
         world = world_from_local(bound, torch.tensor(self._posed, dtype=torch.float32), self.rig.faces)

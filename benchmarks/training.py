@@ -39,7 +39,7 @@ from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
-STAGES = ("70_bind", "80_teacher", "85_bake", "90_compensate")
+STAGES = ("70_fit", "80_teacher", "85_bake", "90_compensate")
 WARM_UP, TIMED = 3, 14
 KINDS = {
     "rasteriser": ("_Rasterize",),
@@ -204,7 +204,7 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
     track, pretrain, bake = preset.teacher.track, preset.teacher.pretrain, preset.bake
 
     def tracking(config: TrackConfig) -> Callable[[int], Any]:
-        gaussians = load_bound(run / "70_bind" / "gaussians.safetensors")
+        gaussians = load_bound(run / "70_fit" / "gaussians.safetensors")
         avatar = TrackedAvatar(rig, gaussians, config.control_points, still_body=config.still_body)
         task = TrackTask(sequence, avatar, config)
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.

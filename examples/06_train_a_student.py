@@ -31,7 +31,7 @@ def main() -> None:
     sequence = avatar.AvatarSequence(capture, template)
     views = avatar.read_views(capture, 0, sequence.train_cameras)
     scene = avatar.FitScene(template, template.pose(capture.params(0))[0], views)
-    fitted = avatar.fit_reference(scene, preset.fit, out / "fit").gaussians
+    fitted = avatar.fit_gaussians(scene, preset.fit, out / "fit").gaussians
     config = replace(preset.teacher, track=replace(preset.teacher.track, reference=0))  # the template is of frame 0
     teacher, _ = avatar.fit_teacher(sequence, fitted, preset.networks.teacher, config, avatar.Session(out / "teacher"))
     start = teacher.gaussians.snapshot()

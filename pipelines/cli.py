@@ -11,6 +11,7 @@ import sys
 import warnings
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -18,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
+from pipelines.runs.places import refuse_old_run
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_values import jsonable
 
@@ -49,9 +51,9 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "a run in the browser: layers, weights, Gaussians, photographs, frames, and a training while it goes on",
     ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
-    "fit-reference": (
-        "pipelines.commands.fit_reference",
-        "FitReference",
+    "fit": (
+        "pipelines.commands.fit",
+        "Fit",
         "a built template and one frame's photographs in; textured Gaussians on it and their figures out",
     ),
     "train": (
@@ -199,6 +201,10 @@ def _run(name: str, args: list[str]) -> int:
         args=args,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
+    # Every folder of a run that a command opens or writes comes in as one of its paths.
+    for option, value in vars(command).items():
+        if isinstance(value, Path) and option != "capture":
+            refuse_old_run(value)
     result = command.run()
     if getattr(command, "json", False) and result is not None:
         sys.stdout.write(json.dumps(jsonable(result), indent=1) + "\n")

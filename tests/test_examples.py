@@ -23,7 +23,7 @@ FILES = {
     "02_transfer_weights": {"as_published.ply", "default.ply", "default_for_lower_clothes.ply"},
     "03_metrics": {"comparison.json"},
     "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
-    "05_fit_reference": {"run", "metrics.jsonl", "splats.ply", "Cam004.png"},
+    "05_fit": {"run", "metrics.jsonl", "splats.ply", "Cam004.png"},
     "06_train_a_student": {"fit", "teacher", "bake", "shapes", "student.safetensors", "new_pose.png"},
 }
 

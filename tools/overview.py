@@ -68,15 +68,15 @@ def held_out_view(
     numbers = {"views": [], "models": {}} if manifest is None else manifest["numbers"]
     views = [shown for shown in numbers["views"] if (shown["set"], shown.get("chosen")) == ("novel_view", "evenly")]
     models = list(numbers["models"])
-    if not views or not {"reference-fit", "student"} <= set(models):
+    if not views or not {"fit", "student"} <= set(models):
         raise InputError(
             "evaluation of the run",
-            expected="a reference fit and a student, measured on novel views",
+            expected="a fit and a student, measured on novel views",
             received=f"{', '.join(models) or 'none'}, {len(views)} novel views",
             remedy="run `smplxpp train` and `smplxpp evaluate`",
         )
     photograph, rendered = read_tiles(run / EVALUATE_STAGE / views[-1]["file"], len(models))
-    return photograph, rendered[models.index("reference-fit")], rendered[models.index("student")]
+    return photograph, rendered[models.index("fit")], rendered[models.index("student")]
 
 
 def _cut(images: tuple[UInt8[np.ndarray, "H W 3"], ...]) -> list[UInt8[np.ndarray, "h w 3"]]:

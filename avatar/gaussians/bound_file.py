@@ -21,7 +21,7 @@ from smplxpp.core.files.json_file import as_integer, as_text, shown
 
 SCHEMA = 1
 _KIND = "bound_gaussians"
-_REMEDY = "take the file that `smplxpp fit-reference` wrote, or fit again"
+_REMEDY = "take the file that `smplxpp fit` wrote, or fit again"
 
 
 def save_bound(bound: BoundGaussians, path: str | Path) -> None:

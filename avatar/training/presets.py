@@ -12,7 +12,7 @@ from avatar.models.networks.presets import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.pretraining import PretrainConfig
-from avatar.training.reference_fit.config import PRESETS, FitConfig
+from avatar.training.fit.config import PRESETS, FitConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig
@@ -33,7 +33,7 @@ class TrainingPreset:
 
     Attributes:
         networks: sizes of the teacher and the field.
-        fit: the reference fit, which makes the Gaussians.
+        fit: the fit, which makes the Gaussians.
         teacher, bake, compensate: the three trainings.
         blend_shapes: of the student. control_points, still_body: see `StudentConfig`.
     """

@@ -109,10 +109,10 @@ def cpu(job: Job, note: Note) -> None:
 
 
 def fit(job: Job, note: Note) -> None:
-    """The reference fit."""
+    """The fit."""
     size = ("--gaussians", 300, "--iterations", 2) if job.toy else ("--max-minutes", 0.6 * job.seconds / 60)
     where = ("--capture", job.capture, "--device", job.device, "--force", "--no-report")
-    answer = command("fit-reference", job.run, *where, *size)
+    answer = command("fit", job.run, *where, *size)
     note(**{key: answer[key] for key in answer if key != "run"}, **_memory(job))
 
 

@@ -16,11 +16,11 @@ from avatar.models.student import StudentConfig
 from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shapes
 from avatar.training.student.bake import BakeConfig
 from pipelines.ablation.stages import BaselineStage, PruneConfig, PrunedStage
-from pipelines.runs.layout import ABLATION, BAKE_STAGE, BIND_STAGE, CLOTH_STAGE, COMPENSATE_STAGE, TEACHER_STAGE
+from pipelines.runs.layout import ABLATION, BAKE_STAGE, CLOTH_STAGE, COMPENSATE_STAGE, FIT_STAGE, TEACHER_STAGE
 from pipelines.stages.bake import BakeStage
-from pipelines.stages.bind import BindStage
 from pipelines.stages.cloth import ClothConfig, ClothStage
 from pipelines.stages.compensate import CompensateStage
+from pipelines.stages.fit import FitStage
 from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage
 from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
@@ -137,9 +137,9 @@ class _Plan:
         """The paper's rows."""
         preset = self.preset
         for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
-            own = {} if prefix else {"fit": (BIND_STAGE,), "teacher": (TEACHER_STAGE,), "bake": (BAKE_STAGE,)}
+            own = {} if prefix else {"fit": (FIT_STAGE,), "teacher": (TEACHER_STAGE,), "bake": (BAKE_STAGE,)}
             self._add(
-                BindStage(
+                FitStage(
                     name=_folder(f"{prefix}gaussians"),
                     ground=ground,
                     config=preset.fit,

@@ -76,7 +76,7 @@ class BaselineStage(ModelStage):
     """An avatar of another kind, trained on photographs.
 
     Attributes:
-        gaussians: the reference fit that it starts from.
+        gaussians: the fit that it starts from.
     """
 
     file = "baseline.safetensors"

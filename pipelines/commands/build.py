@@ -15,10 +15,10 @@ from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
 from pipelines.runs.by_hand import take_file
 from pipelines.runs.layout import (
-    BIND_STAGE,
     BUILD_STAGES,
     CORRECTIONS_FILE,
     EVALUATE_STAGE,
+    FIT_STAGE,
     LANDMARKS_FILE,
     REFINE_STAGE,
     RELIGHT_STAGE,
@@ -163,7 +163,7 @@ class Build:
         manifests = [record.folder / "manifest.json" for record in records.values()]
         manifests += [
             self.out / name / "manifest.json"
-            for name in (REFINE_STAGE, BIND_STAGE, *TRAIN_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
+            for name in (REFINE_STAGE, FIT_STAGE, *TRAIN_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
         ]
         made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
         return report.is_file() and report.stat().st_mtime_ns > max(made)

@@ -34,8 +34,8 @@ class Evaluate:
     """Folder with a template and trained models; the evaluation goes into it as 95_evaluate."""
     capture: Path
     """Folder of the capture: cameras, images, masks, body parameters; true meshes where it has them."""
-    models: tuple[Literal["reference-fit", "teacher", "baked", "student", "compact"], ...] = ()
-    """Which to measure; by default reference fit, teacher and student, as far as the run has them. baked: the student
+    models: tuple[Literal["fit", "teacher", "baked", "student", "compact"], ...] = ()
+    """Which to measure; by default fit, teacher and student, as far as the run has them. baked: the student
     before its blend shapes. compact: its file for players."""
     sets: tuple[Literal["training", "novel_view", "novel_pose", "novel_pose_training_view"], ...] = ()
     """Which views; by default all that the capture holds out something for, and training views."""

@@ -14,8 +14,8 @@ from rich.text import Text
 from pipelines.report.model import CheckRow, count_statuses, worst_status
 from pipelines.runs.layout import (
     ALL_STAGES,
-    BIND_STAGE,
     EVALUATE_STAGE,
+    FIT_STAGE,
     REFINE_STAGE,
     RELIGHT_STAGE,
     TEMPLATE_STAGES,
@@ -101,8 +101,8 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
 
 def _remedy(run: Path, stage: str) -> str:
     """Return the command that makes a stage."""
-    if stage == BIND_STAGE:
-        return f"smplxpp fit-reference {run} --capture DIR (with the fit's options)"
+    if stage == FIT_STAGE:
+        return f"smplxpp fit {run} --capture DIR (with the fit's options)"
     if stage in (REFINE_STAGE, *TRAIN_STAGES):
         return f"smplxpp train --run {run} --capture DIR (with the training's options)"
     if stage in (EVALUATE_STAGE, RELIGHT_STAGE):

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
-from pipelines.runs.layout import BIND_STAGE
+from pipelines.runs.layout import FIT_STAGE
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.errors import InputError
@@ -37,7 +37,7 @@ class Train:
     """Options of `smplxpp train`. It trains what a run lacks; the same command goes on with what was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
-    """Folder that `smplxpp build` wrote; 66_refine, 70_bind, 80_teacher, 83_cloth, 85_bake and 90_compensate go into
+    """Folder that `smplxpp build` wrote; 66_refine, 70_fit, 80_teacher, 83_cloth, 85_bake and 90_compensate go into
     it. Write --run-folder with torchrun, which takes --run for an option of its own."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
@@ -64,7 +64,7 @@ class Train:
     iterations_share: OptionalFloat = None
     """Share of the preset's iterations, of all stages."""
     fit_iterations: OptionalInt = None
-    """Iterations of the reference fit, in the place of the preset's."""
+    """Iterations of the fit, in the place of the preset's."""
     teacher_iterations: OptionalInt = None
     """Iterations of the teacher."""
     bake_iterations: OptionalInt = None
@@ -74,7 +74,7 @@ class Train:
     batch: OptionalInt = None
     """Poses in a step of every training. With several processes there is at least one for each."""
     gaussians: OptionalInt = None
-    """Number of Gaussians of the reference fit."""
+    """Number of Gaussians of the fit."""
     blend_shapes: Literal["full", "local", "pruned"] = "full"
     """full: as published; local: 256 parts with coefficients of their own and 16 columns; pruned: full, and the compact
     file keeps those that move and colour most."""
@@ -105,7 +105,7 @@ class Train:
     seed: int = 0
     """Decides everything that is drawn."""
     force: bool = False
-    """Train anew even what stands; checkpoints go. A reference fit that you made stays."""
+    """Train anew even what stands; checkpoints go. A fit that you made stays."""
     tensorboard: bool = False
     """Log for TensorBoard too, into the folders of the stages."""
     no_report: bool = False
@@ -297,7 +297,7 @@ def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:
     stage = record.folder.name
     views = (
         numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
-        if stage == BIND_STAGE
+        if stage == FIT_STAGE
         else (numbers.get("novel_view", {}))
     )
     poses = numbers.get("novel_pose", {})

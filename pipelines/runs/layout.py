@@ -1,11 +1,14 @@
-"""The folder of a run: the name of every stage and file, said once."""
+"""Names of the stages and files of a run folder.
+
+The numbers of the stages give the order in which they run.
+"""
 
 from __future__ import annotations
 
 RECONSTRUCT_STAGE = "02_reconstruct"
 LOCATE_STAGE = "03_locate"
 REGISTER_STAGE = "05_register"
-CAPTURE_STAGE = "00_capture"
+CAPTURE_STAGE = "08_capture"
 POSE_BODY_STAGE = "10_body"
 SEGMENT_STAGE = "20_segment"
 CLEAN_STAGE = "30_clean"
@@ -14,13 +17,15 @@ UNPOSE_STAGE = "50_unpose"
 ASSEMBLE_STAGE = "60_assemble"
 VALIDATE_STAGE = "65_validate"
 REFINE_STAGE = "66_refine"
-BIND_STAGE = "70_bind"
+FIT_STAGE = "70_fit"
 TEACHER_STAGE = "80_teacher"
 CLOTH_STAGE = "83_cloth"
 BAKE_STAGE = "85_bake"
 COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
 RELIGHT_STAGE = "97_relight"
+OLD_STAGE_NAMES = {"00_capture": CAPTURE_STAGE, "70_bind": FIT_STAGE}
+"""Stages by the names that earlier versions gave them; `pipelines.runs.places.refuse_old_run` refuses such runs."""
 ABLATION = "ablation"
 TALKING_FILM = "talking.mp4"
 
@@ -39,8 +44,8 @@ BUILD_STAGES = (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE, *TEMPLATE_STAGE
 """The stages of `smplxpp build` in their order. Parameters that are not given come from a registration, or from the
 body found in a scan that comes alone, which a registration may start from."""
 TRAIN_STAGES = (TEACHER_STAGE, CLOTH_STAGE, BAKE_STAGE, COMPENSATE_STAGE)
-"""The stages that `smplxpp train` adds to a reference fit."""
-MODEL_STAGES = (BIND_STAGE, *TRAIN_STAGES)
+"""The stages that `smplxpp train` adds to a fit."""
+MODEL_STAGES = (FIT_STAGE, *TRAIN_STAGES)
 ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
 
 RECONSTRUCTION = f"{RECONSTRUCT_STAGE}/reconstruction.json"
@@ -60,8 +65,8 @@ TEMPLATE = f"{ASSEMBLE_STAGE}/smplxpp.npz"
 TEMPLATE_GLB = f"{ASSEMBLE_STAGE}/template.glb"
 TEMPLATE_OBJ = f"{ASSEMBLE_STAGE}/template.obj"
 TEMPLATE_ERRORS = f"{VALIDATE_STAGE}/errors.npz"
-GAUSSIANS = f"{BIND_STAGE}/gaussians.safetensors"
-SPLATS = f"{BIND_STAGE}/splats.ply"
+GAUSSIANS = f"{FIT_STAGE}/gaussians.safetensors"
+SPLATS = f"{FIT_STAGE}/splats.ply"
 TEACHER = f"{TEACHER_STAGE}/teacher.safetensors"
 GARMENTS = f"{CLOTH_STAGE}/garments.npz"
 BAKED = f"{BAKE_STAGE}/student.safetensors"

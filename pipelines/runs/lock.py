@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from pipelines.runs.places import refuse_old_run
 from smplxpp.core.errors import InputError
 
 LOCK_NAME = ".lock"
@@ -29,8 +30,9 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
         names: stems of what a build writes: stages and files.
 
     Raises:
-        InputError: the folder cannot be written, or another build works in it.
+        InputError: the folder cannot be written, another build works in it, or its stages have old names.
     """
+    refuse_old_run(run)
     try:
         run.mkdir(parents=True, exist_ok=True)
         lock = open(run / LOCK_NAME, "w", opener=_at_once)

@@ -1,4 +1,4 @@
-"""Whether two names are of one file, links or not, and that a run keeps out of its capture.
+"""Checks of folders: whether two paths are the same file, what a run may not be written into, and runs of old names.
 
 Captures may link to files that lie elsewhere.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pipelines.runs.layout import ABLATION, ALL_STAGES
+from pipelines.runs.layout import ABLATION, ALL_STAGES, OLD_STAGE_NAMES
 from smplxpp.core.errors import InputError
 
 RUNS_OF_A_CAPTURE = "runs"
@@ -61,4 +61,24 @@ def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--ou
                 expected=f"a folder apart from the capture {capture}",
                 received=received,
                 remedy=f"choose another with {subject}, as {capture / RUNS_OF_A_CAPTURE / 'NAME'} or runs/{root.name}",
+            )
+
+
+def refuse_old_run(folder: Path) -> None:
+    """Refuse a run folder whose stages have the names that earlier versions gave them.
+
+    Its stages would be made again under their new names beside the old ones, and half of the run would be read from
+    either. `pipelines.cli` calls this for every folder that a command is given, and `own_run_folder` for every run
+    that Python code writes.
+
+    Raises:
+        InputError: the folder holds a stage under an old name.
+    """
+    for old, new in OLD_STAGE_NAMES.items():
+        if (folder / old / "manifest.json").is_file():
+            raise InputError(
+                f"run folder {folder}",
+                expected=f"stages named as this version names them ({new})",
+                received=f"{old}, which an earlier version wrote",
+                remedy="build the run again in a new folder",
             )

@@ -23,7 +23,7 @@ class BakeStage(ModelStage):
 
     Attributes:
         cloth: the loose clothes, which poses that count as new are shown simulated; None: nothing is.
-        source: a teacher, whose Gaussians it starts from too; or a reference fit, to learn from photographs alone.
+        source: a teacher, whose Gaussians it starts from too; or a fit, to learn from photographs alone.
     """
 
     file = "student.safetensors"

@@ -1,4 +1,4 @@
-"""Stage 95: reference fit, teacher and student measured on a capture; figures, tables and pictures."""
+"""Stage 95: fit, teacher and student measured on a capture; figures, tables and pictures."""
 
 from __future__ import annotations
 
@@ -201,12 +201,12 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
     missing = [name for name in asked if name not in there]
     untrained = not asked and not there.keys() & set(BEST_FIRST)
     if missing or untrained:
-        fit_alone = missing == ["reference-fit"]
+        fit_alone = missing == ["fit"]
         raise InputError(
             f"run {run}",
             expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
             received=f"only {', '.join(there)}" if there else "no model",
-            remedy=f"`smplxpp {'fit-reference' if fit_alone else 'train'}` makes it; a training under way is measured "
+            remedy=f"`smplxpp {'fit' if fit_alone else 'train'}` makes it; a training under way is measured "
             "when its stage is finished",
         )
     wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
@@ -214,12 +214,12 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
 
 
 def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
-    """Load a model of a run; the reference fit is a student without field and blend shapes.
+    """Load a model of a run; the fit is a student without field and blend shapes.
 
     Raises:
         InputError: a damaged file, one of another template or of a newer version.
     """
-    if name != "reference-fit":
+    if name != "fit":
         return load_avatar(path, rig)
     return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
 
@@ -292,12 +292,12 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
         if part in best.views:
             psnr = best.mean(part)["psnr"]
             checks.append(floor.check(f"{name}, {SETS[part]}: PSNR of the person", psnr))
-            if "reference-fit" in report.models:
+            if "fit" in report.models:
                 checks.append(
                     gates.GAIN.check(
                         f"{name} against one frame's Gaussians, {SETS[part]}",
-                        psnr - report.models["reference-fit"].mean(part)["psnr"],
-                        explanation="gain of PSNR over the reference fit, which skinning alone moves",
+                        psnr - report.models["fit"].mean(part)["psnr"],
+                        explanation="gain of PSNR over the fit, which skinning alone moves",
                     )
                 )
             if name != "teacher" and "teacher" in report.models:

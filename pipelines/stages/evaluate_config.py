@@ -8,14 +8,14 @@ from pipelines.runs.layout import BAKED, COMPACT_STUDENT, GAUSSIANS, STUDENT, TE
 
 REPORT_FILE = "metrics.json"
 MODEL_FILES: Mapping[str, str] = {
-    "reference-fit": GAUSSIANS,
+    "fit": GAUSSIANS,
     "teacher": TEACHER,
     "baked": BAKED,
     "student": STUDENT,
     "compact": COMPACT_STUDENT,
 }
 """Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
-MEASURED = ("reference-fit", "teacher", "student")
+MEASURED = ("fit", "teacher", "student")
 """Those that are measured where nothing else is asked for, as far as a run has them."""
 BEST_FIRST = ("student", "compact", "baked", "teacher")
 """What an evaluation is about: the first of these that was measured."""

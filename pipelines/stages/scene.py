@@ -109,7 +109,7 @@ def open_template(run: Path) -> Template:
 
 
 def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
-    """Open the template of a run and one frame of a capture, for a reference fit; see `open_scene`.
+    """Open the template of a run and one frame of a capture, for a fit; see `open_scene`.
 
     Raises:
         InputError: no template; a capture that lacks images, masks, cameras or parameters of the frame; a template

@@ -1,4 +1,4 @@
-"""The training of a run: reference fit, teacher, bake and compensation, each a stage that is made once."""
+"""The training of a run: fit, teacher, bake and compensation, each a stage that is made once."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from avatar.training.refinement.config import RefineConfig
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import (
     BAKE_STAGE,
-    BIND_STAGE,
     CLOTH_STAGE,
     COMPENSATE_STAGE,
+    FIT_STAGE,
     PARAMS,
     REFINE_STAGE,
     TEACHER_STAGE,
@@ -30,9 +30,9 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
-from pipelines.stages.bind import BindStage
 from pipelines.stages.cloth import ClothConfig, ClothStage, why_none
 from pipelines.stages.compensate import CompensateStage
+from pipelines.stages.fit import FitStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import refine
@@ -88,7 +88,7 @@ class TrainConfig:
 def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
     """The stages of a training by their steps."""
     preset = config.preset
-    fit = BindStage(name=BIND_STAGE, config=preset.fit)
+    fit = FitStage(name=FIT_STAGE, config=preset.fit)
     teacher = TeacherStage(name=TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher)
     cloth = None
     if config.teacher and config.cloth is not None:
@@ -216,7 +216,7 @@ def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ..
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:
-    """The reference fit of this template that the user made, which is never replaced.
+    """The fit of this template that the user made, which is never replaced.
 
     Raises:
         InputError: it saw a camera or a frame that this training holds out.
@@ -227,9 +227,9 @@ def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord |
     numbers = manifest["numbers"]
     if not (numbers.get("by_hand") and is_finished(manifest)):
         return None
-    anew = f"fit without them (smplxpp fit-reference), or delete {run / fit.name}"
+    anew = f"fit without them (smplxpp fit), or delete {run / fit.name}"
     refuse_seen(run, (fit.name,), scene.capture.splits, anew=anew)
-    record = require_stage(run, fit.name, remedy=f"fit it anew (smplxpp fit-reference), or delete {run / fit.name}")
+    record = require_stage(run, fit.name, remedy=f"fit it anew (smplxpp fit), or delete {run / fit.name}")
     log.info(
         "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
         fit.name,

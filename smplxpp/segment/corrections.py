@@ -199,7 +199,7 @@ def _numbered_faces(item: FaceCorrection, surface: ScanSurface, subject: str) ->
                 subject,
                 expected=f"faces 0 to {count - 1}, as the run's scan has them",
                 received=f"{item.faces.max()}",
-                remedy="name faces of RUN/00_capture/scan.npz, or use a box or a stroke",
+                remedy="name faces of RUN/08_capture/scan.npz, or use a box or a stroke",
             )
         return item.faces
     if item.triangles is None:

@@ -9,8 +9,8 @@ from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.presets import NetworkPreset
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.fit.config import FitConfig
 from avatar.training.presets import TrainingPreset
-from avatar.training.reference_fit.config import FitConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig

@@ -23,7 +23,7 @@ from pipelines.report.sections.readable import readable
 from pipelines.report.sections.refine import refine_section
 from pipelines.runs.arrays import load_arrays, save_arrays
 from pipelines.runs.checks import Check
-from pipelines.runs.layout import BIND_STAGE, BUILD_STAGES, REFINE_STAGE
+from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.photographed import unit_cube_of
@@ -86,7 +86,7 @@ def _write_run(run: Path) -> None:
 
     for name in BUILD_STAGES[:3]:
         run_stage(run, stage_of(name), work)
-    for name, numbers in ((BIND_STAGE, _FIT), (REFINE_STAGE, _REFINED)):
+    for name, numbers in ((FIT_STAGE, _FIT), (REFINE_STAGE, _REFINED)):
         run_stage(run, stage_of(name), lambda folder, numbers=numbers: StageOutput(numbers=numbers))
     (run / "metrics.json").write_text(json.dumps({"schema": 1, "subject": "Dancer", "checks": []}))
     inputs = BuildInputs(scan=run / "scan.ply", params=run / "params.npz", subject="Dancer")
@@ -117,7 +117,7 @@ def _open_run(run: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # what cannot be read is said
         sections = []
-        for name, make in ((BIND_STAGE, fit_section), (REFINE_STAGE, refine_section)):
+        for name, make in ((FIT_STAGE, fit_section), (REFINE_STAGE, refine_section)):
             manifest = read_manifest(run / name)
             if manifest is not None:
                 record = StageRecord(run / name, manifest, ran=False)

@@ -46,7 +46,7 @@ def alone(scan):
 
 def test_the_body_is_found(alone):
     true = BODY.forward(load_params(PERSON / "params" / "params.npz").frame(0)).frame(0)
-    found = BODY.forward(load_params(alone / "00_capture" / "params.npz")).frame(0)
+    found = BODY.forward(load_params(alone / "08_capture" / "params.npz")).frame(0)
     assert 1e3 * np.linalg.norm(found.vertices - true.vertices, axis=1).mean() < 15.0
     assert 1e3 * np.linalg.norm(found.joints - true.joints, axis=1)[:22].mean() < 12.0
     numbers = require_stage(alone, LOCATE_STAGE).manifest["numbers"]
@@ -64,7 +64,7 @@ def test_labels_are_told(alone):
         face_count=len(raw.faces),
         label_set="capture",
     )
-    with np.load(alone / SEGMENT_STAGE / "labels.npz") as labels, np.load(alone / "00_capture" / "scan.npz") as kept:
+    with np.load(alone / SEGMENT_STAGE / "labels.npz") as labels, np.load(alone / "08_capture" / "scan.npz") as kept:
         told, source = labels["face_labels"], kept["scan/source_face"]
     corners = true[raw.faces[source]]
     one = (corners == corners[:, :1]).all(axis=1) & (corners[:, 0] != BACKGROUND)
@@ -84,7 +84,7 @@ def test_what_a_registration_takes_up(alone):
 
 def test_the_report_shows_what_else_it_might_have_been(alone):
     record = require_stage(alone, LOCATE_STAGE)
-    with np.load(alone / "00_capture" / "scan.npz") as kept:
+    with np.load(alone / "08_capture" / "scan.npz") as kept:
         mesh = TriangleMesh(kept["scan/vertices"], kept["scan/faces"])
     section = locate_section(record, BODY, mesh)
     assert len(section.pictures) == 2 and "found units cm" in section.text[0]

@@ -135,7 +135,7 @@ def test_labels_corrected_by_hand_are_taken_up_and_kept(small):
     written = (run / "labels_corrections.json").read_bytes()
     after = small.build("run", small.inputs(), last="30_clean")
     ran = {name: record.ran for name, record in after.items()}
-    assert ran == {"00_capture": False, "10_body": False, "20_segment": True, "30_clean": True}
+    assert ran == {"08_capture": False, "10_body": False, "20_segment": True, "30_clean": True}
     with np.load(run / "20_segment" / "labels.npz") as labels:
         corrected = labels["corrected"]
         inside = np.abs(scan.face_centers - head.center).max(axis=1) <= 0.5
@@ -279,8 +279,8 @@ def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
     (run / ".10_body.abc" / "body.npz").write_bytes(b"half")
     (run / ".metrics.abc.json").write_text("{")
     (run / ".notes").write_text("mine")
-    small.build("run", small.inputs(), last="00_capture")
-    assert sorted(p.name for p in run.iterdir()) == [".lock", ".notes", "00_capture", "build.json", "metrics.json"]
+    small.build("run", small.inputs(), last="08_capture")
+    assert sorted(p.name for p in run.iterdir()) == [".lock", ".notes", "08_capture", "build.json", "metrics.json"]
 
 
 def test_two_builds_do_not_share_a_folder(small):
@@ -289,12 +289,12 @@ def test_two_builds_do_not_share_a_folder(small):
     with open(run / ".lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(InputError, match="no other build"):
-            small.build("run", small.inputs(), last="00_capture")
-    small.build("run", small.inputs(), last="00_capture")
+            small.build("run", small.inputs(), last="08_capture")
+    small.build("run", small.inputs(), last="08_capture")
 
 
 def test_a_build_from_a_late_stage_needs_the_earlier_ones(small):
-    with pytest.raises(InputError, match="00_capture"):
+    with pytest.raises(InputError, match="08_capture"):
         build(small.folder / "run", small.inputs(), BuildConfig(), first="40_transfer")
     with pytest.raises(InputError, match="before the last"):
         build(small.folder / "run", small.inputs(), BuildConfig(), first="40_transfer", last="20_segment")
@@ -341,7 +341,7 @@ def test_a_broken_scan_is_repaired_and_said_so(small):
     text = str(warned[0].message)
     for words in ("nonfinite", "flipped", "zero area", "unreferenced"):
         assert words in text
-    assert records["00_capture"].manifest["numbers"]["repairs"] in text
+    assert records["08_capture"].manifest["numbers"]["repairs"] in text
     assert all(c["value"] == 0 for c in records["30_clean"].manifest["checks"] if "non-manifold" in c["name"])
 
 

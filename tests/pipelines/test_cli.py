@@ -145,12 +145,12 @@ def test_an_error_is_json_when_json_was_asked_for(capsys):
 
 
 def test_json_is_all_that_stdout_gets(capsys, tmp_path, cube):
-    add_stage(tmp_path / "run", "00_capture")
+    add_stage(tmp_path / "run", "08_capture")
     for args in (
         ["inspect", tmp_path / "run"],
         ["metrics", cube, cube, "--samples", "100"],
         ["params", "convert", PARAMS, "--out", tmp_path / "p.npz"],
-        ["build", "--capture", FIXTURE, "--out", tmp_path / "b", "--until-stage", "00_capture"],
+        ["build", "--capture", FIXTURE, "--out", tmp_path / "b", "--until-stage", "08_capture"],
     ):
         assert main([*map(str, args), "--json"]) == 0
         assert isinstance(json.loads(capsys.readouterr().out), dict)

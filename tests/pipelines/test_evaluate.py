@@ -61,16 +61,16 @@ def write_dressed(run: Path) -> Path:
 
 
 def write_models(run: Path, template: Template, *, count: int = 600) -> Path:
-    """A reference fit and a student whose field moves the mesh a little, as the training leaves them."""
+    """A fit and a student whose field moves the mesh a little, as the training leaves them."""
     torch.manual_seed(0)
     bound = sample_on_mesh(template, SamplingConfig(count=count))
     student = Student(StudentConfig(FieldConfig(width=8, hidden_layers=1)), Rig(template), bound, (0, 1, 2, 3))
     with torch.no_grad():
         for value in student.field.parameters():
             value.add_(0.01 * torch.randn_like(value))
-    for name in ("reference-fit", "student"):
+    for name in ("fit", "student"):
         (run / MODEL_FILES[name]).parent.mkdir(parents=True)
-    save_bound(bound, run / MODEL_FILES["reference-fit"])
+    save_bound(bound, run / MODEL_FILES["fit"])
     save_avatar(run / MODEL_FILES["student"], student)
     return run
 
@@ -111,7 +111,7 @@ def refused(capsys, run, capture, *options: str) -> str:
 def test_files_of_the_stage(evaluated):
     folder = evaluated / "95_evaluate"
     report = EvalReport.load(folder / "metrics.json")
-    assert list(report.models) == ["reference-fit", "student"]
+    assert list(report.models) == ["fit", "student"]
     assert report.models["student"].bytes == (evaluated / MODEL_FILES["student"]).stat().st_size
     for name in ("summary", "training", "novel_view", "novel_pose", "novel_pose_training_view", "surface", "cost"):
         for ending in ("txt", "csv", "tex"):
@@ -262,9 +262,9 @@ def test_untrained_runs_are_told_to_train(tmp_path, capture, trained, capsys):
     run = write_dressed(tmp_path / "run")
     message = refused(capsys, run, capture)
     assert "a trained teacher or student" in message and "smplxpp train" in message
-    (run / "70_bind").mkdir()
-    shutil.copy(trained / MODEL_FILES["reference-fit"], run / "70_bind")
-    assert "only reference-fit" in refused(capsys, run, capture)
+    (run / "70_fit").mkdir()
+    shutil.copy(trained / MODEL_FILES["fit"], run / "70_fit")
+    assert "only fit" in refused(capsys, run, capture)
     assert "80_teacher/teacher.safetensors" in refused(capsys, run, capture, "--models", "teacher")
 
 
@@ -339,8 +339,8 @@ def test_the_fixture_from_its_build_to_the_page(tmp_path, capsys):
     figures = json.loads(capsys.readouterr().out)
     alone = figures["skinning_alone"]["training"]["mean"]
     assert 1.0 < alone["p2s"] < 12.0 and alone["labels"]["lower"]["p2s"] > alone["labels"]["upper"]["p2s"]
-    assert figures["models"]["reference-fit"]["surfaces"]["training"]["mean"] == alone
-    fit, student = (figures["models"][name]["mean"]["novel_view"] for name in ("reference-fit", "student"))
+    assert figures["models"]["fit"]["surfaces"]["training"]["mean"] == alone
+    fit, student = (figures["models"][name]["mean"]["novel_view"] for name in ("fit", "student"))
     assert fit["psnr"] > 12.0 and fit["psnr"] > student["psnr"]
     html = (run / "report.html").read_text()
     assert "Avatar: figures" in html and "Avatar: side by side" in html

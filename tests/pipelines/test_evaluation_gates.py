@@ -25,7 +25,7 @@ def checks(psnr: float, *, fit: float | None = None, upper: float = 1.0, pixel: 
     """Of a student with a PSNR in novel views and a P2S of its shirt, mm, where skinning alone has 1 mm."""
     models = {"student": ModelFigures({"novel_view": {"Cam0_0": view(psnr)}}, surfaces(upper))}
     if fit is not None:
-        models["reference-fit"] = ModelFigures({"novel_view": {"Cam0_0": view(fit)}})
+        models["fit"] = ModelFigures({"novel_view": {"Cam0_0": view(fit)}})
     report = EvalReport("doll", None, models, skinning_alone=surfaces(1.0))
     return {check.name: check for check in evaluation_checks(report, overlap=0.99, pixel=pixel)}
 

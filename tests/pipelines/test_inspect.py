@@ -66,9 +66,9 @@ def test_damage_is_seen(run):
 
 
 def test_a_stage_of_another_pipeline_is_listed_in_its_place(run):
-    add_stage(run, "70_bind")
+    add_stage(run, "70_fit")
     names = [stage["stage"] for stage in summarise_run(run)[0]["stages"]]
-    assert names == [*BUILD_STAGES, "70_bind"]
+    assert names == [*BUILD_STAGES, "70_fit"]
 
 
 def test_metrics_alone_are_enough_for_the_checks(tmp_path):
@@ -96,7 +96,7 @@ def test_the_terminal_lists_what_does_not_pass_and_all_on_request(run, capsys):
 def test_json_and_exit_status(run, capsys):
     assert main(["inspect", str(run), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"]["warn"] == 1
-    add_stage(run, "70_bind", [Check("broken", 5, "", 1, 2)])
+    add_stage(run, "70_fit", [Check("broken", 5, "", 1, 2)])
     assert main(["inspect", str(run)]) == 0
     assert main(["inspect", str(run), "--strict"]) == 1
     assert main(["inspect", str(run / "nothing")]) == 2

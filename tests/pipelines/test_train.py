@@ -55,9 +55,9 @@ def own(trained, tmp_path):
 
 @pytest.fixture
 def fitted(trained, tmp_path):
-    """A run with the reference fit alone."""
+    """A run with the fit alone."""
     run = write_dance_run(tmp_path / "run")
-    shutil.copytree(trained / "70_bind", run / "70_bind")
+    shutil.copytree(trained / "70_fit", run / "70_fit")
     return run
 
 
@@ -92,7 +92,7 @@ def test_files_and_figures_of_every_stage(trained, stage):
 
 def test_inputs_are_the_files_of_earlier_stages(trained):
     inputs = {stage: set(read_manifest(trained / stage)["inputs"]) for stage in STAGES}
-    assert "70_bind/gaussians.safetensors" in inputs["80_teacher"]
+    assert "70_fit/gaussians.safetensors" in inputs["80_teacher"]
     assert "80_teacher/teacher.safetensors" in inputs["85_bake"]
     assert "85_bake/student.safetensors" in inputs["90_compensate"]
     assert all({"60_assemble/smplxpp.npz", "capture/parameters", "capture/cameras"} <= i for i in inputs.values())
@@ -127,7 +127,7 @@ def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so_f
     (said,) = read_manifest(run / "83_cloth")["numbers"]["said"]
     assert "which pose" in said and words.count(("WARNING", f"loose clothes: {said}")) == 1
     assert words.index(("WARNING", f"loose clothes: {said}")) < min(
-        k for k, (_, word) in enumerate(words) if word.startswith("70_bind")
+        k for k, (_, word) in enumerate(words) if word.startswith("70_fit")
     )
     assert load_garments(run / "83_cloth" / "garments.npz", person()) == []
 
@@ -211,28 +211,28 @@ def test_checkpoints_of_other_options_are_not_overwritten(fitted, capture, capsy
 def test_a_later_stage_is_not_trained_on_one_that_was_made_otherwise(fitted, capture, capsys):
     assert train(fitted, capture, "--stage", "teacher", "--seed", "5") == 2
     message = json.loads(capsys.readouterr().out)["error"]["message"]
-    assert "a finished 70_bind" in message and "seed was 0, is 5" in message
+    assert "a finished 70_fit" in message and "seed was 0, is 5" in message
 
 
 def test_a_reference_fit_of_the_users_own_is_taken(tmp_path, capture, caplog):
     run = write_dance_run(tmp_path / "run")
     options = ("--gaussians", "123", "--iterations", "1", "--json", "--no-report")
-    assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
-    made = (run / "70_bind" / "manifest.json").read_bytes()
+    assert main(["fit", str(run), "--capture", str(capture), *options]) == 0
+    made = (run / "70_fit" / "manifest.json").read_bytes()
     with caplog.at_level("INFO"):
         assert train(run, capture, "--until", "teacher", "--force") == 0
-    assert (run / "70_bind" / "manifest.json").read_bytes() == made and "taken as it stands" in caplog.text
+    assert (run / "70_fit" / "manifest.json").read_bytes() == made and "taken as it stands" in caplog.text
     assert read_manifest(run / "80_teacher")["numbers"]["gaussians"] == 123
 
 
 def test_a_reference_fit_that_saw_what_is_held_out_is_refused(tmp_path, capture, capsys):
     run = write_dance_run(tmp_path / "run")
     options = ("--gaussians", "123", "--iterations", "1", "--hold-out", "Ring3", "--json", "--no-report")
-    assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
+    assert main(["fit", str(run), "--capture", str(capture), *options]) == 0
     capsys.readouterr()
     assert train(run, capture, "--until", "teacher") == 2
     message = json.loads(capsys.readouterr().out)["error"]["message"]
-    assert all(camera in message for camera in HELD_OUT) and "70_bind" in message and "--hold-out Ring3" in message
+    assert all(camera in message for camera in HELD_OUT) and "70_fit" in message and "--hold-out Ring3" in message
     assert not (run / "80_teacher").exists()
 
 
@@ -240,7 +240,7 @@ def test_a_students_bake_without_a_teacher(fitted, capture, capsys):
     assert train(fitted, capture, "--no-teacher", "--until", "bake") == 0
     assert list(json.loads(capsys.readouterr().out)["stages"]) == ["fit", "bake"]
     assert not (fitted / "80_teacher").exists()
-    assert "70_bind/gaussians.safetensors" in read_manifest(fitted / "85_bake")["inputs"]
+    assert "70_fit/gaussians.safetensors" in read_manifest(fitted / "85_bake")["inputs"]
 
 
 def test_held_out_cameras_and_scale_are_the_users_choice(fitted, capture):
@@ -255,7 +255,7 @@ def test_the_terminal_shows_figures(own, capture, capsys, monkeypatch):
     options = [option for option in SMALL if option != "--json"]
     assert main(["train", "--run", str(own), "--capture", str(capture), *options]) == 0
     out = capsys.readouterr().out
-    assert all(stage in out for stage in ("70_bind", *STAGES)) and "stands" in out and "3 of 3" in out
+    assert all(stage in out for stage in ("70_fit", *STAGES)) and "stands" in out and "3 of 3" in out
 
 
 @pytest.mark.slow

@@ -179,7 +179,7 @@ def test_a_body_without_expressions_can_be_baked_but_not_compensated(run, origin
         (("--cloth", "none", "--until", "cloth"), "option cloth"),
         (("--loose-parts", "dress", "cape"), "cape"),
         (("--loose-parts", "dress"), "params.npz"),
-        (("--stage", "teacher"), "a finished 70_bind"),
+        (("--stage", "teacher"), "a finished 70_fit"),
         (("--stage", "bake"), "a finished 80_teacher"),
         (("--stage", "compensate"), "a finished 85_bake"),
     ],
@@ -243,7 +243,7 @@ def test_what_runs_out_is_said_and_finished_stages_stay(run, original, capsys, m
     assert train(run, original) == 2
     message = json.loads(capsys.readouterr().out)["error"]["message"]
     assert "memory" in message or "disk" in message
-    assert read_manifest(run / "70_bind")["numbers"]["finished"] and not (run / "80_teacher").exists()
+    assert read_manifest(run / "70_fit")["numbers"]["finished"] and not (run / "80_teacher").exists()
     assert (run / "80_teacher_work").is_dir()
 
 
@@ -267,9 +267,9 @@ def test_another_lens_is_another_capture(run, capture):
 
 
 def test_a_refusal_names_the_stages_that_saw_what_is_held_out_alone(run, original):
-    for name, frames in (("70_bind", [0]), ("80_teacher", [0, 4])):
+    for name, frames in (("70_fit", [0]), ("80_teacher", [0, 4])):
         (run / name).mkdir()
         seen = {"seen": {"cameras": list(TRAIN), "frames": frames}}
         (run / name / "manifest.json").write_text(json.dumps({"schema": SCHEMA, "numbers": seen}))
     with pytest.raises(InputError, match="frames 4, which 80_teacher learned from"):
-        refuse_seen(run, ("70_bind", "80_teacher"), opened(run, original).capture.splits)
+        refuse_seen(run, ("70_fit", "80_teacher"), opened(run, original).capture.splits)

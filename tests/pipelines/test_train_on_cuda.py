@@ -81,7 +81,7 @@ def test_every_stage_with_loose_clothes_and_their_evaluation(tmp_path, monkeypat
     foreseen = _kept(monkeypatch)
     on_cuda("train", run, capture, "--preset", "demo", *FEW, "--loose-parts", PART)
     assert [type(one.share) for one in foreseen] == [PretendedTensor]  # the skirt was simulated for the tracking
-    for stage in ("70_bind", "80_teacher", "83_cloth", "85_bake", "90_compensate"):
+    for stage in ("70_fit", "80_teacher", "83_cloth", "85_bake", "90_compensate"):
         manifest = read_manifest(run / stage)
         assert manifest["config"]["device"] == "cuda" and manifest["numbers"]["finished"]
     assert read_manifest(run / "83_cloth")["numbers"]["loose"] == [PART]
@@ -89,7 +89,7 @@ def test_every_stage_with_loose_clothes_and_their_evaluation(tmp_path, monkeypat
         assert main(["evaluate", str(run), *_told(capture), *EVALUATED]) == 0
     manifest = read_manifest(run / "95_evaluate")
     assert manifest["config"]["cloth"] == "simulate" and manifest["config"]["device"] == "cuda"
-    assert list(manifest["numbers"]["models"]) == ["reference-fit", "teacher", "student"]
+    assert list(manifest["numbers"]["models"]) == ["fit", "teacher", "student"]
 
 
 def _kept(monkeypatch) -> list:

@@ -35,7 +35,7 @@ def own(run, tmp_path):
 
 
 def standing(run) -> dict[str, StageRecord]:
-    fit = StageRecord(run / "70_bind", read_manifest(run / "70_bind"), ran=False)
+    fit = StageRecord(run / "70_fit", read_manifest(run / "70_fit"), ran=False)
     return standing_trainings(run, [fit])
 
 
@@ -109,13 +109,13 @@ def test_trainings_of_files_that_were_made_anew_are_left_out(own):
     shutil.rmtree(own / "85_bake")
     assert list(standing(own)) == ["80_teacher", "83_cloth", "90_compensate"]
     inputs = read_manifest(own / "80_teacher")["inputs"]
-    change(own / "80_teacher", inputs={**inputs, "70_bind/gaussians.safetensors": "other"})
+    change(own / "80_teacher", inputs={**inputs, "70_fit/gaussians.safetensors": "other"})
     assert "80_teacher" not in standing(own)
 
 
 def test_what_an_outdated_training_gave_on_is_outdated_too(own):
     inputs = read_manifest(own / "80_teacher")["inputs"]
-    change(own / "80_teacher", inputs={**inputs, "70_bind/gaussians.safetensors": "other"})
+    change(own / "80_teacher", inputs={**inputs, "70_fit/gaussians.safetensors": "other"})
     assert standing(own) == {}
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipelines.cli import main
-from pipelines.runs.places import keep_out_of_capture
+from pipelines.runs.lock import own_run_folder
+from pipelines.runs.places import keep_out_of_capture, refuse_old_run
 from smplxpp.capture import find_problems, find_reference, open_capture
 from smplxpp.core.errors import InputError
 
@@ -45,7 +46,7 @@ def test_a_run_lies_beside_the_files_of_its_capture_or_in_its_folder_runs(tmp_pa
     keep_out_of_capture(tmp_path / out, None)
 
 
-@pytest.mark.parametrize("name", ["00_capture", "70_bind", "ablation"])
+@pytest.mark.parametrize("name", ["08_capture", "70_fit", "ablation"])
 def test_a_capture_does_not_take_the_place_of_a_stage(tmp_path, name):
     with pytest.raises(InputError, match=f"takes the place of {name}"):
         keep_out_of_capture(tmp_path, tmp_path / name / "person")
@@ -58,7 +59,7 @@ def test_a_capture_does_not_take_the_place_of_a_stage(tmp_path, name):
         ("build", "--capture", "CAPTURE", "--out", "CAPTURE"),
         ("register", "--capture", "CAPTURE", "--out", "CAPTURE"),
         ("train", "--run", "CAPTURE", "--capture", "CAPTURE"),
-        ("fit-reference", "CAPTURE", "--capture", "CAPTURE"),
+        ("fit", "CAPTURE", "--capture", "CAPTURE"),
         ("evaluate", "CAPTURE", "--capture", "CAPTURE"),
         ("ablate", "--run", "CAPTURE", "--capture", "CAPTURE"),
         ("capture", "check", "CAPTURE", "--out", "CAPTURE"),
@@ -84,8 +85,42 @@ def test_a_run_in_the_captures_folder_runs_is_no_part_of_the_capture(tmp_path):
     before, reference = open_capture(root), find_reference(root)
     run = root / "runs" / "one"
     for name in ("scans", "rgbs", "params", "labels"):
-        shutil.copytree(root / name, run / "00_capture" / name)
+        shutil.copytree(root / name, run / "08_capture" / name)
     after = open_capture(root)
     assert (after.format, after.frames, list(after.cameras)) == (before.format, before.frames, list(before.cameras))
     assert find_problems(after) == find_problems(before)
     assert find_reference(root) == reference
+
+
+@pytest.mark.parametrize(("old", "new"), [("00_capture", "08_capture"), ("70_bind", "70_fit")])
+def test_a_run_with_stages_of_old_names_is_refused_by_every_command_that_opens_one(tmp_path, capsys, old, new):
+    run, photos = tmp_path / "run", str(FIXTURE)
+    (run / old).mkdir(parents=True)
+    refuse_old_run(run)  # a folder of that name is no stage
+    (run / old / "manifest.json").write_text("{}")
+    before = sorted(run.rglob("*"))
+    commands = (
+        ("build", "--capture", photos, "--out", str(run)),
+        ("register", "--capture", photos, "--out", str(run)),
+        ("reconstruct", photos, "--out", str(run)),
+        ("fit", str(run), "--capture", photos),
+        ("train", "--run", str(run), "--capture", photos),
+        ("evaluate", str(run), "--capture", photos),
+        ("ablate", "--run", str(run), "--capture", photos),
+        ("inspect", str(run)),
+        ("view", str(run)),
+        ("label", str(run)),
+        ("animate", str(run), "--params", str(FIXTURE / "params.npz"), "--out", str(tmp_path / "film.mp4")),
+        ("talk", str(run), "--text", "Hello."),
+        ("chat", str(run)),
+        ("web", str(run)),
+        ("export", str(run)),
+    )
+    for command in commands:
+        assert main(list(command)) == 2, command
+        message = " ".join(capsys.readouterr().err.split())
+        assert "expected stages named as this version names them" in message and new in message, command
+        assert f"received {old}, which an earlier version wrote" in message, command
+    with pytest.raises(InputError, match=old), own_run_folder(run, ()):
+        pass
+    assert sorted(run.rglob("*")) == before

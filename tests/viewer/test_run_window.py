@@ -201,12 +201,12 @@ def test_a_training_is_followed(tmp_path):
     session = open_run(run, template())
     window = open_run_window(session, port=free_port())
     try:
-        begin(run, "70_bind", 10)
+        begin(run, "70_fit", 10)
         window.look_again()
         told = window._training.content
-        assert "70_bind" in told and "step 10" in told and "31.5 dB" in told and "step 0: 20.5 dB" in told
+        assert "70_fit" in told and "step 10" in told and "31.5 dB" in told and "step 0: 20.5 dB" in told
         assert (window._preview.image == 10).all() and window._preview.visible
-        work = begin(run, "70_bind", 200)
+        work = begin(run, "70_fit", 200)
         later = time.time() + 5.0
         os.utime(work / "previews" / "Cam_000001.png", (later, later))
         window.look_again()
@@ -216,7 +216,7 @@ def test_a_training_is_followed(tmp_path):
         (run / GAUSSIANS).parent.mkdir()
         save_bound(varied(gaussians()), run / GAUSSIANS)
         window.look_again()
-        assert "/gaussians" in window.scene.names and "70_bind" in said(window)
+        assert "/gaussians" in window.scene.names and "70_fit" in said(window)
         assert not window._splats.disabled and "none is" in window._training.content
         before = colors(window)
         # The next one has a checkpoint: its attributes take their place.

@@ -39,10 +39,10 @@ from pipelines.runs.artefacts import load_params_of_run, load_scan
 from pipelines.runs.digests import versions
 from pipelines.runs.layout import (
     ASSEMBLE_STAGE,
-    BIND_STAGE,
     BUILD_STAGES,
     CLOTH_STAGE,
     EVALUATE_STAGE,
+    FIT_STAGE,
     LOCATE_STAGE,
     RECONSTRUCT_STAGE,
     REFINE_STAGE,
@@ -70,7 +70,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
     poses, relit = standing_refinement(run, template_digest), standing_relighting(run, template_digest)
     records = {**records, **({} if poses is None else {REFINE_STAGE: poses})}
-    records = {**records, **({} if fit is None else {BIND_STAGE: fit})}
+    records = {**records, **({} if fit is None else {FIT_STAGE: fit})}
     trainings = standing_trainings(run, records.values())
     records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
     records = {**records, **({} if relit is None else {RELIGHT_STAGE: relit})}
@@ -81,7 +81,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     scan, colors, _ = load_scan(run)
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
-    early = tuple(c for c in checks if c.stage in ("00_capture", "10_body", "20_segment"))
+    early = tuple(c for c in checks if c.stage in ("08_capture", "10_body", "20_segment"))
     registration = records.get(REGISTER_STAGE)
     kept, moved, checked = (records[name] for name in ("30_clean", "40_transfer", VALIDATE_STAGE))
     found = records.get(LOCATE_STAGE)

@@ -1,4 +1,4 @@
-"""The report's section on an evaluation: photograph, reference fit, teacher and student beside each other."""
+"""The report's section on an evaluation: photograph, fit, teacher and student beside each other."""
 
 from __future__ import annotations
 

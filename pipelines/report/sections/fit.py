@@ -1,4 +1,4 @@
-"""The report's section on a reference fit, from the files of its stage."""
+"""The report's section on a fit, from the files of its stage."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avatar.training.engine.metrics_log import read_metrics
 from pipelines.figures import encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
-from pipelines.runs.layout import BIND_STAGE, TEMPLATE
+from pipelines.runs.layout import FIT_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers, shown
@@ -25,10 +25,10 @@ _FIGURES = ("psnr", "psnr_image", "ssim", "psnr_head")
 
 def standing_fit(run: Path, template_digest: str) -> StageRecord | None:
     """The fit in a run, None where there is none or one of another template than the run has now."""
-    manifest = read_manifest(run / BIND_STAGE)
+    manifest = read_manifest(run / FIT_STAGE)
     if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
         return None
-    return StageRecord(run / BIND_STAGE, manifest, ran=False)
+    return StageRecord(run / FIT_STAGE, manifest, ran=False)
 
 
 def fit_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
@@ -70,15 +70,15 @@ def fit_section(record: StageRecord) -> Section:
             f"from 0 (pale) to {ERROR_LIMIT} of 255 and more (dark).",
             f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations in "
             f"{numbers['seconds_of_steps']:.0f} s, {numbers['iterations_per_second']:.1f} a second. "
-            f"{BIND_STAGE}/splats.ply holds the splats of this pose in the layout of 3D Gaussian Splatting, "
-            f"{BIND_STAGE}/gaussians.safetensors holds them bound to the triangles.",
+            f"{FIT_STAGE}/splats.ply holds the splats of this pose in the layout of 3D Gaussian Splatting, "
+            f"{FIT_STAGE}/gaussians.safetensors holds them bound to the triangles.",
             numbers["convention"],
         ),
         pictures=(*pictures, Picture(f"error, of 255: 0 to {ERROR_LIMIT} and more", encode_png(error_legend()))),
         comparisons=tuple(comparisons),
         curves=_curves(record.folder / "metrics.jsonl"),
         tables=(_table(numbers),),
-        checks=tuple(CheckRow.of(check, stage=BIND_STAGE) for check in record.manifest["checks"]),
+        checks=tuple(CheckRow.of(check, stage=FIT_STAGE) for check in record.manifest["checks"]),
     )
 
 

@@ -126,7 +126,7 @@ def test_a_build_takes_up_what_register_has_made(tmp_path, solver, capsys):
     capsys.readouterr()
     assert main(["build", *options, "--register", "off"]) == 0
     stages = json.loads(capsys.readouterr().out)["stages"]
-    assert "05_register" not in stages and "00_capture" in stages
+    assert "05_register" not in stages and "08_capture" in stages
     assert registration_of(tmp_path, params=FIXTURE / "params" / "params.npz") is None
 
 

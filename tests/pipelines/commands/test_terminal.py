@@ -51,7 +51,7 @@ def test_a_pipe_that_nobody_reads_ends_the_command_quietly(args, monkeypatch, ca
 
 @pytest.mark.parametrize("option", [[], ["--json"]])
 def test_the_answer_of_a_command_to_a_full_stdout(option, tmp_path, monkeypatch, capfd):
-    add_stage(tmp_path / "run", "00_capture")
+    add_stage(tmp_path / "run", "08_capture")
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert main(["inspect", str(tmp_path / "run"), *option]) == 2
@@ -78,7 +78,7 @@ def test_what_stderr_refuses_changes_nothing(monkeypatch, capfd):
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 def test_letters_that_the_encoding_lacks_are_escaped(encoding, tmp_path, monkeypatch, capfd):
     run = tmp_path / "Ω\udcff"  # a letter, and a byte of a name that is not UTF-8
-    add_stage(run, "00_capture")
+    add_stage(run, "08_capture")
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding=encoding, errors="strict"))
     for args in (["inspect", str(run)], ["inspect", str(run), "--json"], ["--help"]):

@@ -89,7 +89,7 @@ def test_labels_of_points_reach_the_parts_and_labels_of_others_are_refused(tmp_p
         build(tmp_path / "run", inputs, BuildConfig(), last="30_clean")
     with (
         np.load(tmp_path / "run" / "20_segment" / "labels.npz") as found,
-        np.load(tmp_path / "run" / "00_capture" / "scan.npz") as scan,
+        np.load(tmp_path / "run" / "08_capture" / "scan.npz") as scan,
     ):
         face_labels, source = found["face_labels"], scan["scan/source_vertex"]
         faces = scan["scan/faces"]

@@ -47,7 +47,7 @@ def track(frames, tmp_path_factory) -> Track:
 
 
 def painted():
-    """Gaussians in the colours of the photographs, as a reference fit would have them."""
+    """Gaussians in the colours of the photographs, as a fit would have them."""
     bound, it = gaussians(1200), template()
     where = world_from_local(bound, torch.tensor(it.vertices, dtype=torch.float32), torch.tensor(it.faces)).means
     x, y, z = where.unbind(-1)

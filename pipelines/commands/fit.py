@@ -1,4 +1,4 @@
-"""`smplxpp fit-reference`: a template and one frame's photographs in; Gaussians on it, figures and a report out."""
+"""`smplxpp fit`: a template and one frame's photographs in; Gaussians on it, figures and a report out."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
-    from avatar.training.reference_fit.config import FitConfig
+    from avatar.training.fit.config import FitConfig
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class FitReference:
-    """Options of `smplxpp fit-reference`. The same command goes on with a fit that was interrupted."""
+class Fit:
+    """Options of `smplxpp fit`. The same command goes on with a fit that was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` wrote; the fit goes into it as 70_bind."""
+    """Folder that `smplxpp build` wrote; the fit goes into it as 70_fit."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of the frame."""
     frame: int = 0
@@ -76,9 +76,9 @@ class FitReference:
         from avatar.training.engine.processes import Distributed
         from avatar.training.refinement.config import RefineConfig
         from pipelines.report.sections.build import rewrite_report
-        from pipelines.runs.layout import BIND_STAGE, REPORT_FILE
+        from pipelines.runs.layout import FIT_STAGE, REPORT_FILE
         from pipelines.runs.places import keep_out_of_capture
-        from pipelines.stages.bind import BindStage
+        from pipelines.stages.fit import FitStage
         from pipelines.stages.models import Trainer, TrainOptions
         from pipelines.stages.refine import refine, wants_refinement
         from pipelines.stages.scene import TrainInputs, open_frame
@@ -97,7 +97,7 @@ class FitReference:
                 max_seconds=60.0 * self.max_minutes, force=self.force, bar=lambda name, total: nullcontext(progress)
             )
             trainer = Trainer(self.run_folder, scene, options, Distributed(device=device), scale=self.scale)
-            record = trainer.make(BindStage(name=BIND_STAGE, config=config, by_hand=True))
+            record = trainer.make(FitStage(name=FIT_STAGE, config=config, by_hand=True))
         report = self.run_folder / REPORT_FILE
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
             log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
@@ -115,7 +115,7 @@ class FitReference:
         """
         from dataclasses import replace
 
-        from avatar.training.reference_fit.config import PRESETS
+        from avatar.training.fit.config import PRESETS
 
         config = PRESETS[self.preset]
         count = config.sampling.count if self.gaussians is None else self.gaussians

@@ -16,7 +16,7 @@ from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.rig.rig import Rig
-from avatar.training.reference_fit.picture_detail import changes, density_of_detail
+from avatar.training.fit.picture_detail import changes, density_of_detail
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth

@@ -1,4 +1,4 @@
-"""Reference fit: one frame's views turn a posed template into textured Gaussians bound to its triangles."""
+"""Fit: one frame's views turn a posed template into textured Gaussians bound to its triangles."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from avatar.metrics.view_quality import Box, ViewQuality, head_box, head_vertice
 from avatar.models.student import Student, StudentConfig
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
-from avatar.training.reference_fit.config import FitConfig
-from avatar.training.reference_fit.initial_colors import initial_gaussians
+from avatar.training.fit.config import FitConfig
+from avatar.training.fit.initial_colors import initial_gaussians
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
@@ -72,7 +72,7 @@ class FitResult:
     heads: dict[str, Box | None]
 
 
-def fit_reference(
+def fit_gaussians(
     scene: FitScene,
     config: FitConfig,
     folder: Path,
@@ -117,7 +117,7 @@ def fit_reference(
 
 
 class FitTask(PhotometricTask):
-    """A reference fit: a student without field or blend shapes learns its Gaussians' attributes on one frame.
+    """A fit: a student without field or blend shapes learns its Gaussians' attributes on one frame.
 
     A step renders one view.
     """

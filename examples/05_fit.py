@@ -1,4 +1,4 @@
-"""One frame's photographs become textured Gaussians on a template: what `smplxpp fit-reference` does, in Python.
+"""One frame's photographs become textured Gaussians on a template: what `smplxpp fit` does, in Python.
 
 Without --run it builds the template first.
 """
@@ -38,7 +38,7 @@ def main() -> None:
 
     # A third of the default's Gaussians and a tenth of its steps: seconds instead of minutes.
     config = avatar.FitConfig(sampling=avatar.SamplingConfig(count=50_000), iterations=60, evaluations=3)
-    result = avatar.fit_reference(scene, config, out)
+    result = avatar.fit_gaussians(scene, config, out)
     avatar.write_splat_ply(out / "splats.ply", result.splats)
     for view in held_out:
         pair = np.concatenate([view.photograph(scene.background), result.images[view.name]], axis=1)

@@ -20,8 +20,8 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.session import Session
-from avatar.training.reference_fit.config import FitConfig
-from avatar.training.reference_fit.fit import FitResult, FitScene, fit_reference
+from avatar.training.fit.config import FitConfig
+from avatar.training.fit.fit import FitResult, FitScene, fit_gaussians
 from pipelines.figures.comparison import write_strip
 from pipelines.runs import gates
 from pipelines.runs.digests import sha256_file
@@ -36,11 +36,11 @@ PREVIEWED_TRAINING_VIEWS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class BindStage(ModelStage):
+class FitStage(ModelStage):
     """Gaussians fitted to one frame's photographs.
 
     Attributes:
-        config: of the fit. by_hand: made by `smplxpp fit-reference`; a training takes such a fit as it stands.
+        config: of the fit. by_hand: made by `smplxpp fit`; a training takes such a fit as it stands.
     """
 
     file = "gaussians.safetensors"
@@ -101,7 +101,7 @@ class BindStage(ModelStage):
         def preview(images: Mapping[str, np.ndarray]) -> None:
             _write_strips(session.folder, images, views, scene.background)
 
-        result = fit_reference(
+        result = fit_gaussians(
             scene,
             self.config,
             session.folder,

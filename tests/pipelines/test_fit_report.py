@@ -33,8 +33,8 @@ def fitted(tmp_path_factory) -> StageRecord:
     base = tmp_path_factory.mktemp("fit")
     run, capture = write_run(base / "run"), write_capture(base / "capture")
     options = ("--gaussians", "800", "--iterations", "4", "--device", "cpu", "--json")
-    assert main(["fit-reference", str(run), "--capture", str(capture), *options]) == 0
-    return StageRecord(run / "70_bind", read_manifest(run / "70_bind"), ran=True)
+    assert main(["fit", str(run), "--capture", str(capture), *options]) == 0
+    return StageRecord(run / "70_fit", read_manifest(run / "70_fit"), ran=True)
 
 
 def test_the_section_shows_every_held_out_camera_whole_and_the_head_enlarged(fitted):
@@ -185,14 +185,14 @@ def test_the_report_of_a_build_gains_the_section_and_keeps_it(fitted, tmp_path):
     ]
     assert main(build) == 0
     assert "<h2>Gaussians" not in (run / "report.html").read_text()
-    shutil.copytree(fitted.folder, run / "70_bind")
-    manifest = json.loads((run / "70_bind" / "manifest.json").read_text())
+    shutil.copytree(fitted.folder, run / "70_fit")
+    manifest = json.loads((run / "70_fit" / "manifest.json").read_text())
     manifest["inputs"]["60_assemble/smplxpp.npz"] = sha256_file(run / "60_assemble" / "smplxpp.npz")
-    (run / "70_bind" / "manifest.json").write_text(json.dumps(manifest))
+    (run / "70_fit" / "manifest.json").write_text(json.dumps(manifest))
     rewrite_report(run)
     assert "<h2>Gaussians" in (run / "report.html").read_text()
-    (run / "70_bind" / "manifest.json").touch()  # newer than the report: the next build writes it again
+    (run / "70_fit" / "manifest.json").touch()  # newer than the report: the next build writes it again
     (run / "report.html").write_text("old")
-    (run / "70_bind" / "manifest.json").touch()
+    (run / "70_fit" / "manifest.json").touch()
     assert main(build) == 0
     assert "<h2>Gaussians" in (run / "report.html").read_text()

@@ -1,6 +1,6 @@
-"""The reference fit on a capture: iterations a second, quality of held-out views as time goes by, where time goes.
+"""The fit on a capture: iterations a second, quality of held-out views as time goes by, where time goes.
 
-    python -m benchmarks.fit_reference --capture DIR [--gaussians 150000] [--iterations 600]
+    python -m benchmarks.fit --capture DIR [--gaussians 150000] [--iterations 600]
 
 The template is built first, which is not counted. Times are of the process alone on the machine or they mean little.
 """
@@ -27,8 +27,8 @@ from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.reference_fit.config import PRESETS, FitConfig
-from avatar.training.reference_fit.fit import FitScene, FitTask, fit_reference
+from avatar.training.fit.config import PRESETS, FitConfig
+from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
 from benchmarks.machine import store_results
 from pipelines.commands.build import Build
 from pipelines.stages.build import build
@@ -57,7 +57,7 @@ class FitBenchmark:
         )
         with tempfile.TemporaryDirectory() as folder:
             scene = _scene(self.capture, Path(folder) / "run")
-            result = fit_reference(scene, config, Path(folder) / "fit")
+            result = fit_gaussians(scene, config, Path(folder) / "fit")
             entries = read_metrics(Path(folder) / "fit" / METRICS_FILE)
         quality = [
             {"iteration": e["iteration"], "seconds": e["seconds"], **{k: round(v, 4) for k, v in e["mean"].items()}}
@@ -75,7 +75,7 @@ class FitBenchmark:
             "milliseconds_of_a_step": _parts(scene, config),
         }
         _print(figures)
-        path = store_results("fit_reference", "python -m benchmarks.fit_reference --capture DIR", figures)
+        path = store_results("fit", "python -m benchmarks.fit --capture DIR", figures)
         print(f"stored {path.name}")
 
 
@@ -146,4 +146,4 @@ def _print(figures: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(FitBenchmark, prog="python -m benchmarks.fit_reference").run()
+    tyro.cli(FitBenchmark, prog="python -m benchmarks.fit").run()

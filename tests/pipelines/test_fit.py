@@ -1,4 +1,4 @@
-"""`smplxpp fit-reference` from end to end on a doll: files, figures, skipping, resuming, and what it refuses."""
+"""`smplxpp fit` from end to end on a doll: files, figures, skipping, resuming, and what it refuses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMALL = ("--gaussians", "1500", "--iterations", "12", "--device", "cpu", "--json
 
 
 def fit(run, capture, *options: str) -> int:
-    return main(["fit-reference", str(run), "--capture", str(capture), *SMALL, *options])
+    return main(["fit", str(run), "--capture", str(capture), *SMALL, *options])
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +59,13 @@ def refused(capsys, run, capture, *options: str) -> str:
 
 def same_fit(one, two) -> bool:
     """Whether two runs hold the same Gaussians, bit for bit."""
-    a, b = (load_bound(run / "70_bind" / "gaussians.safetensors").tensors for run in (one, two))
-    splats = [(run / "70_bind" / "splats.ply").read_bytes() for run in (one, two)]
+    a, b = (load_bound(run / "70_fit" / "gaussians.safetensors").tensors for run in (one, two))
+    splats = [(run / "70_fit" / "splats.ply").read_bytes() for run in (one, two)]
     return splats[0] == splats[1] and all(value.equal(b[name]) for name, value in a.items())
 
 
 def test_files_and_figures(fitted):
-    folder = fitted / "70_bind"
+    folder = fitted / "70_fit"
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     strips = {f"previews/{name}.png" for name in (*HELD_OUT, "Ring0", "Ring3", "Face")}
     assert files == {"manifest.json", "gaussians.safetensors", "splats.ply", "metrics.jsonl", *strips}
@@ -79,14 +79,14 @@ def test_files_and_figures(fitted):
     real, rendered, error = read_strip(folder / "previews" / "Held0.png")
     np.testing.assert_array_equal(real, doll().images["Held0"])
     assert rendered.shape == error.shape == real.shape
-    assert not list(fitted.glob("70_bind_work"))
+    assert not list(fitted.glob("70_fit_work"))
 
 
 def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
     summary, checks = summarise_run(own)
-    stage = next(s for s in summary["stages"] if s["stage"] == "70_bind")
+    stage = next(s for s in summary["stages"] if s["stage"] == "70_fit")
     assert stage["state"] == "done" and stage["files"] == 8
-    assert {c.name for c in checks if c.stage == "70_bind"} >= {
+    assert {c.name for c in checks if c.stage == "70_fit"} >= {
         "held-out views: PSNR of the person",
         "held-out views: gain of PSNR since the start",
     }
@@ -94,22 +94,22 @@ def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
         json.dumps({"schema": SCHEMA, "stage": "60_assemble", "seconds": 1.0, "files": {"smplxpp.npz": "other"}})
     )
     summary, _ = summarise_run(own)
-    assert next(s for s in summary["stages"] if s["stage"] == "70_bind")["state"] == "outdated"
+    assert next(s for s in summary["stages"] if s["stage"] == "70_fit")["state"] == "outdated"
 
 
 @pytest.mark.parametrize(
     ("stage", "command"),
-    [("70_bind", "fit-reference"), ("50_unpose", "build"), ("85_bake", "train"), ("95_evaluate", "evaluate")],
+    [("70_fit", "fit"), ("50_unpose", "build"), ("85_bake", "train"), ("95_evaluate", "evaluate")],
 )
 def test_inspect_says_which_command_makes_a_stage(own, stage, command):
     assert f"smplxpp {command} " in inspect._remedy(own, stage)
 
 
 def test_a_fit_that_stands_is_not_run_again(own, capture, capsys):
-    made = (own / "70_bind" / "manifest.json").stat().st_mtime_ns
+    made = (own / "70_fit" / "manifest.json").stat().st_mtime_ns
     assert fit(own, capture) == 0
     assert json.loads(capsys.readouterr().out)["ran"] is False
-    assert (own / "70_bind" / "manifest.json").stat().st_mtime_ns == made
+    assert (own / "70_fit" / "manifest.json").stat().st_mtime_ns == made
     assert fit(own, capture, "--seed", "1") == 0
     assert json.loads(capsys.readouterr().out)["ran"] is True
 
@@ -119,17 +119,17 @@ def test_a_limit_of_time_gives_a_result_and_the_same_command_goes_on(fitted, tmp
     assert fit(run, capture, "--max-minutes", "1e-9") == 0
     first = json.loads(capsys.readouterr().out)
     assert (first["iterations_done"], first["finished"]) == (1, False)
-    assert (run / "70_bind" / "splats.ply").is_file() and (run / "70_bind_work").is_dir()
+    assert (run / "70_fit" / "splats.ply").is_file() and (run / "70_fit_work").is_dir()
     assert {c["name"]: c["status"] for c in first["checks"]}["iterations done"] == "warn"
     assert fit(run, capture) == 0
     assert json.loads(capsys.readouterr().out)["finished"]
     assert same_fit(run, fitted)
-    assert not (run / "70_bind_work").exists()
+    assert not (run / "70_fit_work").exists()
 
 
 def test_a_killed_fit_goes_on(fitted, tmp_path, capture, monkeypatch):
     from avatar.training.engine import loop
-    from avatar.training.reference_fit.fit import FitTask
+    from avatar.training.fit.fit import FitTask
 
     run = write_run(tmp_path / "run")
     step = FitTask.step
@@ -142,7 +142,7 @@ def test_a_killed_fit_goes_on(fitted, tmp_path, capture, monkeypatch):
     monkeypatch.setattr(loop.LoopConfig, "__init__", _often(loop.LoopConfig.__init__))
     monkeypatch.setattr(FitTask, "step", killed)
     assert fit(run, capture) == 130
-    assert not (run / "70_bind").exists()
+    assert not (run / "70_fit").exists()
     monkeypatch.setattr(FitTask, "step", step)
     assert fit(run, capture) == 0
     assert same_fit(run, fitted)
@@ -170,7 +170,7 @@ def test_held_out_cameras_are_the_users_choice(tmp_path, capture, capsys):
     assert fit(run, capture, "--hold-out", "Ring1", "--iterations", "1", "--scale", "0.5") == 0
     numbers = json.loads(capsys.readouterr().out)
     assert list(numbers["held_out"]) == ["Ring1"] and set(numbers["train"]) == {*TRAIN, *HELD_OUT} - {"Ring1"}
-    assert read_strip(run / "70_bind" / "previews" / "Ring1.png")[0].shape == (40, 32, 3)
+    assert read_strip(run / "70_fit" / "previews" / "Ring1.png")[0].shape == (40, 32, 3)
 
 
 def test_what_the_capture_lacks_is_said_before_work_starts(tmp_path, capsys):
@@ -217,7 +217,7 @@ def test_a_missing_extra_is_named(fitted, capture, capsys, monkeypatch):
 
 def test_the_terminal_shows_figures_and_where_things_are(own, capture, capsys):
     options = [o for o in SMALL if o != "--json"]
-    assert main(["fit-reference", str(own), "--capture", str(capture), *options]) == 0
+    assert main(["fit", str(own), "--capture", str(capture), *options]) == 0
     out = capsys.readouterr().out
     assert "mean, held out" in out and "stands, not run again" in out and "splats.ply" in out
 

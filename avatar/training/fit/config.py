@@ -1,4 +1,4 @@
-"""What decides a reference fit, and presets that differ in time and detail."""
+"""What decides a fit, and presets that differ in time and detail."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from smplxpp.core.validation import require_between
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """Choices of a reference fit.
+    """Choices of a fit.
 
     Attributes:
         sampling: number of Gaussians and where they start. detail: how much denser they lie where the photographs

@@ -16,8 +16,8 @@ from avatar.training.engine.device import choose_device
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import DivergedError
-from avatar.training.reference_fit.config import FitConfig
-from avatar.training.reference_fit.fit import FitScene, FitTask, fit_reference
+from avatar.training.fit.config import FitConfig
+from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from tests.dolls.standing import HELD_OUT, TRAIN, doll
@@ -43,7 +43,7 @@ def scene(**changes) -> FitScene:
 def fitted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit")
     seen = []
-    return fit_reference(scene(), CONFIG, folder, preview=seen.append), read_metrics(folder / "metrics.jsonl"), seen
+    return fit_gaussians(scene(), CONFIG, folder, preview=seen.append), read_metrics(folder / "metrics.jsonl"), seen
 
 
 def test_held_out_views_get_better_and_good(fitted):
@@ -82,8 +82,8 @@ def test_the_same_seed_gives_the_same_bits(tmp_path, threads):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        one, two = (fit_reference(scene(), config, tmp_path / name).gaussians for name in ("one", "two"))
-        other = fit_reference(scene(), replace(config, seed=1), tmp_path / "other").gaussians
+        one, two = (fit_gaussians(scene(), config, tmp_path / name).gaussians for name in ("one", "two"))
+        other = fit_gaussians(scene(), replace(config, seed=1), tmp_path / "other").gaussians
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(value, two.tensors[name]) for name, value in one.tensors.items())
@@ -92,10 +92,10 @@ def test_the_same_seed_gives_the_same_bits(tmp_path, threads):
 
 def test_an_interrupted_fit_is_the_uninterrupted_one(tmp_path):
     config = replace(CONFIG, iterations=6, evaluations=1)
-    whole = fit_reference(scene(), config, tmp_path / "whole", key="k").gaussians
+    whole = fit_gaussians(scene(), config, tmp_path / "whole", key="k").gaussians
     sessions, done = 0, False
     while not done:
-        part = fit_reference(scene(), config, tmp_path / "parts", key="k", max_seconds=1e-9 if sessions < 3 else 1e9)
+        part = fit_gaussians(scene(), config, tmp_path / "parts", key="k", max_seconds=1e-9 if sessions < 3 else 1e9)
         sessions, done = sessions + 1, part.progress.finished
     assert sessions == 4
     assert all(torch.equal(value, part.gaussians.tensors[name]) for name, value in whole.tensors.items())
@@ -109,14 +109,14 @@ def test_every_view_has_its_turn_once_an_epoch():
 
 
 def test_the_silhouette_is_met_with_a_coloured_background(tmp_path):
-    result = fit_reference(scene(background=(0.9, 0.2, 0.4)), replace(CONFIG, iterations=30), tmp_path)
+    result = fit_gaussians(scene(background=(0.9, 0.2, 0.4)), replace(CONFIG, iterations=30), tmp_path)
     corner = result.images["Held0"][0, 0]
     np.testing.assert_array_equal(corner, np.round(255 * np.array([0.9, 0.2, 0.4])))
     assert result.quality["Held0"].psnr_image > 25
 
 
 def test_without_held_out_views_training_views_are_measured(tmp_path):
-    fit_reference(scene(held_out=[]), replace(CONFIG, iterations=2), tmp_path)
+    fit_gaussians(scene(held_out=[]), replace(CONFIG, iterations=2), tmp_path)
     last = read_metrics(tmp_path / "metrics.jsonl")[-1]
     assert not last["held_out"] and set(last["views"]) == set(TRAIN)
 
@@ -124,7 +124,7 @@ def test_without_held_out_views_training_views_are_measured(tmp_path):
 def test_a_loss_that_is_not_finite_stops_with_the_views_name(tmp_path):
     config = replace(CONFIG, rates=LearningRates(log_scales=1e30))
     with pytest.raises(DivergedError, match=r"step \d+, view (Ring|Face)"):
-        fit_reference(scene(), config, tmp_path)
+        fit_gaussians(scene(), config, tmp_path)
 
 
 def test_scenes_that_cannot_be_fitted_are_refused():
