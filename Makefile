@@ -25,7 +25,7 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
 
-# Every reader with 100,000 damaged files: hours. `python -m benchmarks.damaged_files --inputs 1000` tries fewer.
+# Every reader with 100,000 damaged files: hours. `python -m benchmarks damaged_files --inputs 1000` tries fewer.
 test-fuzz: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m fuzz -n 2
 
