@@ -26,9 +26,9 @@ import tyro
 from avatar.runtime import AvatarPlayer
 from avatar.speech.voice import PiperVoice
 from benchmarks.machine import store_results
-from pipelines.chat.conversation import Cast
+from pipelines.chat.conversation import ChatParts
+from pipelines.chat.hearing import BLOCK, RATE
 from pipelines.chat.server import ChatServer
-from pipelines.chat.voice_activity import BLOCK, RATE
 from pipelines.commands.chat import Chat
 from pipelines.figures import fit_cameras
 from smplxpp.core.files.tensor_bytes import unpack_tensors
@@ -64,7 +64,7 @@ class ChatBenchmark:
         from pipelines.commands.animate_student import open_student
 
         bundle = open_student(self.avatar)
-        cast = command.cast(bundle, command.partner())
+        cast = command.engines(bundle, command.partner())
         cast.voice.say("Hello.")
         turns: list[dict[str, float]] = []
         server = ChatServer(
@@ -165,7 +165,7 @@ class _Page:
         self._socket.send(json.dumps({"kind": "began", "turn": turn, "what": what}))
 
 
-def _cpu(cast: Cast, page: _Page) -> dict[str, float]:
+def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
     """Seconds of CPU of the parts on their own, means over the sentences; a block is 32 ms of sound."""
     out: dict[str, list[float]] = {}
     activity, performer, recogniser = cast.activity(), cast.performer(), cast.recogniser

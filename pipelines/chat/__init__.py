@@ -1,1 +1,1 @@
-"""A conversation with an avatar in a page: it hears or reads, asks who answers, speaks and moves."""
+"""Converse with an avatar in a page: hear or read a message, get an answer, speak it and move."""

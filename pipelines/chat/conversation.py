@@ -1,10 +1,11 @@
-"""One conversation: what is typed or said goes in, answers go out by sentences, anything new stops the old."""
+"""Hold one conversation: take text or speech, answer sentence by sentence, and let anything new interrupt."""
 
 from __future__ import annotations
 
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -13,40 +14,46 @@ from jaxtyping import Int16
 
 from avatar.speech import Performer
 from avatar.speech.voice import PiperVoice
-from pipelines.chat.recogniser import Recogniser
-from pipelines.chat.sentences import sentences
-from pipelines.chat.stage import Line, Stage
-from pipelines.chat.voice_activity import Activity, Heard, Listener
+from pipelines.chat.frame_queue import FrameQueue, Line
+from pipelines.chat.hearing import Activity, Listener, Recogniser, UtterancePart
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 
+# Limits of a conversation: characters of one message, characters of one answer (some five minutes of speech), and turns
+# that a language model gets as context.
 MOST_TYPED = 2000
-"""Characters of one message."""
-_MOST_ANSWERED = 4000  # characters of one answer: some five minutes
-_REMEMBERED = 12  # turns that the partner is told again
-_WAIT = 0.1  # seconds between looks at whether frames are missing
+_MOST_ANSWERED = 4000
+_REMEMBERED = 12
+LONGEST_SENTENCE = 240
+"""Characters after which a sentence is cut at a pause or between words, because a voice is synthesised by sentences."""
+_END = re.compile("[.!?\u2026]+[\"'\u201d\u2019)\\]]*(?=\\s)|\n+")
+_PAUSE = re.compile("[,;:\u2013\u2014]\\s")
 
 
 class Partner(Protocol):
-    """Who answers: rules, or a language model."""
+    """The answering side: rules or a language model."""
 
     name: str
 
     def answer(self, history: Sequence[tuple[str, str]]) -> Iterator[str]:
-        """Yield the words of an answer to the last of (who, what), as they come."""
+        """Yield the words of an answer to the last (role, text) of the history, as they arrive."""
         ...
 
     def cancel(self) -> None:
-        """Stop waiting for them."""
+        """Stop waiting for an answer."""
 
 
 @dataclass(frozen=True)
-class Cast:
-    """What a conversation is made of.
+class ChatParts:
+    """Engines of a conversation.
 
     Attributes:
-        voice, partner: who speaks, who answers. performer: makes somebody who acts. body: its joints.
-        activity: makes a judge of whether somebody speaks. recogniser: of words; None: typing alone.
+        voice: synthesises speech.
+        partner: answers.
+        performer: returns a new generator of motion.
+        body: joints of the avatar.
+        activity: returns a new detector of voice activity.
+        recogniser: recognises words; None allows typing alone.
     """
 
     voice: PiperVoice
@@ -59,12 +66,16 @@ class Cast:
 
 @dataclass
 class Turn:
-    """One thing said and its answer.
+    """A message and its answer.
 
     Attributes:
-        number: from 1. asked, answered: what the person said, and the sentences that were said to it.
-        began: the clock's time when the person had ended. spoken: aloud, or else typed.
-        marks: seconds from there to each part, in order. cancelled: something new has come.
+        number: number of the turn, from 1.
+        asked: the person's words.
+        began: time of the clock at which the person had ended.
+        spoken: whether the words were spoken and not typed.
+        answered: sentences of the answer so far.
+        marks: seconds from `began` to each part of the answer, in order.
+        cancelled: whether a newer message has interrupted the turn.
     """
 
     number: int
@@ -76,28 +87,30 @@ class Turn:
     cancelled: bool = False
 
     def mark(self, part: str) -> None:
-        """Note that a part is done, the first time."""
+        """Record the time of a part, the first time that it is done."""
         self.marks.setdefault(part, time.monotonic() - self.began)
 
 
 class Conversation:
-    """A page's partner.
+    """The conversation with one page.
 
     Args:
-        cast: who takes part. tell: takes what the page is to know (an object with `kind`). show: takes messages of
-            the `Stage`. report: takes turns whose answer is heard and seen.
+        parts: engines.
+        tell: called with messages for the page, objects with `kind`.
+        show: called with the messages of the `FrameQueue`.
+        report: called with a turn once its answer is heard and seen.
     """
 
     def __init__(
         self,
-        cast: Cast,
+        parts: ChatParts,
         tell: Callable[[dict[str, Any]], None],
         show: Callable[[bytes], None],
         report: Callable[[Turn], None] = lambda _: None,
     ) -> None:
-        self._cast, self._tell, self._report = cast, tell, report
-        self.stage = Stage(cast.performer(), cast.body, show)
-        self._listener = Listener(cast.activity())
+        self._parts, self._tell, self._report = parts, tell, report
+        self.frames = FrameQueue(parts.performer(), parts.body, show)
+        self._listener = Listener(parts.activity())
         self._turns: list[Turn] = []
         self._turn: Turn | None = None
         self._answering: threading.Thread | None = None
@@ -106,45 +119,45 @@ class Conversation:
         self._pump.start()
 
     def typed(self, text: str) -> None:
-        """Take something typed; what is being said is stopped.
+        """Take a typed message and interrupt the answer being spoken.
 
         Raises:
-            InputError: nothing, or too much.
+            InputError: an empty or too long message.
         """
         text = " ".join(text.split())
         if not text or len(text) > MOST_TYPED:
             raise InputError(
-                "message", expected=f"1 to {MOST_TYPED} characters", received=str(len(text)), remedy="say it in parts"
+                "message", expected=f"1 to {MOST_TYPED} characters", received=str(len(text)), remedy="send it in parts"
             )
         self.stop()
         self._begin(text, time.monotonic(), spoken=False)
 
     def heard(self, samples: Int16[np.ndarray, " N"]) -> None:
-        """Take sound of the microphone, at 16 kHz; who begins to speak stops the answer."""
-        if self._cast.recogniser is None:
-            raise InputError("sound", expected="text: nothing here recognises words", received="sound")
+        """Take sound of the microphone at 16 kHz; the beginning of speech interrupts the answer."""
+        if self._parts.recogniser is None:
+            raise InputError("sound", expected="text, because no recogniser is installed", received="sound")
         for part in self._listener.hear(samples):
-            self._take(part, self._cast.recogniser)
+            self._take(part, self._parts.recogniser)
 
     def mute(self) -> None:
-        """The microphone is off: what was begun is dropped."""
-        self._listener = Listener(self._cast.activity())
-        self.stage.listen(False)
+        """Drop an utterance that was begun, because the microphone is off."""
+        self._listener = Listener(self._parts.activity())
+        self.frames.listen(False)
 
     def stop(self) -> None:
-        """End the answer at once; the page is told of it."""
+        """End the answer at once and notify the page."""
         turn = self._turn
         if turn is not None:
             turn.cancelled = True
             self._turn = None
-            self._cast.partner.cancel()
-        self.stage.hush()
+            self._parts.partner.cancel()
+        self.frames.interrupt()
         if turn is not None:
-            # Behind what was sent of it before.
+            # After the frames of the interruption, so that the page does not wait for the rest of the sentence.
             self._tell({"kind": "stopped", "turn": turn.number})
 
     def began(self, number: int, what: str) -> None:
-        """The page has begun to be heard or to show a turn's answer."""
+        """Record that the page has begun to play or to show a turn's answer."""
         turn = self._turn
         if turn is None or turn.number != number or what not in ("sound", "picture"):
             return
@@ -155,19 +168,19 @@ class Conversation:
             self._report(turn)
 
     def close(self) -> None:
-        """End everything."""
+        """End the conversation and its threads."""
         self._closed.set()
         if self._turn is not None:
             self._turn.cancelled = True
-            self._cast.partner.cancel()
+            self._parts.partner.cancel()
         for thread in (self._pump, self._answering):
             if thread is not None:
                 thread.join()
 
-    def _take(self, part: Heard, recogniser: Recogniser) -> None:
+    def _take(self, part: UtterancePart, recogniser: Recogniser) -> None:
         if part.begins:
             self.stop()
-            self.stage.listen(True)
+            self.frames.listen(True)
             self._tell({"kind": "listening"})
             recogniser.begin()
         recogniser.hear(part.samples)
@@ -176,12 +189,12 @@ class Conversation:
         began = time.monotonic() - part.silent
         decided = time.monotonic()
         words = recogniser.end()
-        self.stage.listen(False)
+        self.frames.listen(False)
         if part.cut:
-            self._note("That was long: what came after half a minute was not heard.")
+            self._note("Only the first half minute was heard.")
         if not words:
             self._tell({"kind": "heard", "text": ""})
-            self._note("I heard something, but no word that I know.")
+            self._note("I heard something, but no words.")
             return
         self._begin(words, began, spoken=True, pause=decided - began)
 
@@ -213,26 +226,26 @@ class Conversation:
 
     def _words(self, turn: Turn) -> Iterator[str]:
         count = 0
-        for piece in self._cast.partner.answer(history(self._turns)):
+        for piece in self._parts.partner.answer(history(self._turns)):
             if turn.cancelled:
                 return
             turn.mark("first words")
             yield piece[: _MOST_ANSWERED - count]
             count += len(piece)
             if count >= _MOST_ANSWERED:
-                self._note("The answer goes on; it is cut here.")
+                self._note("The answer was too long and is cut here.")
                 return
 
     def _say(self, turn: Turn, number: int, sentence: str) -> None:
         try:
-            spoken = self._cast.voice.say(sentence)
-        except InputError as error:  # another script, or signs alone: shown, not spoken
+            spoken = self._parts.voice.say(sentence)
+        except InputError as error:  # another alphabet or punctuation alone is shown and not spoken
             self._tell({"kind": "silent", "turn": turn.number, "line": number, "text": sentence})
             if any(one.isalnum() for one in sentence):
                 self._note(str(error))
             return
         turn.mark("voice")
-        self.stage.say(spoken, Line(turn.number, number, sentence), lambda: not turn.cancelled)
+        self.frames.say(spoken, Line(turn.number, number, sentence), lambda: not turn.cancelled)
         turn.mark("sent")
 
     def _note(self, text: str) -> None:
@@ -240,12 +253,12 @@ class Conversation:
 
     def _keep_ahead(self) -> None:
         while not self._closed.is_set():
-            self.stage.keep_ahead()
-            self._closed.wait(_WAIT)
+            self.frames.keep_ahead()
+            self._closed.wait(0.1)  # seconds; much shorter than the queue of frames
 
 
 def history(turns: Sequence[Turn]) -> list[tuple[str, str]]:
-    """Who ("user", "assistant") said what, in order; of answers that were stopped what was said of them."""
+    """Return (role, text) in order, with role "user" or "assistant"; interrupted answers up to the interruption."""
     out = []
     for turn in turns:
         out += [("user", turn.asked), *([("assistant", " ".join(turn.answered))] if turn.answered else [])]
@@ -253,5 +266,38 @@ def history(turns: Sequence[Turn]) -> list[tuple[str, str]]:
 
 
 def rounded(marks: dict[str, float]) -> dict[str, float]:
-    """Seconds in whole milliseconds."""
+    """Return seconds rounded to milliseconds."""
     return {part: round(seconds, 3) for part, seconds in marks.items()}
+
+
+def sentences(pieces: Iterable[str]) -> Iterator[str]:
+    """Yield the sentences of a text that arrives in pieces, as early as possible, and the remainder at the end."""
+    rest = ""
+    for piece in pieces:
+        rest += piece
+        while cut := _cut(rest):
+            sentence, rest = rest[:cut].strip(), rest[cut:]
+            if sentence:
+                yield sentence
+    if rest.strip():
+        yield from _short(rest.strip())
+
+
+def _cut(text: str) -> int:
+    """Return where the first sentence ends, 0 if that is not known yet."""
+    found = _END.search(text)
+    if found is not None and found.end() <= LONGEST_SENTENCE:
+        return found.end()
+    if len(text) <= LONGEST_SENTENCE:
+        return 0
+    pauses = [pause.end() for pause in _PAUSE.finditer(text, 0, LONGEST_SENTENCE)]
+    return pauses[-1] if pauses else text.rfind(" ", 0, LONGEST_SENTENCE) + 1 or LONGEST_SENTENCE
+
+
+def _short(text: str) -> Iterator[str]:
+    """Yield pieces of a remainder that are not too long."""
+    while cut := _cut(text):
+        yield text[:cut].strip()
+        text = text[cut:]
+    if text.strip():
+        yield text.strip()

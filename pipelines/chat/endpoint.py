@@ -1,4 +1,4 @@
-"""A language model behind an OpenAI-compatible address: asked with the conversation, its words as they come."""
+"""Ask a language model behind an OpenAI-compatible address and yield its words as they arrive."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_list, as_object, parse_json
 from smplxpp.core.validation import require_positive
 
-MANNER = (
+SYSTEM_PROMPT = (
     "You speak aloud through an avatar. Answer in one to three short sentences of plain spoken English, "
     "without lists, markup or emoji."
 )
 _PATH = "/chat/completions"
-_MOST_LINE, _MOST_BYTES = 1 << 18, 4 << 20
-_REMEDY = "see that it runs and that --llm names its base address, as http://127.0.0.1:8080/v1"
+_MOST_LINE, _MOST_BYTES = 1 << 18, 4 << 20  # bounds of a line and of an answer in bytes, against endless streams
+_REMEDY = "check that it runs and that --llm is its base address, for example http://127.0.0.1:8080/v1"
 
 
 @dataclass
@@ -29,18 +29,21 @@ class Endpoint:
     """An address that answers `POST .../chat/completions`, streamed or whole.
 
     Attributes:
-        url: the base address, or the whole one. model: its name there.
-        key: of the account; "" where none is asked for. manner: what the model is told first.
-        connecting, silent: seconds to wait for a connection, and for the next bytes.
+        url: base address, or the whole one.
+        model: name of the model there.
+        key: key of the account; "" if the address needs none.
+        prompt: system prompt.
+        connecting: seconds to wait for a connection.
+        silent: seconds to wait for the next bytes.
 
     Raises:
-        InputError: no address of that kind.
+        InputError: the address has another form.
     """
 
     url: str
     model: str = "default"
     key: str = field(default="", repr=False)
-    manner: str = MANNER
+    prompt: str = SYSTEM_PROMPT
     connecting: float = 5.0
     silent: float = 30.0
 
@@ -64,13 +67,13 @@ class Endpoint:
         """Yield the model's words.
 
         Args:
-            history: who ("user", "assistant") said what, in order.
+            history: (role, text) in order, with role "user" or "assistant".
 
         Raises:
-            InputError: no connection, silence for too long, an error status, something else than an answer.
+            InputError: no connection, a timeout, an error status, or a malformed answer.
         """
         subject = f"language model at {self._host}"
-        messages = [{"role": "system", "content": self.manner}]
+        messages = [{"role": "system", "content": self.prompt}]
         messages += [{"role": who, "content": what} for who, what in history]
         body = json.dumps({"model": self.model, "messages": messages, "stream": True, "max_tokens": 300}).encode()
         headers = {"Content-Type": "application/json", "Accept": "text/event-stream, application/json"}
@@ -100,7 +103,7 @@ class Endpoint:
             connection.close()
 
     def cancel(self) -> None:
-        """End what is waited for: whoever reads it gets an error."""
+        """Close the connections that wait for an answer; their readers get an error."""
         for waiting in list(self._waiting):
             with suppress(OSError):
                 waiting.shutdown(socket.SHUT_RDWR)
@@ -113,8 +116,8 @@ class Endpoint:
 
 
 def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
-    """Words of server-sent events, `data: {...}` a line, to `data: [DONE]`."""
-    read, said = 0, False
+    """Yield the words of server-sent events, lines `data: {...}` up to `data: [DONE]`."""
+    read, answered = 0, False
     while line := reply.readline(_MOST_LINE):
         read += len(line)
         if read > _MOST_BYTES or (not line.endswith(b"\n") and len(line) == _MOST_LINE):
@@ -125,10 +128,10 @@ def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
         if data == b"[DONE]":
             break
         words = _words(data, "delta", subject)
-        said = said or bool(words)
+        answered = answered or bool(words)
         if words:
             yield words
-    if not said:
+    if not answered:
         raise InputError(subject, expected="words", received="none", remedy=_REMEDY)
 
 
@@ -143,7 +146,7 @@ def _whole(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
 
 
 def _words(data: bytes, part: str, subject: str) -> str:
-    """The words of one event or of the whole answer; some events have none."""
+    """Return the words of one event or of the whole answer; some events have none."""
     value = as_object(parse_json(data, subject=subject, remedy=_REMEDY), subject=subject)
     if "error" in value:
         raise InputError(subject, expected="an answer", received=str(value["error"])[:300], remedy=_REMEDY)

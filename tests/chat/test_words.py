@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.chat.sentences import LONGEST, sentences
-from pipelines.chat.stand_in import StandIn
+from pipelines.chat.conversation import LONGEST_SENTENCE, sentences
+from pipelines.chat.rules import RulePartner
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_a_text_without_ends_is_cut_at_pauses_and_words_and_nothing_is_lost():
     words = [f"word{k}" for k in range(300)]
     for text in (" ".join(words), ", ".join(words), "x" * 1000):
         out = list(sentences([text]))
-        assert all(0 < len(one) <= LONGEST for one in out)
+        assert all(0 < len(one) <= LONGEST_SENTENCE for one in out)
         assert "".join("".join(out).split()) == "".join(text.split())
 
 
@@ -51,10 +51,10 @@ def test_a_text_without_ends_is_cut_at_pauses_and_words_and_nothing_is_lost():
     ],
 )
 def test_rules_answer_anything(said, word):
-    assert word in "".join(StandIn().answer([("user", said)]))
+    assert word in "".join(RulePartner().answer([("user", said)]))
 
 
 def test_rules_do_not_say_the_same_twice():
-    partner = StandIn()
+    partner = RulePartner()
     first, second = ("".join(partner.answer([("user", "hello")])) for _ in range(2))
     assert first != second

@@ -1,7 +1,7 @@
-"""A small partner of rules, for machines without a language model: it turns what is said into a question.
+"""Answer by rules, for machines without a language model.
 
-In the manner of Weizenbaum's ELIZA (1966): the first pattern that fits gives an answer, with you for I in what it
-repeats. It understands nothing, and says so when asked.
+In the manner of Weizenbaum's ELIZA (1966): the first pattern that matches gives an answer, with "you" for "I" in the
+words that it repeats. It understands nothing, and admits it when asked.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-_TURNED = {
+_PRONOUNS = {
     **{"i": "you", "me": "you", "my": "your", "mine": "yours", "am": "are", "myself": "yourself", "i'm": "you're"},
     **{"you": "I", "your": "my", "yours": "mine", "are": "am", "yourself": "myself", "you're": "I'm", "i've": "you've"},
 }
-# What fits first answers; `{}` stands for the rest of what was said, turned round. Several answers come in turn.
+# The first match answers. `{}` is the matched rest with pronouns exchanged; several answers are used in turn.
 _RULES: tuple[tuple[str, tuple[str, ...]], ...] = (
     (r"\b(?:hello|hi|hey|good (?:morning|evening|day))\b", ("Hello! I am glad that you are here.", "Hello again.")),
     (r"\b(?:bye|goodbye|see you)\b", ("Goodbye. It was nice to talk with you.",)),
@@ -31,11 +31,11 @@ _RULES: tuple[tuple[str, tuple[str, ...]], ...] = (
     (r"\?\s*$|^(?:what|why|who|where|when|how)\b", ("That is a good question. What do you think?", "Why do you ask?")),
 )
 _ELSE = ("Please tell me more about that.", "I see. And then?", "You said: {}. How does that make you feel?")
-_MOST_REPEATED = 12  # words
+_MOST_REPEATED = 12  # words; longer echoes sound mechanical
 
 
-class StandIn:
-    """Rules that answer at once."""
+class RulePartner:
+    """A partner of rules that answers at once."""
 
     name = "rules (a stand-in; --llm URL asks a language model)"
 
@@ -43,17 +43,17 @@ class StandIn:
         self._used: dict[tuple[str, ...], int] = {}
 
     def answer(self, history: Sequence[tuple[str, str]]) -> Iterator[str]:
-        """Yield the answer to the last thing said, in one piece."""
-        said = " ".join(history[-1][1].split())
+        """Yield the answer to the last message, in one piece."""
+        text = " ".join(history[-1][1].split())
         for pattern, answers in _RULES:
-            found = re.search(pattern, said, re.IGNORECASE)
+            found = re.search(pattern, text, re.IGNORECASE)
             if found is not None:
-                yield self._next(answers).format(_turned(found[found.lastindex or 0]))
+                yield self._next(answers).format(_exchange_pronouns(found[found.lastindex or 0]))
                 return
-        yield self._next(_ELSE).format(_turned(said))
+        yield self._next(_ELSE).format(_exchange_pronouns(text))
 
     def cancel(self) -> None:
-        """Nothing is waited for."""
+        """Do nothing, because rules never wait."""
 
     def _next(self, answers: tuple[str, ...]) -> str:
         used = self._used.get(answers, 0)
@@ -61,7 +61,7 @@ class StandIn:
         return answers[used % len(answers)]
 
 
-def _turned(said: str) -> str:
-    """What was said, from the other side."""
-    words = said.strip(" .!?").split()[:_MOST_REPEATED]
-    return " ".join(_TURNED.get(word.lower(), word) for word in words)
+def _exchange_pronouns(text: str) -> str:
+    """Return the words with first and second person exchanged."""
+    words = text.strip(" .!?").split()[:_MOST_REPEATED]
+    return " ".join(_PRONOUNS.get(word.lower(), word) for word in words)
