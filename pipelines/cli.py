@@ -10,7 +10,6 @@ import logging
 import sys
 import warnings
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 
 from rich.console import Console
@@ -20,6 +19,7 @@ from rich.text import Text
 
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
 from pipelines.runs.places import refuse_old_run
+from smplxpp import __version__
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_values import jsonable
 
@@ -159,7 +159,7 @@ def _answer(args: list[str], console: Console) -> int:
         _print_help()
         return 0
     if args[0] in ("-V", "--version"):
-        sys.stdout.write(f"smplxpp {version('smplxpp')}\n")
+        sys.stdout.write(f"smplxpp {__version__}\n")
         return 0
     name = next((n for n in COMMANDS if args[: len(n.split())] == n.split()), None)
     if name is None:
@@ -231,9 +231,7 @@ def _print_help(group: str = "") -> None:
             continue
         table.add_row(f"[bold]smplxpp {name}[/]", line)
     console = Console()
-    console.print(
-        f"smplxpp {version('smplxpp')}: personalised clothed body templates from scans, measured at every step\n"
-    )
+    console.print(f"smplxpp {__version__}: personalised clothed body templates from scans, measured at every step\n")
     console.print(table)
     console.print("\n`smplxpp COMMAND --help` lists a command's options; `--json` prints its answer for machines.")
 

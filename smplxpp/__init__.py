@@ -5,7 +5,7 @@ The names below are loaded when they are first used, so that importing the packa
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib import import_module, metadata
 
 from smplxpp.native import let_workers_sleep
 
@@ -31,11 +31,17 @@ _EXPORTS: dict[str, str] = {
     "write_glb": "smplxpp.export",
 }
 _MODULES = ("metrics",)
+_OF_A_CHECKOUT = "0+checkout"  # version of a source tree that is not installed
 
 __all__ = [*_EXPORTS, *_MODULES]
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        try:
+            return metadata.version("smplxpp")
+        except metadata.PackageNotFoundError:
+            return _OF_A_CHECKOUT
     if name in _EXPORTS:
         return getattr(import_module(_EXPORTS[name]), name)
     if name in _MODULES:
@@ -44,4 +50,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *__all__, "__version__"])

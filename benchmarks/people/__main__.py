@@ -16,13 +16,13 @@ from benchmarks.people.access import people
 from benchmarks.people.person_scan import PersonScan
 from benchmarks.people.stances import FINGERS
 from benchmarks.people.variants import variant
-from pipelines.figures.render import render_shaded
 from pipelines.figures.sheets import caption, contact_sheet, encode_png, row
-from pipelines.figures.viewpoints import body_cameras
 from smplxpp.body import load_body
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.labels import LABELS, display_colors
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.raster import render_shaded
+from smplxpp.raster.viewpoints import body_cameras
 
 
 @dataclass(frozen=True)

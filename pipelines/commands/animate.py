@@ -22,7 +22,6 @@ from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
-from pipelines.figures.style import ShadeStyle
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS
 from smplxpp.cloth import Garment, cut_garment
@@ -34,6 +33,7 @@ from smplxpp.core.labels import display_colors
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 
 DEFAULT_FPS = 20.0

@@ -49,13 +49,14 @@ class CaptureCheckCommand:
 
     def run(self) -> dict:
         """Check; exit status 1 if something has to be corrected."""
-        from pipelines.captures.check import CheckConfig, check_capture, write_check_report
+        from pipelines.captures.check import write_check_report
         from pipelines.captures.check.report import check_as_dict
         from pipelines.captures.check.terminal import print_check
         from pipelines.commands.progress import counted_progress
         from pipelines.runs.places import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
+        from smplxpp.capture.check import CheckConfig
 
         if self.out is not None:
             keep_out_of_capture(self.out, self.capture)
@@ -70,7 +71,7 @@ class CaptureCheckCommand:
         )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
         with counted_progress("images", enabled=not self.json) as progress:
-            check = check_capture(capture, body, config, progress=progress)
+            check = capture.check(body, config, progress=progress)
         if not self.json:
             print_check(check, Console())
         report = None if self.out is None else write_check_report(check, self.out)

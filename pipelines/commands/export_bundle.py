@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import GARMENTS, PARAMS, STUDENT, TEMPLATE
+from smplxpp import __version__
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -63,7 +63,7 @@ def export_bundle(
         name=name or run.resolve().name,
         licence=licence,
         provenance={
-            "made by": f"smplxpp {version('smplxpp')}",
+            "made by": f"smplxpp {__version__}",
             "student": sha256_file(run / STUDENT),
             "template": sha256_file(run / TEMPLATE),
         },

@@ -11,10 +11,9 @@ from pipelines.figures.colors import (
     joint_palette,
 )
 from pipelines.figures.overlay import render_overlay
-from pipelines.figures.render import render_heat, render_shaded
+from pipelines.figures.render import render_heat
 from pipelines.figures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
-from pipelines.figures.style import ShadeStyle
-from pipelines.figures.viewpoints import VIEWS, body_cameras, fit_cameras, turntable_cameras
+from smplxpp.raster import VIEWS, ShadeStyle, body_cameras, fit_cameras, render_shaded, turntable_cameras
 
 __all__ = [
     "VIEWS",

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from pipelines.figures.shading import resolve, shade_layer
-from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.colors import linear_from_srgb
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster.shading import ShadeStyle, resolve, shade_layer
 
 
 def render_overlay(

@@ -1,4 +1,4 @@
-"""Whole pictures of one mesh: shaded, or coloured by a value."""
+"""Draw pictures of a mesh coloured by a value."""
 
 from __future__ import annotations
 
@@ -8,31 +8,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.figures.colors import heat_colors
-from pipelines.figures.shading import resolve, shade_layer
 from pipelines.figures.sheets import color_bar
-from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-
-
-def render_shaded(
-    mesh: TriangleMesh,
-    camera: Camera,
-    *,
-    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
-    face_colors: UInt8[np.ndarray, "M 3"] | None = None,
-    style: ShadeStyle | None = None,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw a lit picture of a mesh.
-
-    Args:
-        vertex_colors: sRGB, interpolated in linear light. face_colors: sRGB, one a face.
-        style: see `ShadeStyle`.
-    """
-    style = style or ShadeStyle()
-    layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, style=style)
-    return resolve(layer.color, layer.mask, style=style)
+from smplxpp.raster import ShadeStyle, render_shaded
 
 
 def render_heat(

@@ -9,11 +9,10 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
-from pipelines.figures.shading import shade_layer
-from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.colors import srgb8_from_linear
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster.shading import ShadeStyle, shade_layer
 
 BONE, JOINT = (255, 214, 64), (214, 40, 40)
 _FINE = 3  # bones are drawn this many times larger and shrunk: smooth lines

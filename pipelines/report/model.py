@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Num
 
-from pipelines.runs.checks import Check
 from pipelines.runs.manifest import STATUSES, require_check
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 
 _SIGNATURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}

@@ -3,31 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from pipelines.runs.checks import Check
 from smplxpp.clean import ROUGH
-
-
-@dataclass(frozen=True)
-class Gate:
-    """Bounds of a measured number.
-
-    Attributes:
-        unit: of number and bounds.
-        warn, fail: the number passes up to `warn` (from `warn` on where higher is better) and fails beyond `fail`.
-        higher_is_better: the bounds are lower ones.
-    """
-
-    unit: str
-    warn: float
-    fail: float
-    higher_is_better: bool = True
-
-    def check(self, name: str, value: float, *, explanation: str = "") -> Check:
-        """A number held against the gate."""
-        return Check(name, value, self.unit, self.warn, self.fail, self.higher_is_better, explanation)
-
+from smplxpp.core.checks import Gate
 
 ROUGHNESS = Gate("edges", ROUGH, 1.0, higher_is_better=False)
 """How far a scan's vertices stand off their neighbours: beyond the first bound it is smoothed."""

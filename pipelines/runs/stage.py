@@ -27,10 +27,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pipelines.runs.checks import Check
 from pipelines.runs.code import code_of
 from pipelines.runs.digests import GEOMETRY, sha256_file, versions
 from pipelines.runs.manifest import SCHEMA, read_record
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_values import jsonable

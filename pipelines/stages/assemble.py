@@ -17,7 +17,6 @@ from pipelines.runs.artefacts import (
     load_scan_labels,
     load_weights,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import PARTS_WITHOUT_WEBS
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
@@ -31,6 +30,7 @@ from smplxpp.assemble import (
     darn,
 )
 from smplxpp.body import BodyModel, load_body
+from smplxpp.core.checks import Check
 from smplxpp.core.labels import SKIN
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.distance import MM

@@ -11,10 +11,10 @@ from pipelines.runs.artefacts import (
     load_scan,
     load_scan_labels,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.clean import PartsConfig, clean_parts
+from smplxpp.core.checks import Check
 from smplxpp.metrics import mesh_quality, point_to_surface
 from smplxpp.metrics.distance import MM
 

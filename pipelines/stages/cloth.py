@@ -19,7 +19,6 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.session import Session
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.checks import Check
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.layout import GARMENTS, PARAMS
 from pipelines.runs.stage import StageOutput
@@ -27,6 +26,7 @@ from pipelines.stages.models import ModelStage, Trainer
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.calibrate import Calibration, CalibrationConfig, Followed, calibrate
 from smplxpp.cloth.garment_file import load_garments, save_garments
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.mesh import TriangleMesh

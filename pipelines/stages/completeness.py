@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.checks import Check
 from pipelines.runs.gates import ENDS_UNCOVERED, MIRRORED, REGION_UNCOVERED, SKIN_PATCH, UNCOVERED, UNEXPLAINED
+from smplxpp.core.checks import Check
 from smplxpp.core.labels import BACKGROUND, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams

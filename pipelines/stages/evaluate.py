@@ -30,7 +30,6 @@ from avatar.training.engine.learning_rates import pixel_size
 from pipelines.figures import encode_png
 from pipelines.figures.evaluation import surface_picture, write_tiles
 from pipelines.runs import gates
-from pipelines.runs.checks import Check
 from pipelines.runs.digests import TRAINING, sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
 from pipelines.runs.lock import own_run_folder
@@ -50,6 +49,7 @@ from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.scene_digests import params_digest
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.labels import CLOTH_LABELS

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATION_FILE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
@@ -19,6 +18,7 @@ from pipelines.stages.scan_files import read_scan
 from pipelines.stages.scan_keypoints import facing, keypoints_of_scan
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import smooth_if_rough
+from smplxpp.core.checks import Check
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import TriangleMesh

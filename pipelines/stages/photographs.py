@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.checks import Check
 from pipelines.runs.gates import MIRRORED_VIEWS
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.completeness import sagittal_plane
@@ -14,6 +13,7 @@ from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core.camera import Camera
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams

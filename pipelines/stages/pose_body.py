@@ -10,10 +10,10 @@ from pipelines.runs.artefacts import (
     load_params_of_run,
     load_scan,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.body import load_body
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.checks import Check
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.gates import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from pipelines.runs.layout import RECONSTRUCT_STAGE
@@ -30,6 +29,7 @@ from pipelines.stages.photographed import (
 from pipelines.stages.reconstruct_config import ReconstructInputs, save_reconstruct
 from smplxpp.capture import Capture
 from smplxpp.clean import sanitize
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.files.json_file import as_object, read_json

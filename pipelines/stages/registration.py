@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from pipelines.runs.checks import Check
 from smplxpp.body import BodyModel
+from smplxpp.core.checks import Check
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.register.body_fit import BodyFit
 from smplxpp.register.landmarks import LandmarkModel

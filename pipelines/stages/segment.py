@@ -13,13 +13,13 @@ from pipelines.runs.artefacts import (
     load_scan,
     load_source_faces,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import CORRECTIONS_FILE, SCAN
 from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext, BuildInputs
 from smplxpp.body import load_body
 from smplxpp.capture import read_cameras
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import SKIN, display_colors
 from smplxpp.core.mesh import TriangleMesh

@@ -19,10 +19,10 @@ from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
 from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
 from pipelines.runs import gates
-from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
 from pipelines.stages.train_names import KINDS, kind_name
+from smplxpp.core.checks import Check
 
 WAY_BACK = f"{TRACK}/{BACK}"
 BEFORE = {TRACK: "track_metrics.jsonl", WAY_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}

@@ -15,11 +15,11 @@ from pipelines.runs.artefacts import (
     load_posed_body,
     load_resting_body,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import WebConfig, cut_webs, find_webs
+from smplxpp.core.checks import Check
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply

@@ -10,10 +10,10 @@ from pipelines.runs.artefacts import (
     load_posed_body,
     load_weights,
 )
-from pipelines.runs.checks import Check
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.body import load_body
+from smplxpp.core.checks import Check
 from smplxpp.metrics import stretch_report
 from smplxpp.metrics.distance import MM
 from smplxpp.skinning import unpose

@@ -11,7 +11,6 @@ import numpy as np
 
 from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_scan_labels
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext
@@ -20,6 +19,7 @@ from pipelines.stages.motion import motion_of_build
 from pipelines.stages.photographs import photograph_checks
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.clean import loop_lengths, thickened
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh

@@ -45,6 +45,10 @@ class PosedBody:
     def __len__(self) -> int:
         return self.vertices.shape[0]
 
+    def __repr__(self) -> str:
+        shape, joints = tuple(self.vertices.shape), self.joints.shape[-2]
+        return f"PosedBody(vertices of shape {shape}, {joints} joints)"
+
     def frame(self, index: int) -> PosedBody:
         """Return one frame, its arrays without the leading axis."""
         if not -len(self) <= index < len(self):
@@ -103,6 +107,11 @@ class BodyModel:
             numbered = tuple(f"expression_{k:02d}" for k in range(self.num_expressions))
             object.__setattr__(self, "expression_names", numbered)
         self._check()
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.v_template):,} vertices, {len(self.faces):,} faces, {len(self.parents)} joints"
+        bases = f"{self.shapedirs.shape[-1]} betas, {self.exprdirs.shape[-1]} expressions"
+        return f"BodyModel({self.name!r}, {counts}, {bases})"
 
     def _check(self) -> None:
         V, J = self.joint_regressor.shape[-1], len(self.parents)

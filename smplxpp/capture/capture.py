@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -22,6 +24,10 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_choice
+
+if TYPE_CHECKING:
+    from smplxpp.body import BodyModel
+    from smplxpp.capture.check import CaptureCheck, CheckConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +104,36 @@ class Capture:
         """Frames with an image in any camera, or without images those with parameters; ascending."""
         dropped = {frame for camera, frame in self.excluded if camera is None}
         return tuple(frame for frame in self.recording.frames() if frame not in dropped)
+
+    def check(
+        self,
+        body: BodyModel | None = None,
+        config: CheckConfig | None = None,
+        *,
+        progress: Callable[[int, int], None] = lambda done, count: None,
+    ) -> CaptureCheck:
+        """Find everything that would spoil a training: files, splits, masks, parameters, calibration.
+
+        Args:
+            body: the model that the parameters are for; None: the open body.
+            config: how much is looked at.
+            progress: called with the number of views that were opened and of all that will be.
+
+        Returns:
+            The findings, and `failed`: whether one of them has to be corrected before a training.
+
+        Raises:
+            InputError: frames that the capture does not have.
+
+        Example:
+            >>> check = smplxpp.open_capture("data/fixtures/person").check()
+            >>> [finding.message for finding in check.findings if finding.status == "fail"]
+            []
+        """
+        # The check takes captures, so that it is imported when it is called, by name.
+        if body is None:
+            body = import_module("smplxpp.body").load_body()
+        return import_module("smplxpp.capture.check").check_capture(self, body, config, progress=progress)
 
     def file(self, camera: str, frame: int, kind: str = "image") -> Path | None:
         """The file that a view is read from, None where there is none. Kinds: image, mask, label, normal."""

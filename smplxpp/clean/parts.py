@@ -14,7 +14,7 @@ from smplxpp.clean.remesh import METHODS, remesh, require_remesher
 from smplxpp.clean.simplify import simplify
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
 from smplxpp.core.validation import require_choice
 
@@ -82,7 +82,7 @@ class CleanedPart:
 
 
 def clean_parts(
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     face_labels: Int[np.ndarray, " M"],
     *,
     config: PartsConfig | None = None,
@@ -100,6 +100,7 @@ def clean_parts(
         InputError: labels of another length or unknown, or no loose part at all.
         MissingExtraError: parts to remesh without pymeshlab.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     config = config or PartsConfig()
     require_remesher(config.method)
     face_labels = np.asarray(face_labels)

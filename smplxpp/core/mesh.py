@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer
+from numpy.typing import ArrayLike
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.topology import edge_groups
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,27 @@ class TriangleMesh:
         faces.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+    def __repr__(self) -> str:
+        return f"TriangleMesh({self.vertex_count:,} vertices, {self.face_count:,} faces)"
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """Return the mesh as a `trimesh.Trimesh` with the same vertices and faces in the same order.
+
+        Raises:
+            ImportError: trimesh is not installed.
+
+        Example:
+            >>> TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).to_trimesh().area
+            np.float64(0.5)
+        """
+        try:
+            import trimesh
+        except ImportError:
+            raise ImportError(
+                "TriangleMesh.to_trimesh needs trimesh, which is not installed: pip install trimesh"
+            ) from None
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     @property
     def vertex_count(self) -> int:
@@ -167,6 +193,51 @@ class TriangleMesh:
         lookup = np.full(self.vertex_count, -1, dtype=np.int64)
         lookup[used] = np.arange(len(used))
         return TriangleMesh(self.vertices[used], lookup[faces]), used
+
+
+class HasVerticesAndFaces(Protocol):
+    """A mesh of another library, such as `trimesh.Trimesh`: it has arrays of vertices and of faces."""
+
+    @property
+    def vertices(self) -> Any: ...
+
+    @property
+    def faces(self) -> Any: ...
+
+
+MeshLike: TypeAlias = TriangleMesh | HasVerticesAndFaces | tuple[ArrayLike, ArrayLike]
+"""What public functions take as a mesh; `as_mesh` converts it."""
+
+
+def as_mesh(mesh: MeshLike, *, subject: str = "mesh") -> TriangleMesh:
+    """Convert a mesh of another library, or a pair (vertices, faces), to a `TriangleMesh`.
+
+    Args:
+        mesh: a `TriangleMesh`, which is returned as it is; an object with `vertices` and `faces`, such as
+            `trimesh.Trimesh`; or a pair of arrays (N, 3) and (M, 3).
+        subject: what the mesh is called in errors.
+
+    Raises:
+        InputError: something else, or arrays that a `TriangleMesh` refuses.
+
+    Example:
+        >>> as_mesh(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+        TriangleMesh(3 vertices, 1 faces)
+    """
+    if isinstance(mesh, TriangleMesh):
+        return mesh
+    if isinstance(mesh, tuple | list) and len(mesh) == 2:
+        vertices, faces = mesh
+    elif hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        vertices, faces = mesh.vertices, mesh.faces
+    else:
+        raise InputError(
+            subject,
+            expected="a TriangleMesh, an object with vertices and faces (trimesh.Trimesh), or a pair (vertices, faces)",
+            received=type(mesh).__name__,
+            remedy="read a file with smplxpp.read_mesh",
+        )
+    return TriangleMesh(np.asarray(vertices), np.asarray(faces))
 
 
 def _occurring(indices: np.ndarray, count: int) -> np.ndarray:

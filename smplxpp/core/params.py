@@ -96,6 +96,11 @@ class BodyParams:
     def __len__(self) -> int:
         return len(self.global_orient)
 
+    def __repr__(self) -> str:
+        rate = "" if self.fps is None else f" at {self.fps:g} a second"
+        shape, expression = self.betas.shape[1], self.expression.shape[1]
+        return f"BodyParams({len(self)} frames{rate}, {shape} betas, {expression} expressions)"
+
     @property
     def full_pose(self) -> Float64[np.ndarray, "T 55 3"]:
         """The axis-angle vectors of all joints in SMPL-X order.

@@ -37,6 +37,10 @@ class SkinWeights:
     def __len__(self) -> int:
         return len(self.joint_indices)
 
+    def __repr__(self) -> str:
+        slots = self.joint_indices.shape[-1]
+        return f"SkinWeights({len(self):,} vertices over {self.joint_count} joints, at most {slots} a vertex)"
+
     def dense(self) -> Float64[np.ndarray, "N J"]:
         """The weights of every joint; every row sums to 1."""
         out = np.zeros((len(self), self.joint_count))

@@ -11,7 +11,7 @@ import pygltflib
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
 from smplxpp.core.files.zip_file import zip_bytes
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_choice
 from smplxpp.export.gltf_buffers import BufferBuilder
@@ -22,7 +22,7 @@ PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _3MF_UNITS = {"m": "meter", "cm": "centimeter", "mm": "millimeter"}
 
 
-def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> float:
+def write_solid(path: str | Path, mesh: MeshLike, *, units: str = "mm") -> float:
     """Write a closed surface, whole or not at all; the suffix tells the format.
 
     STL and 3MF stand on a printer's bed: z up, the lowest point at 0. PLY and GLB keep +Y up, and GLB its metres, as
@@ -39,6 +39,7 @@ def write_solid(path: str | Path, mesh: TriangleMesh, *, units: str = "mm") -> f
     Raises:
         InputError: another suffix or unit; what was read back is not closed and manifold or has another volume.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     path = Path(path)
     check_solid_path(path)
     require_choice("option units", units, tuple(PER_METRE))

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, as_mesh
 from smplxpp.core.signed_distance import barycentric_coordinates
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.metrics.conventions import DEFAULT, Convention, convention_named
@@ -111,7 +111,7 @@ class MeshComparison:
 
 
 def point_to_surface(
-    points: Num[np.ndarray, "P 3"], mesh: TriangleMesh
+    points: Num[np.ndarray, "P 3"], mesh: MeshLike
 ) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Closest points of `mesh` to (P, 3) points: distance (P,) metres, closest (P, 3), face (P,).
 
@@ -120,6 +120,7 @@ def point_to_surface(
     Raises:
         InputError: NaN or infinite points, another shape, or a mesh without area.
     """
+    mesh = as_mesh(mesh, subject="target mesh")
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError("points", expected="finite values of shape (P, 3)", received=f"shape {points.shape} or NaN")
@@ -135,8 +136,8 @@ def point_to_surface(
 
 
 def directed_distances(
-    source: TriangleMesh,
-    target: TriangleMesh,
+    source: MeshLike,
+    target: MeshLike,
     *,
     samples: int = 100_000,
     seed: int = 0,
@@ -152,6 +153,8 @@ def directed_distances(
     Raises:
         InputError: as `compare`.
     """
+    source = as_mesh(source, subject="source mesh")
+    target = as_mesh(target, subject="target mesh")
     convention, config = convention_named(preset), config or CompareConfig()
     require_surface(source, "source mesh")
     require_surface(target, "target mesh")
@@ -181,8 +184,8 @@ def directed_distances(
 
 
 def compare(
-    pred: TriangleMesh,
-    gt: TriangleMesh,
+    pred: MeshLike,
+    gt: MeshLike,
     *,
     samples: int = 100_000,
     seed: int = 0,
@@ -212,6 +215,8 @@ def compare(
         >>> result = compare(template, scan, gt_labels=scan_labels)
         >>> result.p2s, result.gt_to_pred.p95, result.labels["upper"].chamfer
     """
+    pred = as_mesh(pred, subject="predicted mesh")
+    gt = as_mesh(gt, subject="true mesh")
     convention, config = convention_named(preset), config or CompareConfig()
     require_positive("comparison config threshold_mm", config.threshold_mm)
     require_at_least("comparison config visible_tolerance", config.visible_tolerance, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, as_mesh
 from smplxpp.core.solids import solid_of_mesh
 
 CM3 = 1e6
@@ -31,7 +31,7 @@ class Interpenetration:
         return asdict(self)
 
 
-def interpenetration(a: TriangleMesh, b: TriangleMesh) -> Interpenetration:
+def interpenetration(a: MeshLike, b: MeshLike) -> Interpenetration:
     """The volume of the intersection of two closed meshes in metres.
 
     An open surface has no volume: give it a thickness first (`smplxpp.clean.thickened`), or close it. Where a surface
@@ -40,6 +40,8 @@ def interpenetration(a: TriangleMesh, b: TriangleMesh) -> Interpenetration:
     Raises:
         InputError: a mesh that is open, not manifold, or encloses nothing.
     """
+    a = as_mesh(a, subject="first surface")
+    b = as_mesh(b, subject="second surface")
     first, second = solid_of_mesh(a, subject="first surface"), solid_of_mesh(b, subject="second surface")
     shared = max((first ^ second).volume(), 0.0)
     smaller = min(first.volume(), second.volume())

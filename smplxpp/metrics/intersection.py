@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.validation import require_at_least
 from smplxpp.metrics.distance import MM
@@ -44,7 +44,7 @@ class PenetrationReport:
 
 
 def signed_distance(
-    points: Float[np.ndarray, "P 3"], mesh: TriangleMesh
+    points: Float[np.ndarray, "P 3"], mesh: MeshLike
 ) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Signed distance (P,) of (P, 3) points to `mesh`, negative inside; closest points (P, 3) and faces (P,).
 
@@ -55,18 +55,20 @@ def signed_distance(
     Raises:
         InputError: NaN or infinite points, another shape, a mesh without area or wound inside out.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     found = SignedDistanceField(mesh, solid=True).query(points)
     return found.distance, found.closest, found.face
 
 
 def penetration(
-    outer: TriangleMesh | Float[np.ndarray, "N 3"], inner: TriangleMesh, *, clearance: float = 0.0
+    outer: TriangleMesh | Float[np.ndarray, "N 3"], inner: MeshLike, *, clearance: float = 0.0
 ) -> PenetrationReport:
     """How far vertices of `outer` (a mesh, or points (N, 3)) lie inside `inner` or nearer than `clearance` metres.
 
     Raises:
         InputError: no points, as `signed_distance`, or a clearance that is negative or not finite.
     """
+    inner = as_mesh(inner, subject="inner mesh")
     points = outer.vertices if isinstance(outer, TriangleMesh) else np.asarray(outer, dtype=np.float64)
     if not len(points):
         raise InputError("outer layer", expected="points", received="none")

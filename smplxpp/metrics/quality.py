@@ -8,7 +8,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Integer
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.topology import component_labels
 from smplxpp.metrics.sampling import require_surface
 from smplxpp.metrics.self_intersection import self_intersections
@@ -72,12 +72,13 @@ class MeshQuality:
         return {**asdict(self), "manifold": self.manifold, "closed": self.closed}
 
 
-def mesh_quality(mesh: TriangleMesh, *, self_intersection: bool = False) -> MeshQuality:
+def mesh_quality(mesh: MeshLike, *, self_intersection: bool = False) -> MeshQuality:
     """Measure the quality of a mesh; `self_intersection` adds the slowest test.
 
     Raises:
         InputError: no faces, or no area.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     require_surface(mesh, "mesh")
     edges, counts = mesh.edges_with_counts
     used = np.unique(mesh.faces)

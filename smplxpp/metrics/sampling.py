@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, normalize_rows
 from smplxpp.core.validation import require_at_least
 
 
@@ -34,7 +34,7 @@ class SurfaceSamples:
         return SurfaceSamples(self.points[mask], self.face[mask], self.normals[mask])
 
 
-def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...] = 0) -> SurfaceSamples:
+def sample_surface(mesh: MeshLike, count: int, *, seed: int | tuple[int, ...] = 0) -> SurfaceSamples:
     """`count` points spread over the surface in proportion to area, ordered by face.
 
     Stratified: the i-th point falls into the i-th of `count` equal shares of the area, uniformly inside it, and
@@ -45,6 +45,7 @@ def sample_surface(mesh: TriangleMesh, count: int, *, seed: int | tuple[int, ...
     Raises:
         InputError: `count` below 1, or a mesh without area.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     require_at_least("sample count", count, 1)
     require_surface(mesh, "mesh to sample")
     rng = np.random.Generator(np.random.PCG64(seed))

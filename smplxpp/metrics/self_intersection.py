@@ -8,19 +8,20 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, as_mesh
 
 # A crossing nearer to an edge or a plane than this share of the triangle's size is touching, not cutting.
 TOLERANCE = 1e-9
 PAIRS_AT_ONCE = 500_000
 
 
-def self_intersections(mesh: TriangleMesh) -> Int64[np.ndarray, "P 2"]:
+def self_intersections(mesh: MeshLike) -> Int64[np.ndarray, "P 2"]:
     """The pairs of faces, lower index first, sorted, where an edge of one passes through the inside of the other.
 
     Faces that share an edge are neighbours and never a pair; touching and overlap in one plane are not counted.
     Candidates come from a uniform grid over the faces' boxes; the test is that of edges against triangles.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     triangles = mesh.triangles
     found = [np.zeros((0, 2), dtype=np.int64)]
     for pairs in _candidate_pairs(triangles):

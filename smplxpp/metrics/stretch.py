@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, row_lengths
 from smplxpp.core.validation import require_positive
 
 
@@ -39,19 +39,21 @@ class StretchReport:
         return asdict(self)
 
 
-def edge_stretch(rest: TriangleMesh, posed: TriangleMesh) -> Float64[np.ndarray, " E"]:
+def edge_stretch(rest: MeshLike, posed: MeshLike) -> Float64[np.ndarray, " E"]:
     """The length of each of `rest.edges` in the pose over that at rest; NaN for an edge without length at rest.
 
     Raises:
         InputError: the meshes differ in faces or number of vertices, or have no faces.
     """
+    rest = as_mesh(rest, subject="rest mesh")
+    posed = as_mesh(posed, subject="posed mesh")
     _check_same_topology(rest, posed)
     i, j = rest.edges.T
     before, after = (row_lengths(m.vertices[j] - m.vertices[i]) for m in (rest, posed))
     return np.divide(after, before, out=np.full(len(before), np.nan), where=before > 0)
 
 
-def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, " M"]:
+def flipped_faces(rest: MeshLike, posed: MeshLike) -> Bool[np.ndarray, " M"]:
     """The faces that agree with their edge neighbours at rest and oppose them in the pose.
 
     A face opposes its neighbours when its normal has a negative dot product with the sum of their area vectors.
@@ -60,6 +62,8 @@ def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, "
     Raises:
         InputError: as `edge_stretch`.
     """
+    rest = as_mesh(rest, subject="rest mesh")
+    posed = as_mesh(posed, subject="posed mesh")
     _check_same_topology(rest, posed)
     pairs = rest.face_pairs
 
@@ -75,12 +79,14 @@ def flipped_faces(rest: TriangleMesh, posed: TriangleMesh) -> Bool[np.ndarray, "
     return (agreement(rest) > 0) & (agreement(posed) < 0)
 
 
-def stretch_report(rest: TriangleMesh, posed: TriangleMesh, *, limit: float = 3.0) -> StretchReport:
+def stretch_report(rest: MeshLike, posed: MeshLike, *, limit: float = 3.0) -> StretchReport:
     """Edge stretch and turned faces from `rest` to `posed`.
 
     Raises:
         InputError: as `edge_stretch`, a limit that is not positive, or no edge with a length.
     """
+    rest = as_mesh(rest, subject="rest mesh")
+    posed = as_mesh(posed, subject="posed mesh")
     require_positive("stretch limit", limit)
     ratio = edge_stretch(rest, posed)
     known = ratio[np.isfinite(ratio)]

@@ -1,14 +1,22 @@
-"""Z-buffer rasterisation of meshes without a GPU or a screen, and what follows from it: visibility."""
+"""Rasterise meshes into a z-buffer without a GPU or a screen, and find visibility and draw shaded pictures from it."""
 
+from smplxpp.raster.shading import ShadeStyle, render_shaded
+from smplxpp.raster.viewpoints import VIEWS, body_cameras, fit_cameras, turntable_cameras
 from smplxpp.raster.visibility import outer_visible_faces, outer_visible_points, outside_views, view_directions
 from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh, rasterize_triangles
 
 __all__ = [
+    "VIEWS",
     "MeshMaps",
+    "ShadeStyle",
+    "body_cameras",
+    "fit_cameras",
     "outer_visible_faces",
     "outer_visible_points",
     "outside_views",
     "rasterize_mesh",
     "rasterize_triangles",
+    "render_shaded",
+    "turntable_cameras",
     "view_directions",
 ]

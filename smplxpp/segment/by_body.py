@@ -9,7 +9,7 @@ from jaxtyping import Float64, Num
 
 from smplxpp.body import BodyModel
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import face_adjacency
 from smplxpp.core.validation import require_at_least, require_positive
@@ -95,7 +95,7 @@ class Evidence:
 
 
 def label_by_body(
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     body: BodyModel,
     params: BodyParams,
     *,
@@ -118,6 +118,7 @@ def label_by_body(
     Raises:
         InputError: no faces, several frames, colours of another number of vertices or out of range.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     if not mesh.face_count:
         raise InputError("scan to be labelled", expected="a mesh with faces", received="none")
     config = config or ByBodyConfig()

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix, identity
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, LABELS, OUTER, SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors
@@ -75,7 +75,7 @@ class SegmentedScan:
 
 
 def segment_scan(
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     *,
     votes: Num[np.ndarray, "M L"] | None = None,
     vertex_labels: Num[np.ndarray, " N"] | None = None,
@@ -102,6 +102,7 @@ def segment_scan(
     Raises:
         InputError: none or several of the three, other lengths, unknown ids, or not a single label.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     config = config or SegmentConfig()
     given = {"votes": votes, "vertex_labels": vertex_labels, "face_labels": face_labels}
     present = [name for name, value in given.items() if value is not None]

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,10 @@ class Template:
             weights=self._dense_weights[:count],
         )
         object.__setattr__(self, "body", body)
+
+    def __repr__(self) -> str:
+        parts = ", ".join(self.part_names)
+        return f"Template({len(self.vertices):,} vertices, {len(self.faces):,} faces; {parts})"
 
     def _check(self) -> None:
         V, J, Vb = len(self.vertices), self.body.joint_count, self.body.vertex_count
@@ -234,6 +239,30 @@ class Template:
             "metadata": np.array(json.dumps(self.metadata, sort_keys=True)),
         }
         write_arrays(path, template_arrays.in_file_order(arrays))
+
+    def export(self, path: str | Path, *, animation: BodyParams | None = None) -> Path:
+        """Write the template in a format of other programs, chosen by the path's suffix.
+
+        `.glb` (skin, expressions, colours, motion), `.usd`, `.usda`, `.usdc` or `.usdz` (the same, by usd-core), `.obj`
+        (the surface in the T-pose, or in the one pose of `animation`), `.npz` (as `save`, for `load`).
+
+        Args:
+            path: of the file.
+            animation: T frames that the file plays; None: the template alone.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: another suffix, or frames that the format cannot hold.
+            MissingExtraError: USD without usd-core.
+
+        Example:
+            >>> template.export("anna.glb")  # doctest: +SKIP
+        """
+        # Writers lie above this room; they are imported when they are called, by name.
+        export = import_module("smplxpp.export.by_suffix").export_template
+        return export(path, self, animation=animation)
 
     @staticmethod
     def load(path: str | Path) -> Template:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.transfer.components import settle_unmatched, vertex_components
 from smplxpp.transfer.config import TransferConfig
@@ -32,9 +32,9 @@ _OFF_THE_SKIN = (0.01, 0.025)  # of the source's extent: between these the publi
 
 
 def transfer_weights(
-    source: TriangleMesh,
+    source: MeshLike,
     source_weights: Float[np.ndarray, "V J"],
-    target: TriangleMesh,
+    target: MeshLike,
     *,
     config: TransferConfig | None = None,
 ) -> SkinWeights:
@@ -71,6 +71,8 @@ def transfer_weights(
         >>> weights = transfer_weights(body_mesh, body.weights, skirt, config=TransferConfig.for_label("lower"))
         >>> weights.dense().sum(axis=1)  # all 1
     """
+    source = as_mesh(source, subject="source mesh")
+    target = as_mesh(target, subject="target mesh")
     config = config or TransferConfig()
     weights = check_source(source, source_weights)
     check_target(target)

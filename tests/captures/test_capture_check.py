@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.check import CheckConfig, check_capture, write_check_report
-from pipelines.captures.check.findings import KINDS
-from pipelines.captures.check.silhouettes import compare_silhouettes
+from pipelines.captures.check import write_check_report
 from pipelines.cli import main
 from pipelines.commands.capture import FormatName
 from smplxpp.body import load_body
 from smplxpp.capture import FORMATS, open_capture
+from smplxpp.capture.check import CheckConfig, check_capture
+from smplxpp.capture.check.findings import KINDS
+from smplxpp.capture.check.silhouettes import compare_silhouettes
 from smplxpp.core.rotations import matrix_from_rotvec
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_neus2, write_simple

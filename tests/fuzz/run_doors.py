@@ -22,7 +22,6 @@ from pipelines.report.sections.fit import fit_section
 from pipelines.report.sections.readable import readable
 from pipelines.report.sections.refine import refine_section
 from pipelines.runs.arrays import load_arrays, save_arrays
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
@@ -31,6 +30,7 @@ from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstr
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register
 from smplxpp.body import load_body
 from smplxpp.cloth.garment_file import load_garments, save_garments
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.template import Template
 from tests.cloth.persons import person

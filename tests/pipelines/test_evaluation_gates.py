@@ -7,9 +7,9 @@ import pytest
 from avatar.evaluation.report import EvalReport, ModelFigures, Surfaces
 from avatar.metrics.surface_quality import SurfaceQuality
 from avatar.metrics.view_quality import ViewQuality
-from pipelines.runs.checks import Check
 from pipelines.stages.evaluate import evaluation_checks
 from pipelines.stages.train_names import PSNR_FLOORS
+from smplxpp.core.checks import Check
 
 
 def view(psnr: float) -> ViewQuality:

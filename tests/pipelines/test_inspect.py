@@ -6,9 +6,9 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import BUILD_STAGES, TEMPLATE_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from tests.runs.stages import stage_of
 

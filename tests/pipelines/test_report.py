@@ -26,8 +26,8 @@ from pipelines.report import (
 )
 from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
 from pipelines.report.sections.talking import talking_section
-from pipelines.runs.checks import Check
 from pipelines.runs.layout import TALKING_FILM
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}

@@ -6,10 +6,10 @@ import os
 import numpy as np
 import pytest
 
-from pipelines.runs.checks import Check
 from pipelines.runs.digests import sha256_file
 from pipelines.runs.lock import LOCK_NAME, own_run_folder
 from pipelines.runs.stage import StageOutput, decide, differences, read_manifest, require_stage, run_stage, standing
+from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from tests.runs.stages import stage_of

@@ -7,10 +7,10 @@ from jaxtyping import UInt8
 from PIL import Image
 from scipy import ndimage
 
-from pipelines.captures.check.check import CaptureCheck
-from pipelines.captures.check.silhouettes import body_silhouette
-from pipelines.captures.check.views import OPAQUE, ViewCheck
 from pipelines.figures import caption, contact_sheet, row
+from smplxpp.capture.check.check import CaptureCheck
+from smplxpp.capture.check.silhouettes import body_silhouette
+from smplxpp.capture.check.views import OPAQUE, ViewCheck
 from smplxpp.core.errors import InputError
 from smplxpp.core.spread import spread
 

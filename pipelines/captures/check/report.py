@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.captures.check.check import CaptureCheck
-from pipelines.captures.check.findings import AREAS, grouped
 from pipelines.captures.check.pictures import BODY_COLOR, MASK_COLOR, contact_sheet_of, draw_strips
-from pipelines.captures.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary
 from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.runs.digests import versions
+from smplxpp.capture.check.check import CaptureCheck
+from smplxpp.capture.check.findings import AREAS, grouped
+from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.core.spread import spread

@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.captures.check.check import CaptureCheck
-from pipelines.captures.check.files import in_ranges
-from pipelines.captures.check.findings import Finding, grouped
 from pipelines.captures.check.report import check_as_dict
+from smplxpp.capture.check.check import CaptureCheck
+from smplxpp.capture.check.files import in_ranges
+from smplxpp.capture.check.findings import Finding, grouped
 
 _STYLES = {"fail": "red", "warn": "yellow", "good": "green", "doubtful": "yellow", "bad": "red"}
 _MESSAGES, _FRAMES = 6, 8

@@ -20,7 +20,7 @@ from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.json_file import as_numbers
 from smplxpp.core.files.paths import regular_file
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj
 from smplxpp.core.mesh_files.ply_file import read_ply
@@ -135,13 +135,14 @@ SUFFIXES = tuple(_READERS)
 
 def write_ply(
     path: str | Path,
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     *,
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
     vertex_properties: dict[str, np.ndarray] | None = None,
     face_properties: dict[str, np.ndarray] | None = None,
 ) -> None:
     """Write a binary little-endian PLY, whole or not at all; coordinates as float32."""
+    mesh = as_mesh(mesh, subject="mesh")
     vertex = [(axis, "<f4", mesh.vertices[:, k]) for k, axis in enumerate("xyz")]
     if vertex_colors is not None:
         vertex += [(name, "u1", np.asarray(vertex_colors)[:, k]) for k, name in enumerate(("red", "green", "blue"))]

@@ -10,7 +10,7 @@ from jaxtyping import Float, Integer, UInt8
 from smplxpp.body import BodyModel
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.config import LocateConfig
@@ -25,7 +25,7 @@ Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 
 def locate_body(
     body: BodyModel,
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     *,
     colors: UInt8[np.ndarray, "N 3"] | None = None,
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
@@ -50,6 +50,7 @@ def locate_body(
     Raises:
         InputError: a surface that is no person, or far from its size; landmarks that the body does not have.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     config = config or LocateConfig()
     _check(mesh, colors)
     mesh = _outward(mesh)

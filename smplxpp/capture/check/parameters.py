@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipelines.captures.check.findings import Finding
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
+from smplxpp.capture.check.findings import Finding
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
 

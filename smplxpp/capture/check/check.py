@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipelines.captures.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings
-from pipelines.captures.check.files import missing_findings, split_findings
-from pipelines.captures.check.findings import Finding
-from pipelines.captures.check.mistakes import Sample
-from pipelines.captures.check.parameters import parameter_findings, read_parameters
-from pipelines.captures.check.silhouettes import FitSummary
-from pipelines.captures.check.views import OPAQUE, ViewCheck, check_view
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
+from smplxpp.capture.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings
+from smplxpp.capture.check.files import missing_findings, split_findings
+from smplxpp.capture.check.findings import Finding
+from smplxpp.capture.check.mistakes import Sample
+from smplxpp.capture.check.parameters import parameter_findings, read_parameters
+from smplxpp.capture.check.silhouettes import FitSummary
+from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.captures.check.mistakes import COMBINED, SINGLE, Mistake, Sample, shifts
-from pipelines.captures.check.silhouettes import (
+from smplxpp.capture.check.mistakes import COMBINED, SINGLE, Mistake, Sample, shifts
+from smplxpp.capture.check.silhouettes import (
     IOU_BAD,
     OUTSIDE_DOUBTFUL,
     SilhouetteFit,

@@ -1,16 +1,15 @@
-"""Deferred shading of the z-buffer's mesh maps: key light, sky and ground, rim, ambient occlusion, mesh lines."""
+"""Draw shaded pictures of meshes from the z-buffer's maps: key light, sky and ground, rim, ambient occlusion, lines."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipelines.figures.occlusion import unoccluded
-from pipelines.figures.style import ShadeStyle
 from smplxpp.core.camera import Camera
 from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
 from smplxpp.core.errors import InputError
@@ -27,6 +26,31 @@ _BACK_SIDE = np.array([0.42, 0.46, 0.54], dtype=np.float32)  # inside of open su
 
 
 @dataclass(frozen=True)
+class ShadeStyle:
+    """How surfaces are drawn.
+
+    Attributes:
+        base_color: sRGB of surfaces without colours of their own.
+        background: sRGB.
+        supersampling: samples a pixel along each axis.
+        relief: 1 = full light and shadow, 0 = flat colours; lower where colours must be read exactly.
+        occlusion: strength of the ambient occlusion, 0 to 1.
+        occlusion_radius: metres.
+        smooth: interpolate vertex normals (else one normal a face).
+        wireframe: draw the faces' edges.
+    """
+
+    base_color: tuple[int, int, int] = (206, 200, 192)
+    background: tuple[int, int, int] = (255, 255, 255)
+    supersampling: int = 2
+    relief: float = 1.0
+    occlusion: float = 0.85
+    occlusion_radius: float = 0.07
+    smooth: bool = True
+    wireframe: bool = False
+
+
+@dataclass(frozen=True)
 class Layer:
     """A shaded surface before it is put on a background, at the supersampled size.
 
@@ -40,6 +64,25 @@ class Layer:
     mask: Bool[np.ndarray, "H W"]
     depth: Float32[np.ndarray, "H W"]
     facing: Float32[np.ndarray, "H W"]
+
+
+def render_shaded(
+    mesh: TriangleMesh,
+    camera: Camera,
+    *,
+    vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
+    face_colors: UInt8[np.ndarray, "M 3"] | None = None,
+    style: ShadeStyle | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a lit picture of a mesh.
+
+    Args:
+        vertex_colors: sRGB, interpolated in linear light. face_colors: sRGB, one a face.
+        style: see `ShadeStyle`.
+    """
+    style = style or ShadeStyle()
+    layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, style=style)
+    return resolve(layer.color, layer.mask, style=style)
 
 
 def shade_layer(
@@ -226,3 +269,61 @@ def _edge_heights(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
     twice_area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     opposite = np.stack([np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3)], axis=1)
     return (twice_area[:, None] / np.maximum(opposite, 1e-9)).astype(np.float32)
+
+
+_SAMPLES = 16  # neighbours of a pixel
+_BIAS = np.float32(0.002)  # metres: below it lie the depth map's own steps
+_GAIN = 3.0  # contrast of the occlusion, chosen by eye
+_FAR = np.float32(1e6)  # metres: depth of the background
+_GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)
+
+
+def unoccluded(
+    maps: MeshMaps, camera: Camera, normals_at: Callable[[np.ndarray], np.ndarray], *, style: ShadeStyle
+) -> Float32[np.ndarray, "H W"]:
+    """Return the share of the surroundings that each output pixel sees, 1 on the background.
+
+    `maps` and `camera` are supersampled; the first sample of each output pixel stands for all of them.
+
+    With v the vector to a neighbour at distance |v| < r and n the normal,
+    `A = 1 - strength * gain * mean(max(0, v.n - bias) / |v| * (1 - |v|^2 / r^2))` over one fixed spiral of
+    neighbours: the obscurance of McGuire et al., "The Alchemy Screen-Space Ambient Obscurance Algorithm" (2011),
+    with a smooth falloff.
+    """
+    s = style.supersampling
+    face = maps.face_id[::s, ::s]
+    seen = np.ones(face.shape, np.float32)
+    pixels = np.flatnonzero(face.ravel() >= 0)
+    if style.occlusion <= 0.0 or not len(pixels):
+        return seen
+    row, col = np.divmod(pixels, face.shape[1])
+    normal = normals_at(row * s * camera.width + col * s)
+    depth = np.where(face >= 0, maps.depth[::s, ::s], _FAR)
+    z = depth.ravel()[pixels]
+    focal = camera.K[0, 0] / s
+    reach = style.occlusion_radius * focal / (1.0 if camera.orthographic else float(np.median(z)))
+    pad = int(np.ceil(reach))
+    padded = np.pad(depth, pad, constant_values=_FAR)
+    center = (row + pad) * padded.shape[1] + col + pad
+    flat = padded.ravel()
+    x = ((col + 0.5 - camera.K[0, 2] / s) / focal).astype(np.float32)
+    y = ((row + 0.5 - camera.K[1, 2] / s) / focal).astype(np.float32)
+    nx, ny, nz = np.ascontiguousarray(normal.T)
+    inverse_r2 = np.float32(1.0 / style.occlusion_radius**2)
+    total = np.zeros(len(pixels), np.float32)
+    # Sum the obscurance over a spiral of neighbours of even density, the same for every pixel.
+    for k in range(_SAMPLES):
+        radius, angle = reach * np.sqrt((k + 0.5) / _SAMPLES), _GOLDEN_ANGLE * k
+        dx, dy = round(radius * np.cos(angle)), round(radius * np.sin(angle))
+        step_x, step_y = np.float32(dx / focal), np.float32(dy / focal)
+        zk = flat.take(center + (dy * padded.shape[1] + dx))
+        vz = zk - z
+        if camera.orthographic:
+            vx, vy = step_x, step_y
+        else:
+            vx, vy = x * vz + step_x * zk, y * vz + step_y * zk
+        v2 = vx * vx + vy * vy + vz * vz
+        along = np.maximum(vx * nx + vy * ny + vz * nz - _BIAS, 0.0)
+        total += along * np.maximum(1.0 - v2 * inverse_r2, 0.0) / np.sqrt(v2 + np.float32(1e-6))
+    seen.ravel()[pixels] = np.clip(1.0 - style.occlusion * _GAIN / _SAMPLES * total, 0.0, 1.0)
+    return seen

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 from scipy import ndimage
 
-from pipelines.captures.check.findings import Finding, unreadable_finding
-from pipelines.captures.check.silhouettes import MIN_SHARE, SilhouetteFit, body_silhouette, compare_silhouettes
 from smplxpp.capture import Capture
+from smplxpp.capture.check.findings import Finding, unreadable_finding
+from smplxpp.capture.check.silhouettes import MIN_SHARE, SilhouetteFit, body_silhouette, compare_silhouettes
 from smplxpp.core.errors import InputError
 
 OPAQUE = 127

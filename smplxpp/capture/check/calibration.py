@@ -7,11 +7,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipelines.captures.check.diagnosis import Diagnosis, diagnose
-from pipelines.captures.check.findings import Finding
-from pipelines.captures.check.mistakes import Mistake, Sample
-from pipelines.captures.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, SilhouetteFit, summary
-from pipelines.captures.check.views import ViewCheck
+from smplxpp.capture.check.diagnosis import Diagnosis, diagnose
+from smplxpp.capture.check.findings import Finding
+from smplxpp.capture.check.mistakes import Mistake, Sample
+from smplxpp.capture.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, SilhouetteFit, summary
+from smplxpp.capture.check.views import ViewCheck
 from smplxpp.core.camera import Camera
 from smplxpp.core.spread import spread
 

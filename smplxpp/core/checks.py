@@ -1,4 +1,4 @@
-"""A number held against a stated gate."""
+"""Check a measured number against stated limits."""
 
 from __future__ import annotations
 
@@ -49,3 +49,29 @@ class Check:
             "gate": self.gate,
             "explanation": self.explanation,
         }
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Limits of a measured number.
+
+    Attributes:
+        unit: of number and limits.
+        warn: the number passes up to here; where higher is better, from here on.
+        fail: the number fails beyond.
+        higher_is_better: the limits are lower ones.
+    """
+
+    unit: str
+    warn: float
+    fail: float
+    higher_is_better: bool = True
+
+    def check(self, name: str, value: float, *, explanation: str = "") -> Check:
+        """Hold a number against the limits.
+
+        Example:
+            >>> Gate("mm", 1.0, 3.0, higher_is_better=False).check("distance", 2.0).status
+            'warn'
+        """
+        return Check(name, value, self.unit, self.warn, self.fail, self.higher_is_better, explanation)

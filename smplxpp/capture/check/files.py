@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Int
 
-from pipelines.captures.check.findings import Finding
 from smplxpp.capture import Capture, Problem, find_problems
+from smplxpp.capture.check.findings import Finding
 
 # What `find_problems` says without decoding -> kind; the first that matches.
 _KINDS = (
