@@ -8,7 +8,7 @@ import os
 import platform
 from pathlib import Path
 
-from pipelines.runs.digests import versions
+from pipelines.runs.code import versions
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_values import jsonable
 

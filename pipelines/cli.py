@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
-from pipelines.runs.places import refuse_old_run
+from pipelines.runs.folders import refuse_old_run
 from smplxpp import __version__
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_values import jsonable

@@ -287,9 +287,9 @@ READS: dict[str, set[str]] = {
     "open": {
         *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
         "smplxpp/core/files/package_file.py",
-        *("smplxpp/capture/readers/colmap_model.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/digests.py"),
+        *("smplxpp/capture/readers/colmap_model.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/code.py"),
         *("smplxpp/capture/writers/arrays.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
-        *("avatar/training/engine/metrics_log.py", "pipelines/runs/lock.py", "pipelines/commands/terminal.py"),
+        *("avatar/training/engine/metrics_log.py", "pipelines/runs/folders.py", "pipelines/commands/terminal.py"),
     },
 }
 

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
-from pipelines.figures.evaluation import read_tiles
+from pipelines.figures.comparison import read_tiles
 from pipelines.runs.artefacts import load_params_of_run, load_scan
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest

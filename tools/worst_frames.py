@@ -15,8 +15,7 @@ from jaxtyping import UInt8
 
 from avatar.evaluation.report import EvalReport, view_key
 from pipelines.figures import caption, encode_jpeg, row
-from pipelines.figures.comparison import enlarge, error_colors
-from pipelines.figures.evaluation import read_tiles
+from pipelines.figures.comparison import enlarge, error_colors, read_tiles
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate_config import HELD_OUT_VIEWS, REPORT_FILE

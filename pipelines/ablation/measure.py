@@ -15,9 +15,9 @@ from avatar.evaluation.report import EvalReport, view_key
 from avatar.rig.posed import AvatarModel
 from pipelines.ablation.rows import Row
 from pipelines.figures import encode_png
-from pipelines.runs.digests import TRAINING
+from pipelines.runs.code import TRAINING
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import ABLATION
-from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.cloth import ClothStage, clothed_sequence
 from pipelines.stages.evaluate import surface_digest

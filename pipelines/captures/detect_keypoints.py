@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipelines.figures import contact_sheet
-from pipelines.figures.keypoints import draw_keypoints
+from pipelines.figures.body_drawings import draw_keypoints
 from smplxpp.capture import Capture
 from smplxpp.capture.images import read_alpha, read_color
 from smplxpp.capture.keypoint_files import read_keypoints

@@ -78,7 +78,7 @@ class Ablate:
         from avatar.training.engine.device import choose_device
         from pipelines.ablation.ablate import AblationRun, ablate
         from pipelines.ablation.rows import ablation_rows
-        from pipelines.runs.places import keep_out_of_capture
+        from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.scene import TrainInputs
 
         keep_out_of_capture(self.run_folder, self.capture, subject="--run")

@@ -13,7 +13,7 @@ import tyro
 from pipelines.commands.build_inputs import chosen_inputs, chosen_reconstruction, chosen_registration
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
-from pipelines.runs.by_hand import take_file
+from pipelines.runs.folders import keep_out_of_capture, take_file
 from pipelines.runs.layout import (
     BUILD_STAGES,
     CORRECTIONS_FILE,
@@ -24,7 +24,6 @@ from pipelines.runs.layout import (
     RELIGHT_STAGE,
     TRAIN_STAGES,
 )
-from pipelines.runs.places import keep_out_of_capture
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from pipelines.stages.register_config import RegisterInputs

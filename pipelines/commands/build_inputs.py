@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.runs.folders import same_place
 from pipelines.runs.layout import REGISTER_STAGE, reconstructed_scan
-from pipelines.runs.places import same_place
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildInputs
 from pipelines.stages.photographed import open_photographs, usable_cameras, usable_frames

@@ -53,7 +53,7 @@ class CaptureCheckCommand:
         from pipelines.captures.check.report import check_as_dict
         from pipelines.captures.check.terminal import print_check
         from pipelines.commands.progress import counted_progress
-        from pipelines.runs.places import keep_out_of_capture
+        from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
         from smplxpp.capture.check import CheckConfig

@@ -93,7 +93,7 @@ class Evaluate:
         from avatar.evaluation.summary import evaluation_tables
         from avatar.training.engine.device import choose_device
         from pipelines.report.sections.build import rewrite_report
-        from pipelines.runs.places import keep_out_of_capture
+        from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.evaluate import evaluate
         from pipelines.stages.evaluate_config import REPORT_FILE
         from pipelines.stages.scene import TrainInputs

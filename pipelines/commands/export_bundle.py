@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.commands.options import require_avatar
 from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import GARMENTS, PARAMS, STUDENT, TEMPLATE
 from smplxpp import __version__
 from smplxpp.cloth.garment_file import load_garments

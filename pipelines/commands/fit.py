@@ -16,7 +16,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import counted_progress, training_progress
-from pipelines.runs.reading import values_of
+from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
 
@@ -76,8 +76,8 @@ class Fit:
         from avatar.training.engine.processes import Distributed
         from avatar.training.refinement.config import RefineConfig
         from pipelines.report.sections.build import rewrite_report
+        from pipelines.runs.folders import keep_out_of_capture
         from pipelines.runs.layout import FIT_STAGE, REPORT_FILE
-        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.fit import FitStage
         from pipelines.stages.models import Trainer, TrainOptions
         from pipelines.stages.refine import refine, wants_refinement

@@ -97,7 +97,7 @@ class KeypointsDetect:
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import counted_progress
         from pipelines.figures import encode_jpeg, encode_png
-        from pipelines.runs.places import keep_out_of_capture, same_place
+        from pipelines.runs.folders import keep_out_of_capture, same_place
         from smplxpp.capture import open_capture
         from smplxpp.core.files.atomic import atomic_write_bytes
         from smplxpp.detect import load_detector

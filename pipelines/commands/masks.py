@@ -44,7 +44,7 @@ class CaptureMasks:
         from pipelines.captures.masks import write_masks
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import counted_progress
-        from pipelines.runs.places import keep_out_of_capture, same_place
+        from pipelines.runs.folders import keep_out_of_capture, same_place
         from smplxpp.capture import open_capture
 
         if not same_place(self.out, self.capture / "masks"):
@@ -77,7 +77,7 @@ class CaptureMasks:
             return plates.of_camera, plates.identity
         matter: Matter
         if self.matting is not None:
-            from pipelines.runs.digests import sha256_file
+            from pipelines.runs.code import sha256_file
             from smplxpp.capture.matting import MattingModel
 
             matter, identity = MattingModel(self.matting), f"matting model {sha256_file(self.matting)}"

@@ -67,9 +67,8 @@ class ReconstructCommand:
     def run(self) -> dict:
         """Reconstruct, write the report, print what is sure and what is not."""
         from pipelines.commands.progress import shared_progress
+        from pipelines.runs.folders import keep_out_of_capture, own_run_folder
         from pipelines.runs.layout import RECONSTRUCT_STAGE
-        from pipelines.runs.lock import own_run_folder
-        from pipelines.runs.places import keep_out_of_capture
         from pipelines.stages.reconstruct import reconstruct_capture
 
         keep_out_of_capture(self.out, self.capture)

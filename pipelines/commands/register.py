@@ -79,11 +79,9 @@ class Register:
     def run(self) -> dict:
         """Register, write the report, print residuals before and after."""
         from pipelines.commands.progress import shared_progress
-        from pipelines.runs.by_hand import take_file
+        from pipelines.runs.artefacts import values_of
+        from pipelines.runs.folders import keep_out_of_capture, own_run_folder, take_file
         from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE
-        from pipelines.runs.lock import own_run_folder
-        from pipelines.runs.places import keep_out_of_capture
-        from pipelines.runs.reading import values_of
         from pipelines.stages.register_capture import register_capture
         from smplxpp.register.landmark_file import read_landmarks
 

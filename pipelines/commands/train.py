@@ -17,8 +17,8 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
+from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import FIT_STAGE
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.errors import InputError
 
@@ -121,7 +121,7 @@ class Train:
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
         from avatar.training.refinement.config import RefineConfig
-        from pipelines.runs.places import keep_out_of_capture
+        from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.models import TrainOptions
         from pipelines.stages.refine import wants_refinement
         from pipelines.stages.scene import TrainInputs, open_scene

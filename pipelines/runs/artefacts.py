@@ -1,15 +1,15 @@
-"""What the stages of a build leave for each other, read back."""
+"""Read and write the arrays that the stages of a build pass to each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipelines.runs.arrays import load_arrays, read_named, take
 from pipelines.runs.layout import (
     CANONICAL,
     PARAMS,
@@ -20,14 +20,22 @@ from pipelines.runs.layout import (
     SCAN_LABELS,
     WEIGHTS,
 )
-from pipelines.runs.reading import values_of
+from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_integer, as_numbers
 from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.core.skin_weights import SkinWeights
+
+# Remedies of the errors below: a file whose arrays are missing, and one whose values cannot be used.
+_DAMAGED = "the stage's file is damaged: delete the stage's folder and give the command again"
+_FOREIGN = "it was written by another version or is damaged: delete its folder and give the command that makes it again"
+# Exceptions of code that takes apart values of another kind than it expects.
+_OF_ANOTHER_KIND = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+_KINDS = {"u": "whole numbers", "i": "whole numbers", "f": "numbers", "b": "true or false"}
 
 
 def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
@@ -60,7 +68,7 @@ def load_source_faces(run: Path) -> np.ndarray:
 
 
 def load_scan_labels(run: Path, faces: int) -> np.ndarray:
-    """Read the labels of the scan's faces, which are so many."""
+    """Read the labels of the scan's faces, one for each of `faces`."""
     (labels,) = read_named(run / SCAN_LABELS, "face_labels")
     with values_of(run / SCAN_LABELS):
         _check("face_labels", labels, "iu", (faces,))
@@ -88,7 +96,7 @@ def load_cleaned_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.
 
 
 def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    """Read the same as `load_cleaned_parts` without webs: what skin weights are for."""
+    """Read the parts without bridges, which is what the skin weights are for; layout of `load_cleaned_parts`."""
     return _parts(run / PARTS_WITHOUT_WEBS)
 
 
@@ -136,14 +144,11 @@ def _parts(file: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
 
 
 def _mesh(arrays: Mapping[str, np.ndarray]) -> TriangleMesh:
-    """The mesh of a stage's arrays, whose colours and numbers of vertices in the user's file are as many as those."""
+    """Return the mesh of a stage's arrays, after checks of its colours and source vertices."""
     mesh = TriangleMesh(arrays["vertices"], arrays["faces"])
     _check("colors", arrays["colors"], "u", (mesh.vertex_count, 3))
     _check("source_vertex", arrays["source_vertex"], "iu", (mesh.vertex_count,))
     return mesh
-
-
-_WORDS = {"u": "whole numbers", "i": "whole numbers", "f": "numbers", "b": "true or false"}
 
 
 def _check(name: str, array: np.ndarray, kinds: str, shape: tuple[int, ...], *, finite: bool = True) -> None:
@@ -151,4 +156,81 @@ def _check(name: str, array: np.ndarray, kinds: str, shape: tuple[int, ...], *, 
     right = array.dtype.kind in kinds and array.shape == shape
     if not right or (finite and not np.isfinite(array).all()):
         received = f"{array.dtype} of shape {array.shape}" if not right else "NaN or infinity"
-        raise InputError(name, expected=f"{_WORDS[kinds[0]]} of shape {shape}", received=received)
+        raise InputError(name, expected=f"{_KINDS[kinds[0]]} of shape {shape}", received=received)
+
+
+def save_arrays(path: Path, groups: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+    """Write `{group: {name: array}}` as `group/name`."""
+    flat: dict[str, Any] = {f"{g}/{name}": array for g, arrays in groups.items() for name, array in arrays.items()}
+    np.savez(path, **flat)
+
+
+def load_arrays(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Read what `save_arrays` wrote, groups in their order.
+
+    Raises:
+        InputError: missing, damaged or foreign file.
+    """
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    for key, array in read_arrays(path, subject="stage file", remedy=_DAMAGED).items():
+        group, slash, name = key.partition("/")
+        if not slash:
+            raise InputError(f"stage file {path}", expected="arrays in groups", received=key, remedy=_DAMAGED)
+        groups.setdefault(group, {})[name] = array
+    return groups
+
+
+def read_named(path: Path, *names: str) -> tuple[np.ndarray, ...]:
+    """Read arrays of a stage's npz file by their names.
+
+    Raises:
+        InputError: missing, damaged or foreign file, or one without them.
+    """
+    arrays = read_arrays(path, subject="stage file", remedy=_DAMAGED)
+    return tuple(take(arrays, *names, path=path).values())
+
+
+def take(arrays: Mapping[str, np.ndarray], *names: str, path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of these names.
+
+    Raises:
+        InputError: one is missing.
+    """
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise InputError(
+            f"stage file {path}", expected=f"the array {missing[0]}", received="a file without it", remedy=_DAMAGED
+        )
+    return {name: arrays[name] for name in names}
+
+
+@contextmanager
+def values_of(file: Path | StageRecord) -> Iterator[None]:
+    """Name the file in errors of the lines that use its values, or the values of a stage's manifest.
+
+    Only code that uses values read from the file belongs there, because a mistake of ours in those lines would be
+    reported as one of the file. Records that this process has made itself were never read; their errors pass unchanged.
+
+    Raises:
+        InputError: missing entries, entries of another kind, or an `InputError` of the lines themselves.
+    """
+    if isinstance(file, StageRecord) and file.ran:
+        yield
+        return
+    path = file.folder / MANIFEST if isinstance(file, StageRecord) else file
+    try:
+        yield
+    except InputError as error:
+        if isinstance(file, StageRecord) or str(path) in str(error):  # files of the stage name themselves
+            raise
+        raise InputError(
+            f"file {path}: {error.subject}",
+            expected=error.expected,
+            received=error.received,
+            remedy=error.remedy or _FOREIGN,
+        ) from error
+    except _OF_ANOTHER_KIND as error:
+        received = f"{type(error).__name__}: {error}"[:200]
+        raise InputError(
+            f"file {path}", expected="the entries that this version writes", received=received, remedy=_FOREIGN
+        ) from error

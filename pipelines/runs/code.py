@@ -1,28 +1,37 @@
-"""The code that a stage runs, as digests: its module and whatever that imports, the kernels it calls among them.
+"""Digest the inputs of a stage: its code with all imports and native kernels, its files, its libraries.
 
-A comment, a docstring or the layout of a file changes no digest; neither does code that the stage never imports.
+Comments, docstrings and the layout of a file change no digest, and neither does code that the stage never imports.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import platform
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import regular_file
+
 PACKAGES = ("smplxpp", "avatar", "pipelines")
 NATIVE = "smplxpp.native"
+GEOMETRY = ("numpy", "scipy", "libigl", "fast-simplification")
+"""Libraries whose versions decide the result of a geometric stage."""
+TRAINING = (*GEOMETRY, "torch")
+"""Libraries whose versions decide the result of a training."""
 _COMMENTS = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _EXPORT = re.compile(r"SMPLXPP_EXPORT[^;{(]*?(\w+)\(")
 
 
 @dataclass(frozen=True)
 class _Module:
-    """What counts of a source file: the digest of its statements, the modules it imports, the names it mentions."""
+    """Digest of a source file's statements, the modules that it imports, and the attribute names that it uses."""
 
     digest: str
     imports: tuple[str, ...]
@@ -30,13 +39,14 @@ class _Module:
 
 
 def code_of(*modules: str) -> dict[str, str]:
-    """Hex digests by name of the modules, of all that they import of `PACKAGES`, and of the kernels' folders they call.
+    """Return hex digests by name of modules, of all their imports in `PACKAGES`, and of the native folders they call.
 
-    Imports anywhere in a file count, those within functions too, but not those that only type checkers see.
+    Imports anywhere in a file count, also those within functions, except those under `TYPE_CHECKING`.
 
     Raises:
         ModuleNotFoundError: no such module.
     """
+    # Follow imports breadth first. A native folder counts where a module mentions one of its exported functions.
     found: dict[str, str] = {}
     kernels: set[str] = set()
     waiting = [part for module in modules for part in _with_packages(module)]
@@ -67,7 +77,7 @@ def _module(name: str) -> _Module:
 
 
 class _Statements(ast.NodeTransformer):
-    """Leaves out what does nothing: texts that stand alone, docstrings among them."""
+    """Drop string statements, which include docstrings, because they do nothing."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
@@ -75,7 +85,7 @@ class _Statements(ast.NodeTransformer):
 
 
 def _imported(tree: ast.AST, package: str) -> Iterable[str]:
-    """Modules of `PACKAGES` that a file imports."""
+    """Yield the modules of `PACKAGES` that a file imports."""
     for node in _executed(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PACKAGES)
@@ -88,7 +98,7 @@ def _imported(tree: ast.AST, package: str) -> Iterable[str]:
 
 
 def _executed(tree: ast.AST) -> Iterable[ast.AST]:
-    """All nodes but those under `if TYPE_CHECKING`."""
+    """Yield all nodes except those under `if TYPE_CHECKING`."""
     waiting = [tree]
     while waiting:
         node = waiting.pop()
@@ -100,14 +110,14 @@ def _executed(tree: ast.AST) -> Iterable[ast.AST]:
 
 
 def _with_packages(module: str) -> list[str]:
-    """A module after the packages that hold it: importing it runs theirs first."""
+    """Return a module's packages and the module, because importing it runs the packages first."""
     parts = module.split(".")
     return [".".join(parts[: k + 1]) for k in range(len(parts))]
 
 
 @cache
 def _source(module: str) -> Path | None:
-    """The file of a module of `PACKAGES`; nothing is imported but the package at its top."""
+    """Return the file of a module of `PACKAGES` without importing more than its top package."""
     top, *rest = module.split(".")
     base = _root(top).joinpath(*rest)
     candidates = (base / "__init__.py", base.with_suffix(".py")) if rest else (base / "__init__.py",)
@@ -124,7 +134,7 @@ def _root(package: str) -> Path:
 
 @cache
 def _exports() -> dict[str, str]:
-    """Folder of the native sources by the name of each function that they hand out."""
+    """Return the folder of the native sources by the name of each exported function."""
     root = _root("smplxpp") / "native"
     return {
         name: path.parent.name
@@ -135,10 +145,28 @@ def _exports() -> dict[str, str]:
 
 @cache
 def _native_digest(folder: str) -> str:
-    """The digest of a folder of native sources, without comments and white space."""
+    """Return the digest of a folder of native sources without comments and white space."""
     digest = hashlib.sha256()
     root = _root("smplxpp") / "native" / folder
     for path in sorted([*root.glob("*.cpp"), *root.glob("*.hpp")]):
         digest.update(path.name.encode())
         digest.update("".join(_COMMENTS.sub("", path.read_text(encoding="utf-8")).split()).encode())
     return digest.hexdigest()[:16]
+
+
+def sha256_file(path: str | Path) -> str:
+    """Return the hex SHA-256 of a regular file's content.
+
+    Raises:
+        InputError: the file is missing, not a regular file, or unreadable.
+    """
+    try:
+        with open(regular_file(path), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"file {path}", expected="a readable file", received=error.strerror or str(error)) from None
+
+
+def versions(libraries: Iterable[str] = GEOMETRY) -> dict[str, str]:
+    """Return the versions of Python and of the libraries that compute the result."""
+    return {"python": platform.python_version(), **{name: version(name) for name in libraries}}

@@ -25,7 +25,7 @@ COMPENSATE_STAGE = "90_compensate"
 EVALUATE_STAGE = "95_evaluate"
 RELIGHT_STAGE = "97_relight"
 OLD_STAGE_NAMES = {"00_capture": CAPTURE_STAGE, "70_bind": FIT_STAGE}
-"""Stages by the names that earlier versions gave them; `pipelines.runs.places.refuse_old_run` refuses such runs."""
+"""Stages by the names that earlier versions gave them; `pipelines.runs.folders.refuse_old_run` refuses such runs."""
 ABLATION = "ablation"
 TALKING_FILM = "talking.mp4"
 

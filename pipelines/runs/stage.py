@@ -27,8 +27,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pipelines.runs.code import code_of
-from pipelines.runs.digests import GEOMETRY, sha256_file, versions
+from pipelines.runs.code import GEOMETRY, code_of, sha256_file, versions
 from pipelines.runs.manifest import SCHEMA, read_record
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError

@@ -16,9 +16,9 @@ from pipelines.runs.artefacts import (
     load_scan,
     load_scan_labels,
     load_weights,
+    values_of,
 )
 from pipelines.runs.layout import PARTS_WITHOUT_WEBS
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext
 from smplxpp.assemble import (

@@ -12,7 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import (
     ASSEMBLE_STAGE,
     BUILD_STAGES,
@@ -30,7 +31,6 @@ from pipelines.runs.layout import (
     UNPOSE_STAGE,
     VALIDATE_STAGE,
 )
-from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
 from pipelines.stages import assemble, capture, clean, locate, pose_body, segment, transfer, unpose, validate
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build

@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from pipelines.runs.artefacts import values_of
+from pipelines.runs.folders import absolute
 from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
 from pipelines.runs.manifest import require_plain_fields
-from pipelines.runs.places import absolute
-from pipelines.runs.reading import values_of
 from smplxpp.assemble import DarnConfig
 from smplxpp.clean import WebConfig
 from smplxpp.core.errors import InputError

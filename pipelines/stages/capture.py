@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import save_arrays
-from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.artefacts import load_stacked_params, save_arrays
 from pipelines.runs.gates import ROUGHNESS
 from pipelines.runs.layout import LOCATED_PARAMS, REGISTERED_PARAMS
 from pipelines.runs.stage import StageOutput

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import (
     load_scan,
     load_scan_labels,
+    save_arrays,
 )
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext

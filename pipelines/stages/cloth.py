@@ -19,7 +19,7 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.session import Session
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import GARMENTS, PARAMS
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer

@@ -28,11 +28,11 @@ from avatar.rig.posed import AvatarModel
 from avatar.rig.rig import Rig
 from avatar.training.engine.learning_rates import pixel_size
 from pipelines.figures import encode_png
-from pipelines.figures.evaluation import surface_picture, write_tiles
+from pipelines.figures.comparison import surface_picture, write_tiles
 from pipelines.runs import gates
-from pipelines.runs.digests import TRAINING, sha256_file
+from pipelines.runs.code import TRAINING, sha256_file
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
-from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int64
 
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.protocol import view_sets
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture, open_capture

@@ -24,7 +24,7 @@ from avatar.training.fit.config import FitConfig
 from avatar.training.fit.fit import FitResult, FitScene, fit_gaussians
 from pipelines.figures.comparison import write_strip
 from pipelines.runs import gates
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer

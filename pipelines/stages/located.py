@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from pipelines.runs.arrays import read_named
-from pipelines.runs.reading import values_of
+from pipelines.runs.artefacts import read_named, values_of
 from smplxpp.body import BodyModel, load_params
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams

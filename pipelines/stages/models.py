@@ -21,9 +21,9 @@ from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import explain_resource_errors, keep_freed_memory
 from avatar.training.engine.session import Session
 from pipelines.figures.comparison import preview_writer
-from pipelines.runs.digests import TRAINING
-from pipelines.runs.lock import own_run_folder
-from pipelines.runs.reading import values_of
+from pipelines.runs.artefacts import values_of
+from pipelines.runs.code import TRAINING
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.stage import (
     Stage,
     StageOutput,

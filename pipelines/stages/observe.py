@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.stages.located import LOCATED_FILES, read_located
 from pipelines.stages.observed_scans import observed_scans
 from pipelines.stages.register_config import RegisterInputs

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.gates import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage

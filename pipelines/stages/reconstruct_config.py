@@ -7,10 +7,10 @@ import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pipelines.runs.artefacts import values_of
+from pipelines.runs.folders import absolute
 from pipelines.runs.layout import RECONSTRUCT_FILE
 from pipelines.runs.manifest import require_plain_fields
-from pipelines.runs.places import absolute
-from pipelines.runs.reading import values_of
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json

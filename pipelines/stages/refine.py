@@ -18,7 +18,8 @@ from avatar.gaussians.bound_file import save_bound
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
 from pipelines.runs import gates
-from pipelines.runs.digests import TRAINING
+from pipelines.runs.code import TRAINING
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import (
     REFINE_STAGE,
     REFINED_CAMERAS,
@@ -26,7 +27,6 @@ from pipelines.runs.layout import (
     REFINED_PARAMS,
     REGISTERED_PARAMS,
 )
-from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with, told_of_given
 from pipelines.stages.refine_pictures import write_pictures

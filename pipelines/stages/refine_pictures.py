@@ -13,7 +13,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.render.avatar_view import render_view
 from avatar.rig.posed import at_rest
 from avatar.training.refinement.refine import Refinement
-from pipelines.figures.evaluation import write_tiles
+from pipelines.figures.comparison import write_tiles
 
 SHOWN_FRAMES = 4
 """The frames with the largest loss after refinement."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, REGISTER_STAGE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.observe import Observed, observe

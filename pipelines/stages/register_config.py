@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pipelines.runs.artefacts import values_of
+from pipelines.runs.folders import absolute
 from pipelines.runs.layout import REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
-from pipelines.runs.places import absolute
-from pipelines.runs.reading import values_of
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text

@@ -15,9 +15,9 @@ from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
 from pipelines.figures import VIEWS, encode_png, fit_cameras
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.digests import TRAINING, sha256_file
+from pipelines.runs.code import TRAINING, sha256_file
+from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import PARAMS, RELIGHT_STAGE, STUDENT, TEMPLATE
-from pipelines.runs.lock import own_run_folder
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from avatar.evaluation.input_protocol import EXACT, MIXED, NOT_KNOWN, TRACKED
+from pipelines.runs.folders import lies_in, same_place
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTERED_PARAMS
-from pipelines.runs.places import lies_in, same_place
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.register_config import load_register

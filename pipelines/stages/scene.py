@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avatar.data.views import read_views
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
+from pipelines.runs.folders import lies_in
 from pipelines.runs.layout import (
     RECONSTRUCT_STAGE,
     REFINE_STAGE,
@@ -17,7 +18,6 @@ from pipelines.runs.layout import (
     REGISTERED_PARAMS,
     TEMPLATE,
 )
-from pipelines.runs.places import lies_in
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with

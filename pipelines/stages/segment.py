@@ -12,9 +12,9 @@ from pipelines.runs.artefacts import (
     load_params_of_run,
     load_scan,
     load_source_faces,
+    values_of,
 )
 from pipelines.runs.layout import CORRECTIONS_FILE, SCAN
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext, BuildInputs
 from smplxpp.body import load_body

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from pipelines.figures.colors import blend_joint_colors
-from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import (
     load_cleaned_parts,
     load_posed_body,
     load_resting_body,
+    save_arrays,
 )
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.runs.arrays import save_arrays
 from pipelines.runs.artefacts import (
     load_parts,
     load_posed_body,
     load_weights,
+    save_arrays,
 )
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildContext

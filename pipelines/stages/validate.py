@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import save_arrays
-from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_scan_labels
+from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_scan_labels, save_arrays
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.build_config import BuildConfig, BuildContext

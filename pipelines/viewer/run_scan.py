@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.arrays import read_named, take
-from pipelines.runs.artefacts import load_scan, load_scan_labels
+from pipelines.runs.artefacts import load_scan, load_scan_labels, read_named, take, values_of
 from pipelines.runs.layout import (
     CORRECTIONS_FILE,
     LANDMARKS_FILE,
@@ -20,7 +19,6 @@ from pipelines.runs.layout import (
     SCAN_LABELS,
     SEGMENT_STAGE,
 )
-from pipelines.runs.reading import values_of
 from pipelines.stages.build import build
 from pipelines.stages.build_config import load_build
 from pipelines.stages.capture import GREY

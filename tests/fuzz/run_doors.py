@@ -21,7 +21,7 @@ from pipelines.report import Report, write_report
 from pipelines.report.sections.fit import fit_section
 from pipelines.report.sections.readable import readable
 from pipelines.report.sections.refine import refine_section
-from pipelines.runs.arrays import load_arrays, save_arrays
+from pipelines.runs.artefacts import load_arrays, save_arrays
 from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build

@@ -23,7 +23,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from pipelines.cli import main
 from pipelines.commands import evaluate as command
-from pipelines.figures.evaluation import read_tiles, surface_picture, write_tiles
+from pipelines.figures.comparison import read_tiles, surface_picture, write_tiles
 from pipelines.report import Report, write_report
 from pipelines.report.sections.evaluation import (
     evaluation_figures,
@@ -31,7 +31,7 @@ from pipelines.report.sections.evaluation import (
     evaluation_views,
     standing_evaluation,
 )
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES

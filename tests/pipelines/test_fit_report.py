@@ -17,7 +17,7 @@ from pipelines.report import Curve, Report, write_report
 from pipelines.report.charts import curve_svg
 from pipelines.report.sections.build import rewrite_report
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, head_box, standing_fit
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.register_config import RegisterInputs, load_register, save_register

@@ -13,7 +13,7 @@ import pytest
 from avatar.training.refinement.config import RefineConfig
 from pipelines.cli import main
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINED_CAMERAS, REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with

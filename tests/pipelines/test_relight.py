@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pipelines.report.sections.relight import relight_section, standing_relighting
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import read_manifest
 from tests.core.files.radiance import write_radiance
 from tests.dolls.standing import dressed, write_frames

@@ -10,14 +10,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipelines.runs.arrays import load_arrays, read_named, save_arrays
 from pipelines.runs.artefacts import (
+    load_arrays,
     load_canonical,
     load_parts,
     load_scan,
     load_scan_labels,
     load_source_faces,
     load_weights,
+    read_named,
+    save_arrays,
 )
 from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_WEBS, SCAN, SCAN_LABELS, WEIGHTS
 from smplxpp.core.errors import InputError

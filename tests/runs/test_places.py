@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.cli import main
-from pipelines.runs.lock import own_run_folder
-from pipelines.runs.places import keep_out_of_capture, refuse_old_run
+from pipelines.runs.folders import keep_out_of_capture, own_run_folder, refuse_old_run
 from smplxpp.capture import find_problems, find_reference, open_capture
 from smplxpp.core.errors import InputError
 

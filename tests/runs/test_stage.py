@@ -6,8 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from pipelines.runs.digests import sha256_file
-from pipelines.runs.lock import LOCK_NAME, own_run_folder
+from pipelines.runs.code import sha256_file
+from pipelines.runs.folders import LOCK_NAME, own_run_folder
 from pipelines.runs.stage import StageOutput, decide, differences, read_manifest, require_stage, run_stage, standing
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError

@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.captures.check.pictures import BODY_COLOR, MASK_COLOR, contact_sheet_of, draw_strips
 from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
-from pipelines.runs.digests import versions
+from pipelines.runs.code import versions
 from smplxpp.capture.check.check import CaptureCheck
 from smplxpp.capture.check.findings import AREAS, grouped
 from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary

@@ -35,8 +35,8 @@ from pipelines.report.sections.template import (
     weights_section,
 )
 from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
-from pipelines.runs.artefacts import load_params_of_run, load_scan
-from pipelines.runs.digests import versions
+from pipelines.runs.artefacts import load_params_of_run, load_scan, values_of
+from pipelines.runs.code import versions
 from pipelines.runs.layout import (
     ASSEMBLE_STAGE,
     BUILD_STAGES,
@@ -52,7 +52,6 @@ from pipelines.runs.layout import (
     TEMPLATE_STAGES,
     VALIDATE_STAGE,
 )
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_body

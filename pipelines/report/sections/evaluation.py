@@ -11,11 +11,10 @@ from jaxtyping import UInt8
 
 from avatar.evaluation.input_protocol import InputProtocol, counted
 from pipelines.figures import encode_jpeg, encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend
-from pipelines.figures.evaluation import SURFACE_LIMIT_MM, read_tiles
+from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, enlarge, error_colors, error_legend, read_tiles
 from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import EVALUATE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES

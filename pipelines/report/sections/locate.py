@@ -6,8 +6,8 @@ import numpy as np
 
 from pipelines.figures import body_cameras, encode_jpeg, render_overlay, render_shaded, row
 from pipelines.report import CheckRow, Picture, Section, Table
+from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import LOCATION_FILE
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.located import read_located
 from smplxpp.body import BodyModel

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.report.charts import curve_svg, histogram_svg
 from pipelines.report.model import CheckRow, KeyNumber, Section
-from pipelines.runs.reading import values_of
+from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord
 from smplxpp.core.errors import GeometryWarning, InputError
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.figures import encode_png, row
-from pipelines.figures.evaluation import read_tiles
+from pipelines.figures.comparison import read_tiles
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import REFINE_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipelines.figures import body_cameras, caption, encode_jpeg, encode_png, render_overlay, row
-from pipelines.figures.heat_strip import heat_strip
-from pipelines.figures.skeleton import body_on_photograph, draw_bones
+from pipelines.figures.body_drawings import body_on_photograph, draw_bones
+from pipelines.figures.sheets import heat_strip
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.report.sections.readable import readable, readable_numbers
-from pipelines.runs.arrays import read_named
-from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.artefacts import load_stacked_params, read_named
 from pipelines.runs.layout import REGISTER_STAGE
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.observe import open_inputs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipelines.report import Comparison, Picture, Section
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import RELIGHT_STAGE, STUDENT, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.files.paths import path_inside, read_bytes

@@ -18,10 +18,8 @@ from pipelines.figures import (
     row,
 )
 from pipelines.report import CheckRow, Comparison, Histogram, Picture, Section, Table
-from pipelines.runs.arrays import load_arrays, read_named
-from pipelines.runs.artefacts import load_cleaned_parts, load_parts, load_weights
+from pipelines.runs.artefacts import load_arrays, load_cleaned_parts, load_parts, load_weights, read_named, values_of
 from pipelines.runs.layout import SCAN_LABELS
-from pipelines.runs.reading import values_of
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.motion import motion_of_build

@@ -13,7 +13,7 @@ import trimesh
 from avatar.models.model_file import save_avatar
 from avatar.runtime import AvatarPlayer, load_bundle
 from pipelines.cli import main
-from pipelines.runs.digests import sha256_file
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import STUDENT, TEMPLATE
 from smplxpp.body import load_body
 from smplxpp.core.errors import GeometryWarning

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.figures.heat_strip import heat_strip
-from pipelines.figures.skeleton import JOINT, body_on_photograph, draw_bones
+from pipelines.figures.body_drawings import JOINT, body_on_photograph, draw_bones
+from pipelines.figures.sheets import heat_strip
 from pipelines.report.sections.register import register_section, worst_frames
 from pipelines.stages.register_capture import register_capture
 from pipelines.stages.register_config import RegisterInputs
