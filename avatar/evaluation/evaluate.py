@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -40,7 +40,7 @@ from avatar.models.student import Student
 from avatar.render.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
 from avatar.rig.rig import Motion, Rig
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least
@@ -88,7 +88,7 @@ def evaluate_models(
     config: EvaluationConfig | None = None,
     *,
     files: Mapping[str, Path] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Evaluation:
     """Measure models on a capture: images, surface, speed and size, all by the same rules.
 
@@ -100,7 +100,7 @@ def evaluate_models(
         models: modules that are `AvatarModel`s, by the name that tables give them, on the sequence's device.
         sequence: the capture and the template of the person.
         files: of the models, for their bytes on disk.
-        progress: called with frames done and all frames.
+        progress: called with the share of the frames that are measured.
 
     Raises:
         InputError: no model, a model on another device, no view to measure on, frames without parameters.
@@ -112,9 +112,9 @@ def evaluate_models(
     run = _Run(models, sequence, config, sets, truths, load_metric(config.metric, device=sequence.device))
     frames = sorted({frame for one in sets.values() for frame in one.frames} | set(chain(*truths.values())))
     for done, frame in enumerate(frames):
-        progress(done, len(frames))
+        progress("frames", done / len(frames))
         run.measure(frame)
-    progress(len(frames), len(frames))
+    progress("frames", 1.0)
     return run.result(files or {})
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float32, UInt16
 
 from avatar.formats.harmonics import C0
 from avatar.formats.splats import Splats
+from smplxpp.core.colors import decode_srgb
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export.gltf_buffers import BufferBuilder
@@ -74,7 +75,6 @@ def _fields(splats: Splats) -> dict[str, Float32[np.ndarray, "N ..."]]:
 
 
 def _point_colors(splats: Splats) -> UInt16[np.ndarray, "N 4"]:
-    """Return linear colours without what depends on the view, and opacities, in 16 bits (IEC 61966-2-1)."""
+    """Return linear colours without what depends on the view, and opacities, in 16 bits."""
     srgb = np.clip(0.5 + C0 * splats.f_dc.astype(np.float64), 0.0, 1.0)
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.rint(65535.0 * np.hstack([linear, splats.opacities[:, None]])).astype(np.uint16)
+    return np.rint(65535.0 * np.hstack([decode_srgb(srgb), splats.opacities[:, None]])).astype(np.uint16)

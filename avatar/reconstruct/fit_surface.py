@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from avatar.reconstruct.hash_grid import HashGrid
 from avatar.reconstruct.neural_surface import NeuralSurface
 from avatar.reconstruct.rays import Rays, rays_of
 from avatar.reconstruct.volume import opacities, weights_of
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.validation import require_at_least, require_positive
@@ -85,7 +85,7 @@ def fit_surface(
     config: SurfaceConfig | None = None,
     *,
     device: torch.device | str = "cuda",
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> SurfaceFit:
     """Fit a signed distance, a residual over the hull's, to photographs, and take its surface.
 

@@ -16,8 +16,8 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_list, as_number, as_numbers, as_object, as_text, read_json
 from smplxpp.core.files.paths import read_text
+from smplxpp.core.params import DEFAULT_FPS
 
-_FPS = 30.0
 _MOST_ROWS = 200_000
 _MOST_BYTES = 1 << 28
 _TIMES = ("timecode", "time", "timestamp", "seconds")
@@ -37,7 +37,7 @@ def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
       FLAME; `fps`.
 
     Args:
-        fps: frames a second where the file does not say; None: 30.
+        fps: frames a second where the file does not state them; None: `DEFAULT_FPS`.
 
     Raises:
         InputError: another suffix, a file that is none of these, and what `Curves` refuses.
@@ -47,7 +47,7 @@ def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"curves {path}", expected=".csv, .json or .npz", received=path.suffix or "no suffix")
-    return reader(path, fps or _FPS)
+    return reader(path, fps or DEFAULT_FPS)
 
 
 def _csv(path: Path, fps: float) -> Curves:

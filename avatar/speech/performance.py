@@ -16,7 +16,7 @@ from avatar.speech.liveliness import blinks, glances, head_motion, nods
 from avatar.speech.phonemes import Phoneme, Speech
 from avatar.speech.stance import Stance
 from avatar.speech.tracks import Track
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_at_least, require_between, require_positive
 
@@ -42,7 +42,7 @@ class TalkConfig:
         InputError: options out of range.
     """
 
-    fps: float = 30.0
+    fps: float = DEFAULT_FPS
     seed: int = 0
     strength: float = 1.0
     lively: float = 1.0

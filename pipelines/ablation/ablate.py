@@ -28,6 +28,7 @@ from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
+from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.files.image_file import open_image
 from smplxpp.core.files.json_values import jsonable
@@ -44,7 +45,8 @@ class AblationRun:
     Attributes:
         command: in words, for `results.json`.
         device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' stages anew.
-        training: called with the name of a stage and its progress. measuring: with a row, frames done, all frames.
+        training: called with the name of a stage and its progress.
+        measuring: called with the name of a row and the share of its frames that are measured.
     """
 
     command: str = ""
@@ -52,7 +54,7 @@ class AblationRun:
     max_seconds: float = math.inf
     force: bool = False
     training: Callable[[str, Progress], None] = lambda name, progress: None
-    measuring: Callable[[str, int, int], None] = lambda name, done, total: None
+    measuring: ProgressCallback = ignore_progress
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,11 @@ class AblationOutcome:
     table: FigureTable
     results: dict[str, Any]
     waiting: list[str] = field(default_factory=list)
+
+
+def _report_row(how: AblationRun, row: str, step: str, share: float) -> None:
+    """Report how far the measurement of a row is, under the row's name."""
+    how.measuring(row, share)
 
 
 def ablate(
@@ -114,7 +121,7 @@ def ablate(
             known=known,
             force=how.force,
             in_time=bool(trainer.seconds_left()),
-            progress=partial(how.measuring, name),
+            progress=partial(_report_row, how, name),
         )
         if measured is not None:
             found[name] = measured

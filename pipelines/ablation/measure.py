@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from pipelines.stages.evaluate import surface_digest
 from pipelines.stages.evaluate_poses import of_held_out_poses, refined_digest, refined_poses
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
+from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.json_file import as_integer, as_number
 
@@ -92,7 +93,7 @@ def measure_row(
     known: InputProtocol,
     force: bool = False,
     in_time: bool = True,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> RowResult | None:
     """Measure a row unless it stands; None where it does not stand and there is no time left for it.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv, write_plain_cameras_json
 from smplxpp.capture.writers.description import write_description
 from smplxpp.capture.writers.keypoints import write_keypoints
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes, atomic_write_text
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.json_values import jsonable
@@ -30,7 +30,6 @@ from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_between, require_choice, require_positive
 
-Progress = Callable[[int, int], None]
 _RECORD = "conversion.json"
 
 
@@ -81,7 +80,7 @@ class Conversion:
 
 
 def convert_capture(
-    capture: Capture, out: Path, config: ConvertConfig | None = None, *, progress: Progress = lambda done, count: None
+    capture: Capture, out: Path, config: ConvertConfig | None = None, *, progress: ProgressCallback = ignore_progress
 ) -> Conversion:
     """Write a capture anew.
 
@@ -92,7 +91,7 @@ def convert_capture(
         capture: at full size.
         out: a new or an empty folder, or that of the same conversion, interrupted.
         config: what to write.
-        progress: called with the number of views done and of all.
+        progress: called with the share of the views that are written.
 
     Raises:
         InputError: cameras or frames that the capture does not have, or a folder with something else in it.
@@ -125,7 +124,7 @@ def _write_views(
     outcomes: list[ViewOutcome],
     out: Path,
     config: ConvertConfig,
-    progress: Progress,
+    progress: ProgressCallback,
 ) -> None:
     """Write the views in parallel; `outcomes` takes what was done, also before an error ends it."""
     writer = ViewWriter(source, _root(out, config), config.layout, config.quality)
@@ -133,7 +132,7 @@ def _write_views(
         try:
             for outcome in pool.map(writer.write, *zip(*views, strict=True)) if views else ():
                 outcomes.append(outcome)
-                progress(len(outcomes), len(views))
+                progress("views", len(outcomes) / len(views))
         except OSError:
             pool.shutdown(cancel_futures=True)  # a full disk stays full
             raise

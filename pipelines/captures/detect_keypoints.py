@@ -21,13 +21,12 @@ from smplxpp.capture import Capture
 from smplxpp.capture.images import read_alpha, read_color
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.writers.keypoints import write_keypoints
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
 
-Progress = Callable[[int, int], None]
 # A kill loses at most this many seconds of detecting.
 _SAVE_EVERY_S = 20.0
 _NAMED = 8
@@ -61,7 +60,7 @@ def detect_keypoints(
     *,
     cameras: Sequence[str] | None = None,
     frames: Iterable[int] | None = None,
-    progress: Progress = lambda done, count: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> dict[str, DetectedCamera]:
     """Detect keypoints in the images of a capture and write `folder/CAM.npz`, which `open_capture(keypoints=folder)`
     reads.
@@ -95,7 +94,7 @@ def detect_keypoints(
         for frame in numbers:
             work.look(frame)
             done += 1
-            progress(done, total)
+            progress("images", done / total)
         found[name] = work.finish()
     if not any((one.people > 0).any() for one in found.values()):
         raise InputError(

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.runs.stage import goes_on
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback
 
 if TYPE_CHECKING:
     from avatar.training.engine.loop import Progress as TrainingProgress
@@ -137,11 +137,10 @@ class Ablate:
 
 
 Training = Callable[[str, "TrainingProgress"], None]
-Measuring = Callable[[str, int, int], None]
 
 
 @contextmanager
-def _progress(*, enabled: bool) -> Iterator[tuple[Training, Measuring]]:
+def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
     """A bar a piece with loss, held-out PSNR and speed, and one while a row is measured."""
     columns = (
         TextColumn("{task.description:<18}"),
@@ -169,8 +168,8 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, Measuring]]:
             figures += [quality[name]] if name in quality else []
             bar.update(task(name, state.iterations), completed=state.iteration, figures="  ".join(figures))
 
-        def measuring(name: str, done: int, total: int) -> None:
-            bar.update(task(f"measuring {name}", total), completed=done)
+        def measuring(name: str, share: float) -> None:
+            bar.update(task(f"measuring {name}", 100), completed=round(100 * share))
 
         yield training, measuring
 

@@ -30,13 +30,12 @@ from smplxpp.cloth.play import play
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import display_colors
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.spread import spread
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 
-DEFAULT_FPS = 20.0
 _FRAMING_POSES = 24  # poses that the camera is fitted to
 _PRE_ROLL = 0.7  # seconds of the motion before the first frame that loose clothes follow
 _BLOCK = 16  # frames posed at a time
@@ -64,7 +63,7 @@ class Animate:
     interpolate: OptionalFloat = None
     """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""
     fps: OptionalFloat = None
-    """Frames a second; by default those of the parameters (or 20) over --step, so that the speed is true."""
+    """Frames a second; by default those of the parameters (or 30) over --step, so that the speed is true."""
     view: Literal["front", "side", "back", "three-quarter", "turntable"] = "front"
     """Where the camera stands; turntable: once around over the whole film."""
     colors: Literal["scan", "labels", "semantic", "weights", "none"] = "scan"

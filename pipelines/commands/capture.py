@@ -52,7 +52,7 @@ class CaptureCheckCommand:
         from pipelines.captures.check import write_check_report
         from pipelines.captures.check.report import check_as_dict
         from pipelines.captures.check.terminal import print_check
-        from pipelines.commands.progress import counted_progress
+        from pipelines.commands.progress import shared_progress
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
@@ -70,7 +70,7 @@ class CaptureCheckCommand:
             protocol=self.protocol,
         )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
-        with counted_progress("images", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             check = capture.check(body, config, progress=progress)
         if not self.json:
             print_check(check, Console())
@@ -120,7 +120,7 @@ class CaptureConvertCommand:
     def run(self) -> dict:
         """Convert; exit status 1 if something had to be left out."""
         from pipelines.captures.convert import ConvertConfig, convert_capture
-        from pipelines.commands.progress import counted_progress
+        from pipelines.commands.progress import shared_progress
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
 
@@ -144,7 +144,7 @@ class CaptureConvertCommand:
             cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
             quality=self.quality,
         )
-        with counted_progress("views", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             done = convert_capture(capture, self.out, config, progress=progress)
         if not self.json:
             console = Console()
@@ -158,7 +158,7 @@ class CaptureConvertCommand:
 
     def _matte(self, model_file: Path) -> None:
         """Run the model over every image that has no matte yet."""
-        from pipelines.commands.progress import counted_progress
+        from pipelines.commands.progress import shared_progress
         from smplxpp.capture import open_capture
         from smplxpp.capture.matting import MattingModel, write_mattes
 
@@ -166,9 +166,9 @@ class CaptureConvertCommand:
             raise InputError("--matting", expected="--masks FOLDER for the mattes", received="no folder")
         capture = open_capture(self.capture, format=_reader(self.format), cache_bytes=0)
         model, total = MattingModel(model_file), len(capture.views())
-        with counted_progress("mattes", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             for done, _ in enumerate(write_mattes(capture, model, self.masks), start=1):
-                progress(done, total)
+                progress("mattes", done / total)
 
 
 def _reader(format: FormatName) -> str | None:

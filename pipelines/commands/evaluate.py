@@ -13,7 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.lighting import Lighting
 from pipelines.commands.options import ClothMode, OptionalPath, OptionalText, require_avatar
-from pipelines.commands.progress import counted_progress
+from pipelines.commands.progress import shared_progress
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
 from smplxpp.core.light import Irradiance, Relighting
@@ -118,7 +118,7 @@ class Evaluate:
         )
         lights = self._lights()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
-        with counted_progress("frames", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             record = evaluate(
                 self.run_folder,
                 inputs,

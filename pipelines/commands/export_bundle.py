@@ -16,11 +16,10 @@ from pipelines.runs.layout import GARMENTS, PARAMS, STUDENT, TEMPLATE
 from smplxpp import __version__
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 SUFFIX = ".avatar"
 # Of poses that training saw, where nobody says how fast they came.
-_FPS = 20.0
 
 
 def export_bundle(
@@ -81,4 +80,4 @@ def _seen(run: Path, poses: np.ndarray) -> BodyParams:
     else:
         reference = BodyParams.rest(betas=0)
     still = reference.select(np.zeros(len(poses), dtype=np.int64))
-    return replace(still, body_pose=poses, fps=reference.fps or _FPS)
+    return replace(still, body_pose=poses, fps=reference.fps or DEFAULT_FPS)

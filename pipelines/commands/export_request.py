@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.commands.options import ClothMode
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 SERIES = ""
 """The suffix of a folder with a file a frame."""
@@ -15,7 +15,6 @@ SERIES_FILE = "sequence.json"
 """Says when each of its files is shown."""
 PRE_ROLL = 0.7
 """Seconds of a motion before its first frame that loose clothes follow."""
-_DEFAULT_FPS = 20.0
 # Of the formats that a suffix names, or that stand behind others' suffixes.
 SUFFIXES: dict[str, tuple[str, ...]] = {
     "avatar": (".avatar",),
@@ -84,8 +83,8 @@ class FileRequest:
 
 
 def frames_a_second(params: BodyParams) -> float:
-    """Return the rate of parameters, 20 where they do not say it."""
-    return params.fps or _DEFAULT_FPS
+    """Return the rate of parameters, `DEFAULT_FPS` where they state none."""
+    return params.fps or DEFAULT_FPS
 
 
 def format_of(out: Path, named: str) -> str:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
-from pipelines.commands.progress import counted_progress, training_progress
+from pipelines.commands.progress import shared_progress, training_progress
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord, goes_on
 from smplxpp.core.validation import require_at_least, require_positive
@@ -88,8 +88,8 @@ class Fit:
         config = self.config()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         if wants_refinement(self.run_folder, inputs, self.refine_poses):
-            with counted_progress("poses", enabled=not self.json) as told:
-                refine(self.run_folder, inputs, RefineConfig(seed=self.seed), told=told)
+            with shared_progress(enabled=not self.json) as show:
+                refine(self.run_folder, inputs, RefineConfig(seed=self.seed), progress=show)
         scene = open_frame(self.run_folder, inputs, self.frame)
         device = choose_device(self.device)
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:

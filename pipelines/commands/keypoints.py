@@ -95,7 +95,7 @@ class KeypointsDetect:
         """Detect; returns what was found of each camera."""
         from pipelines.captures.detect_keypoints import detect_keypoints, detection_sheet, problems_of
         from pipelines.commands.capture import selected_frames
-        from pipelines.commands.progress import counted_progress
+        from pipelines.commands.progress import shared_progress
         from pipelines.figures import encode_jpeg, encode_png
         from pipelines.runs.folders import keep_out_of_capture, same_place
         from smplxpp.capture import open_capture
@@ -110,7 +110,7 @@ class KeypointsDetect:
         if self.sheet is not None and self.sheet.suffix.lower() not in (".png", ".jpg"):
             raise InputError("--sheet", expected="the name of a .png or .jpg", received=str(self.sheet))
         detector = load_detector(self.detector)
-        with counted_progress("images", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             found = detect_keypoints(
                 capture,
                 detector,

@@ -43,7 +43,7 @@ class CaptureMasks:
         """Write the masks; returns how many stand."""
         from pipelines.captures.masks import write_masks
         from pipelines.commands.capture import selected_frames
-        from pipelines.commands.progress import counted_progress
+        from pipelines.commands.progress import shared_progress
         from pipelines.runs.folders import keep_out_of_capture, same_place
         from smplxpp.capture import open_capture
 
@@ -58,9 +58,9 @@ class CaptureMasks:
         cameras = tuple(dict.fromkeys(camera for camera, _ in views))
         matter_of, identity = self._matters(capture, cameras)
         written = write_masks(capture, matter_of, self.out, identity=identity, cameras=cameras, frames=frames)
-        with counted_progress("masks", enabled=not self.json) as progress:
+        with shared_progress(enabled=not self.json) as progress:
             for done, _ in enumerate(written, start=1):
-                progress(done, len(views))
+                progress("masks", done / len(views))
         return {"out": str(self.out), "masks": len(views), "cameras": list(cameras)}
 
     def _matters(self, capture: Capture, cameras: tuple[str, ...]) -> tuple[Callable[[str], Matter], str]:

@@ -12,10 +12,13 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from smplxpp.core.errors import ProgressCallback
 
 if TYPE_CHECKING:
     from avatar.training.engine.loop import Progress as TrainingProgress
@@ -32,19 +35,6 @@ def stage_progress(count: int, *, enabled: bool = True) -> Iterator[Callable[[st
             progress.update(task, description=name, advance=1 if done else 0)
 
         yield step
-
-
-@contextmanager
-def counted_progress(what: str, *, enabled: bool = True) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar over things that are counted; yields `show(done, count)`."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
-        task = progress.add_task(what, total=None)
-
-        def show(done: int, count: int) -> None:
-            progress.update(task, completed=done, total=count)
-
-        yield show
 
 
 @contextmanager
@@ -92,13 +82,14 @@ def training_progress(
 
 
 @contextmanager
-def shared_progress(*, enabled: bool = True) -> Iterator[Callable[[str, float], None]]:
-    """Show a bar that fills with each piece of work; yields `show(what, share done)`."""
-    columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TimeElapsedColumn())
+def shared_progress(*, enabled: bool = True) -> Iterator[ProgressCallback]:
+    """Show a bar that fills once for each step of the work; yields the callback that moves it."""
+    name = TextColumn("{task.description:<14}")
+    columns = (SpinnerColumn(), name, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
         task = progress.add_task("start", total=1.0)
 
-        def show(what: str, share: float) -> None:
-            progress.update(task, description=what, completed=share)
+        def show(step: str, share: float) -> None:
+            progress.update(task, description=step, completed=share)
 
         yield show

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -50,7 +50,7 @@ from pipelines.stages.scene_digests import params_digest
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.core.validation import require_known
@@ -77,7 +77,7 @@ def evaluate(
     cloth: ClothMode = "simulate",
     device: str = "cpu",
     force: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
     """Measure the models of a run on a capture; skipped while models, capture, code and configuration stand.
 
@@ -86,7 +86,7 @@ def evaluate(
         cloth: what moves loose clothes of students in held-out poses, where the run has found some.
         refined: measure held-out poses that the run refined on training cameras too, where it has any.
         force: measure anew even if the stage stands.
-        progress: called with frames done and all frames.
+        progress: called with the share of the frames that are measured.
 
     Raises:
         InputError: no template, no trained model, a model of another template; a capture of another body, or one that

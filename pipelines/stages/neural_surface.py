@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -12,10 +11,8 @@ import numpy as np
 from avatar.reconstruct import SurfaceConfig, fit_surface
 from avatar.training.engine.device import choose_device
 from pipelines.stages.reconstruct import Method
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback
 from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct
-
-Report = Callable[[str, float], None]
 
 
 def neural_method(config: ReconstructConfig, surface: SurfaceConfig, device: str) -> Method:
@@ -43,7 +40,7 @@ def _neural_surface(
     config: ReconstructConfig,
     surface: SurfaceConfig,
     device: str,
-    progress: Report,
+    progress: ProgressCallback,
 ) -> Reconstruction:
     """The hull, then the neural surface within it; colours and confidence as of the sweep's surface."""
     start = reconstruct(views, replace(config, refine=False), progress=progress)

@@ -30,7 +30,7 @@ from pipelines.stages.reconstruct_config import ReconstructInputs, save_reconstr
 from smplxpp.capture import Capture
 from smplxpp.clean import sanitize
 from smplxpp.core.checks import Check
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.json_values import jsonable
@@ -40,8 +40,6 @@ from smplxpp.reconstruct.agreement import silhouette_agreement
 from smplxpp.reconstruct.neus2 import mesh_in_world
 from smplxpp.reconstruct.views import usable_views
 
-Report = Callable[[str, float], None]
-"""Told what is being done, and the share of it that is done."""
 Maker = Callable[..., Reconstruction]
 """`make(views, progress=...)`: the surface of a moment."""
 
@@ -62,17 +60,13 @@ class Method:
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
 
 
-def _silent(what: str, share: float) -> None:
-    """Report nothing."""
-
-
 def reconstruct_capture(
     run: Path,
     inputs: ReconstructInputs,
     *,
     method: Method | None = None,
     force: bool = False,
-    progress: Report = _silent,
+    progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
     """Reconstruct the frames, unless the stage stands, and keep it in a run that the caller owns.
 
@@ -126,7 +120,7 @@ def _work(
     cameras: tuple[str, ...],
     frames: tuple[int, ...],
     make: Maker,
-    progress: Report,
+    progress: ProgressCallback,
 ) -> StageOutput:
     """Write `scan_FFFFFF.ply`, `scan_FFFFFF.npz` of every frame, and `reconstruction.json`."""
     found: dict[int, dict[str, Any]] = {}
@@ -169,7 +163,7 @@ def _work(
 
 
 def _make_frame(
-    made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: Report
+    made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: ProgressCallback
 ) -> None:
     views, problems = photographs(capture, cameras, frame)
     result = make(views, progress=progress)
@@ -184,11 +178,11 @@ def _make_frame(
         (temporary / "numbers.json").write_text(json.dumps(jsonable(numbers)) + "\n")
 
 
-def _surface(views: list[PhotoView], *, config: ReconstructConfig, progress: Report) -> Reconstruction:
+def _surface(views: list[PhotoView], *, config: ReconstructConfig, progress: ProgressCallback) -> Reconstruction:
     return reconstruct(views, config, progress=progress)
 
 
-def _adopted(views: list[PhotoView], *, inputs: ReconstructInputs, progress: Report) -> Reconstruction:
+def _adopted(views: list[PhotoView], *, inputs: ReconstructInputs, progress: ProgressCallback) -> Reconstruction:
     """Another program's surface, in the cameras' world."""
     assert inputs.mesh is not None
     progress("masks", 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,7 +35,7 @@ from pipelines.stages.scene import TrainInputs, TrainScene, of_protocol, open_ca
 from pipelines.stages.usable import with_cameras
 from smplxpp.capture import Capture
 from smplxpp.capture.writers.cameras import write_plain_cameras_json
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_values import jsonable
@@ -44,7 +44,6 @@ from smplxpp.register.kinematics import BodyState
 from smplxpp.template.template import Template
 
 Choice = Literal["auto", "on", "off"]
-Told = Callable[[int, int], None]
 log = logging.getLogger(__name__)
 
 
@@ -79,7 +78,7 @@ def refine(
     *,
     held_out: bool = True,
     force: bool = False,
-    told: Told = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
     """Refine the poses of a run's capture, made in one go; skipped while template, capture, code and choices stand.
 
@@ -90,7 +89,7 @@ def refine(
 
     Args:
         inputs: with the parameters that refinement begins with. held_out: refine held-out frames apart.
-        force: refine even if the stage stands. told: of looks at frames, done and all.
+        force: refine even if the stage stands. progress: called with the share of the frames' evaluations.
 
     Raises:
         InputError: see `open_scene`.
@@ -106,16 +105,22 @@ def refine(
     )
     with own_run_folder(run, (REFINE_STAGE, "report")):
         return run_stage(
-            run, stage, lambda folder: _work(scene, inputs, config, folder, told, held_out=held_out), force=force
+            run, stage, lambda folder: _work(scene, inputs, config, folder, progress, held_out=held_out), force=force
         )
 
 
 def _work(
-    scene: TrainScene, inputs: TrainInputs, config: RefineConfig, folder: Path, told: Told, *, held_out: bool
+    scene: TrainScene,
+    inputs: TrainInputs,
+    config: RefineConfig,
+    folder: Path,
+    progress: ProgressCallback,
+    *,
+    held_out: bool,
 ) -> StageOutput:
     begin = time.perf_counter()
     sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False))
-    found = refine_poses(sequence, config, reference=scene.frame, told=told)
+    found = refine_poses(sequence, config, reference=scene.frame, progress=progress)
     if found.kept:
         log.warning("frames %s keep their poses: refined ones fit worse", " ".join(map(str, found.kept)))
     capture, template = scene.capture, scene.template

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,18 +17,11 @@ from pipelines.stages.observe import Observed, observe
 from pipelines.stages.register_config import RegisterInputs, save_register
 from pipelines.stages.registration import registration_checks, stacked_rows, summary
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.json_values import jsonable
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.fit import register
 from smplxpp.register.follow import follow, lost_frames
-
-Report = Callable[[str, float], None]
-"""Told what is being done, and the share of it that is done."""
-
-
-def _silent(what: str, share: float) -> None:
-    """Report nothing."""
 
 
 def register_capture(
@@ -37,7 +29,7 @@ def register_capture(
     inputs: RegisterInputs,
     *,
     force: bool = False,
-    progress: Report = _silent,
+    progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
     """Register the body, unless the stage stands, and keep the stage in a run that the caller owns.
 
@@ -80,7 +72,7 @@ def _work(
     inputs: RegisterInputs,
     body: BodyModel,
     config: RegisterConfig,
-    progress: Report,
+    progress: ProgressCallback,
 ) -> StageOutput:
     """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
     observations = observed.observations

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from pipelines.figures import ShadeStyle, render_shaded, turntable_cameras
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_at_least
 from smplxpp.detect import Detector
 from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
 
-Progress = Callable[[int, int], None]
 Landmarks = dict[str, tuple[Float64[np.ndarray, " 3"], float]]
 # Confidence from which a view counts as one that sees a point.
 _SEEN = 0.3
@@ -54,7 +53,7 @@ def keypoints_of_scan(
     detector: Detector,
     *,
     config: ScanViews | None = None,
-    progress: Progress = lambda done, count: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Landmarks:
     """Find the landmarks that a detector knows on a scan that stands upright.
 
@@ -90,7 +89,7 @@ def views_of_scan(
     detector: Detector,
     config: ScanViews,
     *,
-    progress: Progress = lambda done, count: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Triangulation:
     """What the detector sees in pictures all around, triangulated; one frame.
 
@@ -108,7 +107,7 @@ def views_of_scan(
             keypoints[name] = Keypoints2D(
                 detector.names, np.array([0]), people[0].points[None], people[0].confidence[None]
             )
-        progress(k + 1, config.count)
+        progress("views", (k + 1) / config.count)
     if len(cameras) < 2:
         raise InputError(
             "scan",

@@ -181,13 +181,13 @@ def train(
 
 
 def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: TrainOptions) -> StageRecord:
-    """Refine the poses, with a bar of looks at frames."""
+    """Refine the poses of the training frames, and show the percentage done in a bar."""
     with options.bar(REFINE_STAGE, 0) as report:
 
-        def told(done: int, total: int) -> None:
-            report(Progress(done, total, 0.0, 0.0))
+        def show(step: str, share: float) -> None:
+            report(Progress(round(100 * share), 100, 0.0, 0.0))
 
-        return refine(run, inputs, config, force=options.force, told=told)
+        return refine(run, inputs, config, force=options.force, progress=show)
 
 
 def _tell_of_clothes(run: Path, scene: TrainScene, config: TrainConfig, steps: tuple[str, ...]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.cameras import write_cameras_json
 from smplxpp.capture.writers.description import write_description
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.params import BodyParams
@@ -80,7 +79,7 @@ def degrade_capture(
     config: DegradeConfig | None = None,
     *,
     body: BodyModel | None = None,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Degraded:
     """Write a capture that has, beside its exact inputs, those that trackers would give; whole or not at all.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,13 +32,13 @@ from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.cameras import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
+from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
 
-Progress = Callable[[str, float], None]
 _NOVEL_POSE_SHARE = 0.2
 # Cells of colours on the head, beside those on the body: close-ups look at it.
 _FINER = 0.45
@@ -106,7 +106,7 @@ def make_capture(
     config: SynthConfig,
     *,
     environment: Environment | None = None,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> dict[str, float]:
     """Write a capture to the folder `out`, whole or not at all; what stands there is replaced.
 
@@ -177,7 +177,7 @@ def make_capture(
     return checks
 
 
-def add_tracked_inputs(root: Path, *, seed: int, progress: Progress = lambda what, share: None) -> dict[str, float]:
+def add_tracked_inputs(root: Path, *, seed: int, progress: ProgressCallback = ignore_progress) -> dict[str, float]:
     """Write a tracker's keypoints and a parser's label maps into a synthetic capture, from its own files.
 
     Args:
@@ -223,7 +223,7 @@ def _rig(person: Person, take: Take, config: SynthConfig) -> list[RigCamera]:
     return [replace(item, camera=replace(item.camera, name=f"Cam{k + 1:03d}")) for k, item in enumerate(rig)]
 
 
-def _atlas(person: Person, hidden: Bool[np.ndarray, " M"], texel: float, progress: Progress) -> Atlas | None:
+def _atlas(person: Person, hidden: Bool[np.ndarray, " M"], texel: float, progress: ProgressCallback) -> Atlas | None:
     if not texel:
         return None
     progress("colours", 0.0)
@@ -283,7 +283,7 @@ def _write_views(
     painted: tuple[Person, Atlas | None],
     rig: list[RigCamera],
     config: SynthConfig,
-    progress: Progress,
+    progress: ProgressCallback,
 ) -> None:
     """Render every frame through every camera and write the files."""
     person, atlas = painted

@@ -18,11 +18,10 @@ from smplxpp.body.bvh_params import load_bvh
 from smplxpp.body.retarget import Skeleton
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)
-_FPS = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +79,14 @@ def motion_of_run(run: Path, template: Template, capture: Capture | None, given:
             # The template has the identity: betas must not move the root's joint a second time.
             body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
             params = load_params(given, body=body).without_shape()
-        return ShownMotion(params, tuple(range(len(params))), params.fps or _FPS, given.name)
+        return ShownMotion(params, tuple(range(len(params))), params.fps or DEFAULT_FPS, given.name)
     if capture is not None:
         found = {frame: own for frame in capture.frames if (own := capture.params(frame)) is not None}
         if found:
             whole = BodyParams.concatenate([replace(one, fps=None) for one in found.values()]).without_shape()
-            return ShownMotion(whole, tuple(found), capture.fps or _FPS, f"capture {capture.name}", photographed=True)
+            return ShownMotion(
+                whole, tuple(found), capture.fps or DEFAULT_FPS, f"capture {capture.name}", photographed=True
+            )
     if (run / PARAMS).is_file():
-        return ShownMotion(load_params_of_run(run).frame(0).without_shape(), (0,), _FPS, "the reference frame")
-    return ShownMotion(BodyParams.rest(betas=0, expressions=0), (0,), _FPS, "the T-pose")
+        return ShownMotion(load_params_of_run(run).frame(0).without_shape(), (0,), DEFAULT_FPS, "the reference frame")
+    return ShownMotion(BodyParams.rest(betas=0, expressions=0), (0,), DEFAULT_FPS, "the T-pose")

@@ -11,7 +11,7 @@ from pipelines.figures.colors import heat_colors
 from smplxpp.core.labels import LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
-from smplxpp.export.gltf_mesh import linear_from_srgb
+from smplxpp.export.gltf_mesh import linear_rgba16
 
 MOST_SPLIT_FACES = 250_000
 """Scans of more faces are drawn with colours of vertices: every face with corners of its own would take too long."""
@@ -61,7 +61,7 @@ def _glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: n
     attributes = pygltflib.Attributes(
         POSITION=buffers.add(vertices.astype(np.float32), target=ARRAY_BUFFER, bounds=True),
         NORMAL=buffers.add(normals.astype(np.float32), target=ARRAY_BUFFER),
-        COLOR_0=buffers.add(linear_from_srgb(colors), target=ARRAY_BUFFER, normalized=True),
+        COLOR_0=buffers.add(linear_rgba16(colors), target=ARRAY_BUFFER, normalized=True),
     )
     indices = buffers.add(faces.reshape(-1).astype(index_dtype(len(vertices))), target=ELEMENT_ARRAY_BUFFER)
     dull = pygltflib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)

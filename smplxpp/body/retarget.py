@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.skinning.linear_blend import forward_kinematics
 
@@ -24,7 +24,6 @@ FEET = ("left_foot", "right_foot", "left_ankle", "right_ankle")
 _SLOW, _LOW = 0.35, 0.06
 """A foot stands where it moves by less than so many leg lengths a second, so many of them above its lowest."""
 _BRACE = 0.05
-_FPS = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +99,7 @@ def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyPara
     moved = places - target.places[0]
     out = replace(params.without_shape(), transl=moved)
     feet, theirs = target.pose(out)[:, target.at(*FEET)], scale * own[:, source.at(*FEET)]
-    moved = moved + held_feet(theirs, feet, target.leg, params.fps or _FPS)
+    moved = moved + held_feet(theirs, feet, target.leg, params.fps or DEFAULT_FPS)
     lowest = target.pose(replace(out, transl=moved))[:, target.at(*FEET), 1].min()
     moved[:, 1] += floor - lowest
     return replace(out, transl=moved)

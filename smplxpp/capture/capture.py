@@ -19,7 +19,7 @@ from smplxpp.capture.splits import Splits
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -110,14 +110,14 @@ class Capture:
         body: BodyModel | None = None,
         config: CheckConfig | None = None,
         *,
-        progress: Callable[[int, int], None] = lambda done, count: None,
+        progress: ProgressCallback = ignore_progress,
     ) -> CaptureCheck:
         """Find everything that would spoil a training: files, splits, masks, parameters, calibration.
 
         Args:
             body: the model that the parameters are for; None: the open body.
             config: how much is looked at.
-            progress: called with the number of views that were opened and of all that will be.
+            progress: called with the share of the views that are checked.
 
         Returns:
             The findings, and `failed`: whether one of them has to be corrected before a training.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
 from smplxpp.cloth.garment import Garment, GarmentConfig
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least, require_between
 from smplxpp.template.template import Template
@@ -101,7 +101,7 @@ def calibrate(
     *,
     config: CalibrationConfig | None = None,
     driver: DriverConfig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> tuple[Garment, Calibration]:
     """Fit drag and pin depth to a followed surface, where it moves.
 
@@ -167,9 +167,9 @@ def calibrate(
 
     frames = np.arange(len(skinned))
     for done, pair in enumerate(pairs):
-        progress(done, len(pairs))
+        progress("calibration", done / len(pairs))
         table[pair] = simulated(*pair)
-    progress(len(pairs), len(pairs))
+    progress("calibration", 1.0)
     drag, pin = best(frames)
     if table[drag, pin].mean() > config.most_share * skinned.mean():
         return garment, _found(garment, skinned, table[drag, pin], moves=True)

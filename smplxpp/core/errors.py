@@ -1,6 +1,16 @@
-"""Errors for the user's input: what was expected, what was received, what to do."""
+"""What the library reports to its caller: errors about input, warnings, and the progress of long work."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+ProgressCallback: TypeAlias = Callable[[str, float], None]
+"""Receives the name of the step under way and the share of it that is done, 0 to 1."""
+
+
+def ignore_progress(step: str, share: float) -> None:
+    """Discard a report of progress; the default where a function takes a `ProgressCallback`."""
 
 
 class InputError(ValueError):

@@ -24,7 +24,11 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
 )
 # Every array of BodyParams, in the order of its fields.
 ARRAY_NAMES: tuple[str, ...] = (*(name for name, _ in POSE_BLOCKS), "betas", "expression", "transl")
-# Of radians, metres and coefficients: nobody has more, and squares of far more overflow.
+DEFAULT_FPS = 30.0
+"""Frames per second of a motion or capture that states none: the rate of most cameras and of animation programs, and
+what glTF, BVH and USD players show smoothly. Files that state a rate keep theirs."""
+# Upper bound of the absolute value of radians, metres and coefficients. No valid file is near it, and squares of much
+# larger numbers overflow in float32.
 _LARGEST = 1e6
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_positive
 
-_FPS = 30.0
 _BETAS = 16
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _FACE = ("jaw_pose", "leye_pose", "reye_pose")
@@ -36,7 +35,7 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
     Raises:
         InputError: no frames, a rate that is not positive, a body of other joints, more than 16 betas.
     """
-    fps = params.fps or _FPS
+    fps = params.fps or DEFAULT_FPS
     require_positive("frames a second of the motion", fps)
     if not len(params):
         raise InputError("motion for AMASS", expected="at least one frame", received="none")

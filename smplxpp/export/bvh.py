@@ -10,12 +10,11 @@ from jaxtyping import Float, Float64
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.validation import require_positive
 
 UNITS_A_METRE = 100.0
 """BVH has no unit of its own; animation programs take it as centimetres."""
-_FPS = 30.0
 _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Xrotation Yrotation"
 # Of the bone that a joint without children ends: as long as so much of the one before it.
 _END = 0.6
@@ -31,13 +30,13 @@ def write_bvh(
     complete. Left out: expressions, and what they and the shape do to the joints.
 
     Args:
-        body: J joints, whose names they get. params: T frames, at their `fps` or 30 a second.
+        body: J joints, whose names they get. params: T frames, at their `fps` or `DEFAULT_FPS`.
         joints: at rest, metres; None: those of the mean shape.
 
     Raises:
         InputError: no frames, a rate that is not positive, a body of several roots.
     """
-    fps = params.fps or _FPS
+    fps = params.fps or DEFAULT_FPS
     require_positive("frames a second of the motion", fps)
     roots = np.flatnonzero(body.parents < 0)
     if not len(params) or roots.tolist() != [0]:

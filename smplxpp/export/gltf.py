@@ -29,7 +29,7 @@ def write_glb(
     Args:
         path: of the file, with any suffix; `.glb` is usual.
         template: body and parts in the T-pose.
-        animation: T frames, played at their `fps` or 30 a second.
+        animation: T frames, played at their `fps` or `DEFAULT_FPS`.
         morph_targets: write the expressions, sparsely, as morph targets of the body.
 
     Raises:

@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.validation import require_positive
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.template.template import Template
 
-DEFAULT_FPS = 30.0
 # A joint that expressions move by less, in metres, keeps its place at rest.
 _STILL = 1e-6
 
@@ -80,7 +79,7 @@ def add_animation(
         gltf: where the animation goes.
         buffers: its buffer.
         template: J joints.
-        params: T frames at `params.fps`, or 30 a second; without morph targets the face stays neutral.
+        params: T frames at `params.fps` or `DEFAULT_FPS`; without morph targets the face stays neutral.
         joint_nodes: (J,) indices of the joints' nodes.
         morph_node: the node with the expressions, None where there are none.
 

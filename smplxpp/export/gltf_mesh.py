@@ -7,6 +7,7 @@ import pygltflib
 from jaxtyping import UInt8, UInt16
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
+from smplxpp.core.colors import decode_srgb
 from smplxpp.core.labels import LABELS
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 from smplxpp.export.gltf_skin import influence_sets, quantized_influences
@@ -26,7 +27,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     """
     joints, weights = quantized_influences(template.weights)
     normals = _unit_normals(template)
-    colors = linear_from_srgb(template.vertex_colors)
+    colors = linear_rgba16(template.vertex_colors)
     nodes = []
     for index, name in enumerate(template.part_names):
         faces = template.faces[template.part_faces(name)]
@@ -59,14 +60,12 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     return nodes
 
 
-def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
-    """Convert sRGB to linear RGB with full alpha.
+def linear_rgba16(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
+    """Convert sRGB bytes to 16-bit linear RGB with full alpha.
 
-    Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge (IEC 61966-2-1).
+    Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge.
     """
-    c = np.arange(256) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    table = np.rint(65535 * linear).astype(np.uint16)
+    table = np.rint(65535 * decode_srgb(np.arange(256) / 255.0)).astype(np.uint16)
     return np.pad(table[colors], ((0, 0), (0, 1)), constant_values=65535)
 
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from smplxpp.core.colors import decode_srgb
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.labels import LABELS
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.validation import require_positive
-from smplxpp.export.gltf_animation import DEFAULT_FPS, joint_motion
+from smplxpp.export.gltf_animation import joint_motion
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.export.usd_stage import open_usd, usd_modules
 from smplxpp.template.template import BODY_PART, Template
@@ -34,7 +35,7 @@ def write_usd(path: str | Path, template: Template, *, animation: BodyParams | N
 
     Args:
         path: .usdc, .usda or .usd.
-        animation: T frames, played at their `fps` or 30 a second.
+        animation: T frames, played at their `fps` or `DEFAULT_FPS`.
 
     Raises:
         InputError: another suffix, or an animation that the template cannot play.
@@ -171,9 +172,8 @@ def _translations(pxr: SimpleNamespace, offsets: np.ndarray) -> Any:
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
-    """sRGB bytes as linear floats (IEC 61966-2-1)."""
-    c = colors / 255.0
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    """Convert sRGB bytes to linear light, float32."""
+    return decode_srgb(colors / 255.0).astype(np.float32)
 
 
 def _identifier(name: str) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.reconstruct.colors import blend_colors
 from smplxpp.reconstruct.config import ReconstructConfig
@@ -28,17 +28,11 @@ from smplxpp.reconstruct.sweep import (
 from smplxpp.reconstruct.trust import Consensus, find_consensus
 from smplxpp.reconstruct.views import PhotoView, check_spread, usable_views
 
-Progress = Callable[[str, float], None]
-"""Told what is being done, and the share of it that is done."""
 _CELLS = (3e-3, 6e-3)
 _CELL_PIXELS = 2.0
 _LEAST_SEEN = 2
 # Agreement of the photographs: none, and what is as sure as it gets.
 _NO_AGREEMENT, _FULL_AGREEMENT = 0.1, 0.7
-
-
-def _silent(what: str, share: float) -> None:
-    """Report nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +68,7 @@ def reconstruct(
     views: Sequence[PhotoView],
     config: ReconstructConfig | None = None,
     *,
-    progress: Progress = _silent,
+    progress: ProgressCallback = ignore_progress,
 ) -> Reconstruction:
     """Reconstruct one moment: consensus of the masks, soft visual hull, gated sweep along the normals, colours.
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.spread import spread
 from smplxpp.register.anatomy import Anatomy
 from smplxpp.register.bare import bare_vertices, hands_of
@@ -28,7 +27,6 @@ from smplxpp.register.silhouette_term import SilhouetteTerm, Surface
 from smplxpp.register.solver import Terms, gauss_newton
 from smplxpp.register.start import joined_points, state_from_points
 
-Progress = Callable[[str, float], None]
 # Deviations that a fit is believed to have where nothing tells them: radians, metres, betas.
 _START_NOISE = (np.radians(2.0), 0.01, 0.3)
 # A fit has slow errors too, which its noise does not show: beside keypoints it counts as so many times as noisy.
@@ -45,7 +43,7 @@ def register(
     observed: Observations,
     config: RegisterConfig | None = None,
     *,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> BodyFit:
     """Fit pose, shape and translation of a body to keypoints, landmarks, masks, label maps and scans in any mixture.
 
@@ -83,7 +81,9 @@ class _Window:
 class _Registration:
     """One registration under way."""
 
-    def __init__(self, body: BodyModel, observed: Observations, config: RegisterConfig, progress: Progress) -> None:
+    def __init__(
+        self, body: BodyModel, observed: Observations, config: RegisterConfig, progress: ProgressCallback
+    ) -> None:
         self.body, self.observed, self.config, self.progress = body, observed, config, progress
         self.kinematics, self.frames = Kinematics(body), np.array(observed.frames)
         self.points = BodyPoints.of_vertices(body, np.arange(body.vertex_count))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.raster import rasterize_mesh
@@ -34,7 +34,7 @@ def follow(
     *,
     at: int,
     config: RegisterConfig | None = None,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> BodyParams:
     """A start for every frame, from the fit of a single one.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from smplxpp.core.params import DEFAULT_FPS
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.register.anatomy import Anatomy
 from smplxpp.register.config import RegisterConfig
@@ -18,8 +19,6 @@ _BELIEVED = np.radians(5.0)
 # Radians over which a bound is soft.
 _BOUND = np.radians(3.0)
 _EXPRESSION_SPREAD = 0.35
-DEFAULT_FPS = 25.0
-"""Frames a second where nothing says it."""
 # More frames than this between two: their motion says nothing of each other.
 _LARGEST_GAP = 5
 

@@ -158,11 +158,11 @@ def test_progress_is_told(capture, tmp_path):
         capture,
         ("lbs",),
         training=lambda name, progress: told["training"].append((name, progress.iterations)),
-        measuring=lambda name, done, total: told["measuring"].append((name, done, total)),
+        measuring=lambda name, share: told["measuring"].append((name, share)),
     )
     assert {name for name, _ in told["training"]} == {"gaussians", "lbs"}
     assert max(total for name, total in told["training"] if name == "lbs") == 6  # of bake and compensation together
-    assert told["measuring"][-1] == ("lbs", 3, 3)
+    assert told["measuring"][-1] == ("lbs", 1.0)
 
 
 def test_a_pruned_student_is_smaller_and_the_null_codes_row_is_full_told_nothing(own, capture):

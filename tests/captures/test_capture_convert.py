@@ -181,8 +181,8 @@ def test_an_interrupted_conversion_goes_on(tmp_path):
     class Interrupted(Exception):
         pass
 
-    def stop(done: int, count: int) -> None:
-        if done == 2:
+    def stop(step: str, share: float) -> None:
+        if share == 2 / 12:
             raise Interrupted
 
     with pytest.raises(Interrupted):

@@ -219,7 +219,7 @@ def test_what_is_not_asked_for_is_not_measured(sequence):
     only = evaluate_models({"still": still(sequence.rig)}, sequence, config, progress=lambda *at: seen.append(at))
     model = only.report.models["still"]
     assert list(model.views) == ["novel_pose"] and model.surfaces == {} and model.speed is None
-    assert only.views == only.surfaces == () and seen == [(0, 1), (1, 1)]
+    assert only.views == only.surfaces == () and seen == [("frames", 0.0), ("frames", 1.0)]
     assert list(evaluation_tables(only.report)) == ["summary", "novel_pose", "cost"]
 
 

@@ -10,7 +10,7 @@ import trimesh
 
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.export import write_glb
-from smplxpp.export.gltf_mesh import linear_from_srgb
+from smplxpp.export.gltf_mesh import linear_rgba16
 from smplxpp.export.gltf_skin import quantized_influences
 from tests.export.glb_reader import GlbReader
 from tests.export.templates import open_body_template, random_motion, random_template
@@ -69,7 +69,7 @@ def test_colours_are_linear(reader, template):
 
 
 def test_every_srgb_tone_stays_apart():
-    tones = linear_from_srgb(np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1))[:, 0]
+    tones = linear_rgba16(np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1))[:, 0]
     assert (np.diff(tones.astype(int)) > 0).all()
     assert (tones[0], tones[255]) == (0, 65535)
     assert tones[188] / 65535 == pytest.approx(0.5029, abs=1e-4)  # mid grey of sRGB

@@ -19,14 +19,11 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.evidence import Photometer
 from avatar.training.refinement.firmness import firmness
 from avatar.training.refinement.posing import PosedTemplate
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.core.validation import require_known
 from smplxpp.register.kinematics import BodyState
-
-Told = Callable[[int, int], None]
-"""Called with looks at frames that are done, and all of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,7 @@ def refine_poses(
     *,
     reference: int | None = None,
     frames: Sequence[int] | None = None,
-    told: Told = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Refinement:
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
 
@@ -74,7 +71,7 @@ def refine_poses(
     Args:
         sequence: whose parameters are the registered start; its images are read at full size.
         reference: frame that colours start from, None: the first. frames: some of the training frames, None: all.
-        told: of progress.
+        progress: called with the share of the frames' evaluations that are done.
 
     Raises:
         InputError: frames that are not trained on, or a frame without parameters or photographs.
@@ -90,13 +87,13 @@ def refine_poses(
     whole = [read_view(sequence.capture, name, first) for name in _cameras(sequence, first)]
     sampling = replace(config.sampling, seed=config.seed)
     gaussians = initial_gaussians(sequence.rig, vertices, whole, sampling).to(device="cpu")
-    progress = _Progress(told, config, len(chosen))
+    counter = _EvaluationCounter(progress, config, len(chosen))
     view = _training_views(sequence)
     begun = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
-    begun.run(config.reference_levels, progress.step)
+    begun.run(config.reference_levels, counter.step)
     if scene.cameras is not None:  # one frame says too little of cameras: they begin anew with all
         scene = replace(scene, cameras=_corrections(sequence, config))
-    return _finish(Alignment(scene, begun.gaussians, chosen, _state(posed, start), view), start, sequence, progress)
+    return _finish(Alignment(scene, begun.gaussians, chosen, _state(posed, start), view), start, sequence, counter)
 
 
 def refine_held_out(
@@ -105,7 +102,7 @@ def refine_held_out(
     config: RefineConfig | None = None,
     *,
     frames: Sequence[int] | None = None,
-    told: Told = lambda done, total: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> Refinement:
     """Refine held-out frames on the photographs of training cameras, everything but their poses as it is.
 
@@ -128,29 +125,32 @@ def refine_held_out(
     scene, start = _scene(sequence, config), _start(sequence, chosen)
     view = _training_views(sequence)
     alignment = Alignment(scene, gaussians, chosen, _state(scene.posed, start), view, learns_appearance=False)
-    return _finish(alignment, start, sequence, _Progress(told, replace(config, reference_levels=()), len(chosen)))
+    counter = _EvaluationCounter(progress, replace(config, reference_levels=()), len(chosen))
+    return _finish(alignment, start, sequence, counter)
 
 
-class _Progress:
-    """Counts looks at frames."""
+class _EvaluationCounter:
+    """Counts the frames that passes have evaluated, and reports their share."""
 
-    def __init__(self, told: Told, config: RefineConfig, frames: int) -> None:
-        self._told, self._done = told, 0
+    def __init__(self, progress: ProgressCallback, config: RefineConfig, frames: int) -> None:
+        self._progress, self._done = progress, 0
         self._total = sum(level.steps + 1 for level in config.reference_levels)
         self._total += frames * (2 + sum(level.steps + 1 for level in config.levels))
 
     def step(self) -> None:
-        """One more look is done."""
+        """Report one more evaluation of a frame."""
         self._done += 1
-        self._told(self._done, self._total)
+        self._progress("poses", self._done / self._total)
 
 
-def _finish(alignment: Alignment, start: BodyParams, sequence: AvatarSequence, progress: _Progress) -> Refinement:
+def _finish(
+    alignment: Alignment, start: BodyParams, sequence: AvatarSequence, counter: _EvaluationCounter
+) -> Refinement:
     """Run an alignment, compare what came out with the start, and keep the better of both."""
     scene, frames = alignment.scene, alignment.frames
-    alignment.run(scene.config.levels, progress.step)
-    before = alignment.losses(alignment.start, progress.step)
-    after = alignment.losses(alignment.state, progress.step)
+    alignment.run(scene.config.levels, counter.step)
+    before = alignment.losses(alignment.start, counter.step)
+    after = alignment.losses(alignment.state, counter.step)
     worse = ~(after < before)
     body = scene.posed.body
     refined = alignment.state.to_params(body, fps=start.fps)

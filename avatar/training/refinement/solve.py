@@ -10,13 +10,14 @@ from scipy.linalg import solveh_banded
 
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.variables import Variables
+from smplxpp.core.params import DEFAULT_FPS
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.register.kinematics import BodyState
 
 TAIL = 2.0
 """Multiples of the trusted acceleration from which an acceleration counts as motion."""
-FPS = 20.0
-"""Frames a second that `acceleration_sigma` is for."""
+REFERENCE_FPS = 20.0
+"""Frames per second to which `RefineConfig.acceleration_sigma` refers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ def smoothness(
     """Look at how unevenly a state moves.
 
     Args:
-        frames: their numbers, ascending. fps: None counts as `FPS`.
+        frames: their numbers, ascending. fps: None counts as `DEFAULT_FPS`.
     """
     number = np.array(frames)
     F, K = len(number), len(variables.joints)
@@ -77,7 +78,7 @@ def smoothness(
         turns = rotvec_from_matrix(state.rotations[1:] @ state.rotations[:-1].swapaxes(-1, -2))
         speed = variables.packed(turns, np.diff(state.transl, axis=0), np.diff(state.expression, axis=0))
         acceleration[1:-1] = np.where(triple[1:-1, None], np.diff(speed, axis=0), 0.0)
-    slower = (FPS / (fps or FPS)) ** 2
+    slower = (REFERENCE_FPS / (fps or DEFAULT_FPS)) ** 2
     sigma = slower * np.concatenate(
         [
             np.full(3 * K, np.radians(config.acceleration_sigma)),

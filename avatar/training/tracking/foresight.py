@@ -17,11 +17,9 @@ from avatar.data.cloth_motion import ClothMotions
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.template.template import Template
 
-USUAL_FPS = 20.0
-"""Frames a second of captures that do not say."""
 FADING = 0.3
 """Seconds in which what a forecast has wrong falls to 1/e: a simulation swings as the cloth does, out of step."""
 JUDGED = 4
@@ -121,7 +119,7 @@ class Foresight:
     simulated: SimulatedControls | None = None
     reference: int | None = None
     error: Float[Tensor, "K 3"] | None = None
-    fps: float = USUAL_FPS
+    fps: float = DEFAULT_FPS
 
     @property
     def share(self) -> Float[Tensor, "K 1 1"] | float:

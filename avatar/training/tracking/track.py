@@ -27,9 +27,10 @@ from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import BACK, Session
 from avatar.training.tracking.certainty import expected_distances, held_directions
 from avatar.training.tracking.config import LEVEL_END, Level, TrackConfig
-from avatar.training.tracking.foresight import USUAL_FPS, Foresight, simulate_controls
+from avatar.training.tracking.foresight import Foresight, simulate_controls
 from avatar.training.tracking.structure import picture_structure
 from smplxpp.core.errors import InputError
+from smplxpp.core.params import DEFAULT_FPS
 
 SEEN = 1
 """Halvings of the photographs, about, that say how much can be told."""
@@ -243,7 +244,7 @@ class TrackTask(PhotometricTask):
     def _sigma(self, solved: Tensor) -> Tensor:
         """Distances (T, K) from the truth that are to be expected of displacements."""
         structure = {frame: self.structure[self.row[frame]] for frame in self.order}
-        seconds, known = 1.0 / (self.sequence.capture.fps or USUAL_FPS), self.track_config.reference is not None
+        seconds, known = 1.0 / (self.sequence.capture.fps or DEFAULT_FPS), self.track_config.reference is not None
         moved = solved.square().sum(-1).mean(0).sqrt()
         found = expected_distances(self.order, seconds, structure, moved, known=known)
         return torch.stack([found[frame] for frame in self.row])
@@ -261,7 +262,7 @@ def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig)
         poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
         reference = poses[config.reference].without_shape()
         simulated = simulate_controls(sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices)
-    return Foresight(config.extrapolation, simulated, config.reference, fps=fps or USUAL_FPS)
+    return Foresight(config.extrapolation, simulated, config.reference, fps=fps or DEFAULT_FPS)
 
 
 def follow_surface(

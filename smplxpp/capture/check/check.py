@@ -23,12 +23,11 @@ from smplxpp.capture.check.mistakes import Sample
 from smplxpp.capture.check.parameters import parameter_findings, read_parameters
 from smplxpp.capture.check.silhouettes import FitSummary
 from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.core.spread import spread
 
-Progress = Callable[[int, int], None]
 # Frames before and after that are tried where images and parameters may not be of one clock.
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
 # Posed bodies held in memory.
@@ -95,7 +94,7 @@ def check_capture(
     body: BodyModel,
     config: CheckConfig | None = None,
     *,
-    progress: Progress = lambda done, count: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> CaptureCheck:
     """Look at files, splits, masks, parameters, and at the posed body's silhouette against the masks.
 
@@ -103,7 +102,7 @@ def check_capture(
         capture: as opened.
         body: the model that the parameters are for.
         config: how much to look at.
-        progress: called with the number of views that were opened and of all that will be.
+        progress: called with the share of the views that are checked.
 
     Raises:
         InputError: frames that the capture does not have.
@@ -123,7 +122,7 @@ def check_capture(
             posed = None if vertices is None else (vertices, body.faces)
             cameras = [camera for camera, _ in group]
             views += pool.map(lambda camera, f=frame, b=posed: check_view(small, camera, f, b), cameras)
-            progress(len(views), len(wanted))
+            progress("images", len(views) / len(wanted))
     findings += [finding for view in views for finding in view.findings]
     findings += [*poser.findings, *_plain_background(views), *blind_cameras(views)]
     findings += calibration_findings(views, small.cameras, lambda camera, frame: _sample(small, poser, camera, frame))

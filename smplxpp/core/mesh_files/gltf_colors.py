@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64, Num, UInt8
 
+from smplxpp.core.colors import decode_srgb, encode_srgb
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.image_file import decode_image
 from smplxpp.core.files.json_file import as_number, as_numbers, as_text
@@ -45,8 +46,8 @@ def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: i
             return found[0]  # the file's own bytes
         light = np.ones((count, 3)) if factor is None else np.repeat(factor[None], count, axis=0)
         for colors in found:
-            light *= linear_from_srgb(colors) if colors.dtype == np.uint8 else colors
-        return srgb_from_linear(light)
+            light *= _linear(colors) if colors.dtype == np.uint8 else colors
+        return _srgb8(light)
     except InputError as error:
         warn(f"{document.subject}: colours of a primitive are lost: {error}")
         return None
@@ -152,13 +153,11 @@ def _factor(document: GltfDocument, primitive: dict[str, Any]) -> Float64[np.nda
     return as_numbers(surface[factor], (4,), subject="base colour")[:3]
 
 
-def linear_from_srgb(colors: UInt8[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """8-bit sRGB as linear RGB in [0, 1] (IEC 61966-2-1)."""
-    c = colors / 255.0
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+def _linear(colors: UInt8[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """Convert 8-bit sRGB to linear RGB in [0, 1], float64."""
+    return decode_srgb(colors / 255.0)
 
 
-def srgb_from_linear(colors: Num[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
-    """Linear RGB in [0, 1] as 8-bit sRGB (IEC 61966-2-1); NaN as 0."""
-    c = np.clip(np.nan_to_num(colors), 0.0, 1.0)
-    return np.rint(255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
+def _srgb8(colors: Num[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
+    """Convert linear RGB in [0, 1] to 8-bit sRGB; NaN becomes 0."""
+    return np.rint(255 * encode_srgb(np.clip(np.nan_to_num(colors), 0.0, 1.0))).astype(np.uint8)

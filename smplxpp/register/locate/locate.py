@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.labels import SKIN
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.params import BodyParams
@@ -17,7 +17,7 @@ from smplxpp.register.locate.config import LocateConfig
 from smplxpp.register.locate.judge import confidence_of, problems_of, refuse_what_is_no_person
 from smplxpp.register.locate.located import Candidate, LocatedBody
 from smplxpp.register.locate.pinned import Pinned
-from smplxpp.register.locate.search import Found, Progress, Search
+from smplxpp.register.locate.search import Found, Search
 
 Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 """Labels every face of the surface, given the body in it; negative where it does not know. None: no labels."""
@@ -31,7 +31,7 @@ def locate_body(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     labeller: Labeller | None = None,
     config: LocateConfig | None = None,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressCallback = ignore_progress,
 ) -> LocatedBody:
     """Find pose, shape, facing and place of the one person in a surface that says nothing else.
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
+from smplxpp.core.errors import ProgressCallback
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.core.surface_points import SurfacePoints
@@ -26,7 +27,6 @@ from smplxpp.register.locate.starts import centred, rank_starts
 from smplxpp.register.normal_equations import Columns
 from smplxpp.register.priors import Priors
 
-Progress = Callable[[str, float], None]
 # How far surface and body attract each other, metres, step by step.
 _FIRST, _AFTER_LIMBS = np.geomspace(0.3, 0.15, 6), np.geomspace(0.2, 0.08, 8)
 _NEARER, _DRESSING = np.geomspace(0.1, 0.04, 6), (0.04, 0.02)
@@ -76,7 +76,7 @@ class Search:
         mesh: TriangleMesh,
         config: LocateConfig,
         pinned: Pinned | None,
-        progress: Progress,
+        progress: ProgressCallback,
     ) -> None:
         body = kinematics.body
         self.kinematics, self.config, self.pinned, self.progress = kinematics, config, pinned, progress

@@ -86,8 +86,8 @@ def test_pictures_with_sides_exchanged_are_outvoted(painted):
 def test_progress_is_told(painted):
     mesh, colors, _ = painted
     told = []
-    keypoints_of_scan(mesh, colors, Spots(), config=VIEWS, progress=lambda done, count: told.append((done, count)))
-    assert told == [(k, 8) for k in range(1, 9)]
+    keypoints_of_scan(mesh, colors, Spots(), config=VIEWS, progress=lambda step, share: told.append((step, share)))
+    assert told == [("views", k / 8) for k in range(1, 9)]
 
 
 def test_a_scan_without_anybody_is_refused(painted):
