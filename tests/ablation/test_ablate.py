@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import machine
-from benchmarks.ablation import AblationBenchmark
+from benchmarks.accuracy.ablation import AblationBenchmark
+from benchmarks.support import results as store
 from pipelines.cli import main
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -109,7 +109,7 @@ def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, captu
 
 
 def test_the_benchmark_stores_the_table_with_its_command(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(machine, "RESULTS", tmp_path)
+    monkeypatch.setattr(store, "RESULTS", tmp_path)
     AblationBenchmark(finished).run()
     stored = json.loads((tmp_path / "ablation_moving doll.json").read_text())
     assert "--iterations-share 0.01" in stored["command"] and stored["figures"]["gaussians"] == 400

@@ -1,4 +1,4 @@
-"""What `python -m benchmarks.gpu` would do with a GPU, done on the CPU at toy size; and what it does without one."""
+"""What `python -m benchmarks gpu` would do with a GPU, done on the CPU at toy size; and what it does without one."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import gpu
-from benchmarks.gpu import GpuBenchmark, run_part
-from benchmarks.on_gpu.parts import PARTS, Job
-from benchmarks.on_gpu.views import enlarge
+from benchmarks.gpu import __main__ as gpu
+from benchmarks.gpu.__main__ import GpuBenchmark, run_part
+from benchmarks.gpu.parts import PARTS, Job
+from benchmarks.gpu.views import enlarge
 from smplxpp.capture import open_capture
 from tests.dolls.dancing import write_dance, write_dance_run
 
@@ -106,7 +106,7 @@ def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     options = {"capture": job.capture, "run_folder": tmp_path / "none", "work": work, "dry_run": True}
     assert GpuBenchmark(parts=("fit", "nccl"), minutes=15.0, **options).run() == 1
     written = json.loads((work / "gpu.json").read_text())
-    assert written["command"] == "python -m benchmarks.gpu --minutes 15 --parts fit nccl --dry-run"
+    assert written["command"] == "python -m benchmarks gpu --minutes 15 --parts fit nccl --dry-run"
     stored = written["figures"]
     assert stored["parts"]["fit"]["state"] == "failed" and "template" in stored["parts"]["fit"]["error"]
     assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]

@@ -178,7 +178,7 @@ def test_bad_input_is_refused(ball):
 
 @pytest.mark.slow
 def test_capture_label_maps(captures):
-    from benchmarks.segmentation import measure
+    from benchmarks.accuracy.segmentation import measure
 
     rows = {}
     for row in measure(captures / "woman_casual"):

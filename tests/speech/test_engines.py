@@ -14,8 +14,8 @@ from avatar.speech.aligner import align, aligned_text, load_recogniser
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
 from avatar.speech.text import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
-from benchmarks.other_voices import Espeak
-from benchmarks.talking import starts_apart
+from benchmarks.accuracy.talking import starts_apart
+from benchmarks.support.other_voices import Espeak
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
 from tests.speech.conftest import TEXT

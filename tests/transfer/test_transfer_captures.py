@@ -6,8 +6,8 @@ import warnings
 
 import pytest
 
-from benchmarks.capture_truth import read_capture_truth
-from benchmarks.driving import judge
+from benchmarks.accuracy.driving import judge
+from benchmarks.support.capture_truth import read_capture_truth
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.transfer import TransferConfig, transfer_weights
 

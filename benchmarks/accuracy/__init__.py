@@ -1,0 +1,1 @@
+"""Distances to a known truth: templates, bodies, labels, avatars, lips."""

@@ -1,0 +1,138 @@
+"""What a bundle's size costs: megabytes, and decibels of held-out views, by reduction.
+
+    python -m benchmarks bundle --run RUN --capture DIR [--frames 6] [--no-store]
+
+Each row is a student drawn in the same held-out views: by torch from the full file, and by the runtime from bundles of
+coarser and coarser numbers. `psnr` is that of the person against the photographs, `lost` what the full student has
+more, `worst view` the largest loss of any single view, `to the full student` the least PSNR of a picture against the
+torch student's.
+Loose clothes are where the field has them.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean
+from typing import Annotated
+
+import torch
+import tyro
+
+from avatar.data.sequence import AvatarSequence, MeasuredView
+from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
+from avatar.losses.psnr import psnr_from_mse
+from avatar.metrics.view_quality import view_quality
+from avatar.models.model_file import load_avatar
+from avatar.models.student import Student
+from avatar.render.avatar_view import render_view
+from avatar.runtime import AvatarPlayer
+from benchmarks.support.results import store_results
+from smplxpp.capture import open_capture
+from smplxpp.cloth.garment_file import load_garments
+from smplxpp.template.template import Template
+
+WAYS = {
+    "exact, float32": BundleConfig(exact=True),
+    "as exported": BundleConfig(),
+    "blend shapes in steps of 0.1 mm, 2/1000": BundleConfig(position_step=1e-4, color_step=2e-3),
+    "blend shapes in steps of 0.4 mm, 8/1000": BundleConfig(position_step=4e-4, color_step=8e-3),
+}
+
+
+@dataclass
+class Row:
+    """Figures of one way over views, by kind."""
+
+    psnr: dict[str, list[float]] = field(default_factory=dict)
+    near: list[float] = field(default_factory=list)
+
+    def add(self, kind: str, psnr: float, mse: float | None = None) -> None:
+        self.psnr.setdefault(kind, []).append(psnr)
+        if mse is not None:
+            self.near.append(psnr_from_mse(mse))
+
+
+@dataclass(frozen=True)
+class BundleBenchmark:
+    """Measure all ways."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Trained run."""
+    capture: Path
+    """Folder of its capture."""
+    frames: int = 6
+    """Frames of each kind whose held-out views are measured."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
+        sequence = AvatarSequence(open_capture(self.capture), template)
+        student = load_avatar(self.run_folder / "90_compensate" / "student.safetensors", sequence.rig)
+        assert isinstance(student, Student)
+        garments = self.run_folder / "83_cloth" / "garments.npz"
+        extras = BundleExtras(
+            name="benchmark", garments=load_garments(garments, template) if garments.is_file() else ()
+        )
+        figures: dict[str, dict[str, float]] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            players = {}
+            for name, config in WAYS.items():
+                sizes = write_bundle(Path(folder) / "a.avatar", student, extras, config)
+                figures[name] = {"megabytes": sizes["total"] / 1e6}
+                figures[name] |= {f"{part} kB": size / 1e3 for part, size in sizes.items() if part != "total"}
+                players[name] = AvatarPlayer(Path(folder) / "a.avatar", threads=1)
+        rows = {name: Row() for name in ("full student, torch", *WAYS)}
+        for item in sequence.measured_views(self.frames):
+            measure(rows, student, players, sequence, item)
+        full = rows["full student, torch"].psnr
+        stored = (self.run_folder / "90_compensate" / "student_compact.safetensors").stat().st_size
+        out = {"full student, torch": {"megabytes": stored / 1e6, **_means(full, full)}}
+        for name in WAYS:
+            out[name] = {**figures[name], **_means(rows[name].psnr, full), "to the full student": min(rows[name].near)}
+        print(json.dumps(out, indent=1))
+        if self.store:
+            command = f"python -m benchmarks bundle --run {self.run_folder.name} --capture {self.capture.name}"
+            store_results(f"bundle_{self.capture.name}", f"{command} --frames {self.frames}", out)
+
+
+def _means(psnr: dict[str, list[float]], full: dict[str, list[float]]) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for kind, values in psnr.items():
+        losses = [a - b for a, b in zip(full[kind], values, strict=True)]
+        words = kind.replace("_", " ")
+        out |= {f"{words}, psnr": mean(values), f"{words}, lost": mean(losses), f"{words}, worst view": max(losses)}
+        out[f"{words}, images"] = len(values)
+    return out
+
+
+@torch.no_grad()
+def measure(
+    rows: dict[str, Row],
+    student: Student,
+    players: dict[str, AvatarPlayer],
+    sequence: AvatarSequence,
+    item: MeasuredView,
+) -> None:
+    """Draw a view all ways."""
+    frame = item.frame if item.kind == "novel_view" else None
+    background = sequence.background
+    params, camera = sequence.params(item.frame), item.view.camera
+    posed = student(sequence.rig.motion(params, frame=frame), item.view.position[None])
+    rendering = render_view(posed, 0, item.view, background)
+    quality = view_quality(item.view, rendering.image, rendering.alpha, background, head=None)
+    rows["full student, torch"].add(item.kind, quality.psnr)
+    behind = tuple(background.tolist())
+    for name, player in players.items():
+        player.pose(params, frame=frame)
+        image, alpha = (torch.from_numpy(one) for one in player.draw(camera, background=behind))
+        psnr = view_quality(item.view, image, alpha, background, head=None).psnr
+        rows[name].add(item.kind, psnr, float((image.clamp(0, 1) - rendering.image.clamp(0, 1)).square().mean()))
+
+
+if __name__ == "__main__":
+    tyro.cli(BundleBenchmark).run()

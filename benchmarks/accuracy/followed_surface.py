@@ -1,0 +1,236 @@
+"""How far the surface that training follows is from the truth, and whether that hangs on the frame rate.
+
+    python -m benchmarks followed_surface --run RUN --capture DIR --every 1 2 3
+
+The tracking of a preset follows the loose part of a RUN's template through every n-th training frame of its capture,
+from the RUN's own Gaussians and poses. Measured are the part's points, each against where it truly is ("vertexwise"),
+its surface, and pictures of cameras that training did not see; beside them what the tracking itself expects of its
+errors, with its rank correlation (Spearman's) with the true ones, point by point, and how far a way back drifts.
+The truth is for measuring alone. How the skirt's pattern
+matters was measured once, on repainted photographs (docs/research.md).
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from statistics import mean
+from typing import Annotated, Any
+
+import igl
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float, Int
+from scipy.stats import spearmanr
+
+from avatar.data.sequence import AvatarSequence, camera_centers_of
+from avatar.gaussians.binding import BoundGaussians
+from avatar.gaussians.bound_file import load_bound
+from avatar.metrics.surface_quality import mean_surface, surface_quality
+from avatar.metrics.view_quality import view_quality
+from avatar.models.tracked_surface import Track, TrackedAvatar
+from avatar.render.avatar_view import render_view
+from avatar.training.engine.session import Session
+from avatar.training.presets import training_preset
+from avatar.training.tracking.config import TrackConfig
+from avatar.training.tracking.track import follow_surface
+from benchmarks.support.results import store_results
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import GAUSSIANS
+from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread_inside
+
+SAMPLES = 30_000
+SAME = 2e-3
+"""Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
+LOOKED_AT = 6
+"""Frames whose held-out views are rendered."""
+
+
+@dataclass(frozen=True)
+class FollowedSurface:
+    """Follow, measure, store."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Run with a template and a fit."""
+    capture: Path
+    """Folder of its capture, with true surfaces whose vertices are the same points in all frames."""
+    every: tuple[int, ...] = (1, 2, 3)
+    """One row each: every n-th training frame is followed."""
+    preset: str = "cpu"
+    part: str = "lower"
+    """That is measured."""
+    seconds: float | None = None
+    """Frames of the first so many are followed; None: all."""
+    levels: int | None = None
+    """Of the preset's sizes of images, the first ones, the coarse; None: all."""
+    simulate: tuple[bool, ...] = (True, False)
+    """With simulated clothes that foresee where frames begin, and without."""
+    held: tuple[float, ...] = ()
+    """Weights of what pictures do not tell where it was foreseen, in the place of the preset's; one row each."""
+    back: bool = False
+    """Go back to the first frame too and measure the drift."""
+    name: str = ""
+    """Of the stored file; by default that of the capture."""
+
+    def run(self) -> None:
+        """Print all rows; what is done is stored."""
+        bench = Bench(self.run_folder, self.capture, self.part)
+        config = training_preset(self.preset).teacher.track
+        if config is None:
+            raise InputError("preset", expected="one that follows the surface", received=self.preset)
+        config = replace(config, levels=config.levels[: self.levels], back=self.back)
+        figures: dict[str, Any] = {
+            "protocol": bench.protocol,
+            "preset": self.preset,
+            "part": self.part,
+            "halvings": [level.halvings for level in config.levels],
+            "rows": {},
+        }
+        for every, simulate, held in product(self.every, self.simulate, self.held or (config.held,)):
+            own = replace(config, simulate=simulate, held=held)
+            row = bench.row(own, every, seconds=self.seconds)
+            name = f"photographs, every {every}, {'foreseen' if simulate else 'carried on'}"
+            name += f", held {held:g}" if self.held else ""
+            figures["rows"][name] = row
+            print(f"{name:44s} {row}", flush=True)
+            store_results(f"followed_surface_{self.name or bench.capture.name}", self._command(), figures)
+
+    def _command(self) -> str:
+        words = [f"--every {' '.join(map(str, self.every))}"]
+        words += [f"--{name} {value}" for name, value in (("seconds", self.seconds), ("levels", self.levels)) if value]
+        words += ["--held " + " ".join(f"{held:g}" for held in self.held)] if self.held else []
+        words += ["--back"] if self.back else []
+        words += ["--simulate " + " ".join(map(str, self.simulate)), f"--preset {self.preset} --part {self.part}"]
+        return " ".join(["python -m benchmarks followed_surface --run RUN --capture DIR", *words])
+
+
+class Bench:
+    """A run's scene, opened once.
+
+    Args:
+        run: with template and fit. folder: of the capture. part: that is measured.
+    """
+
+    def __init__(self, run: Path, folder: Path, part: str) -> None:
+        scene = open_scene(run, TrainInputs(folder))
+        self.scene, self.capture, self.part = scene, scene.capture, part
+        self.protocol = scene.capture.protocol or "exact"
+        self.gaussians = load_bound(run / GAUSSIANS, faces=scene.template.faces)
+        self.reference = load_params_of_run(run).frame(0)
+        self.same = SamePoints.found(scene, self.reference, part)
+
+    def row(self, config: TrackConfig, every: int, *, seconds: float | None = None) -> dict[str, Any]:
+        """Follow every n-th training frame of the first `seconds`, or of all, and measure the result."""
+        frames = self.capture.splits.train_frames[::every]
+        if seconds is not None:
+            last = frames[0] + seconds * (self.capture.fps or 1.0)
+            frames = tuple(frame for frame in frames if frame <= last)
+        capture = replace(self.capture, splits=replace(self.capture.splits, train_frames=frames))
+        sequence, gaussians = AvatarSequence(capture, self.scene.template), self.gaussians
+        config = replace(config, reference=self.scene.built_frame)
+        begin = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            track, _ = follow_surface(sequence, gaussians, config, Session(Path(folder)))
+        each = (time.perf_counter() - begin) / len(frames)
+        return {
+            **self.measured(sequence, track, gaussians),
+            "frames": len(frames),
+            "seconds_a_frame": round(each, 2),
+        }
+
+    def measured(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> dict[str, Any]:
+        """Distances of the part to the truth, mm, over the frames, and the expected ones; dB of held-out cameras."""
+        rig, apart, worst, found = sequence.rig, {}, {}, []
+        true, expected = [], []
+        for frame in sequence.train_frames[1:]:
+            truth = self.capture.truth_mesh(frame)
+            if truth is None:
+                continue
+            vertices = rig.places(sequence.motion(frame), track.displacements(frame))
+            wrong = 1e3 * np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1)
+            true.append(wrong)
+            expected.append(1e3 * track.expected_error(frame).numpy()[self.same.own])
+            apart[frame], worst[frame] = float(wrong.mean()), float(np.percentile(wrong, 95))
+            mesh = TriangleMesh(vertices, rig.template.faces)
+            found.append(surface_quality(mesh, rig.template.vertex_labels, truth, samples=SAMPLES).labels[self.part])
+        surface = mean_surface(found)
+        latest = max(apart, key=lambda frame: apart[frame])
+        return {
+            "vertexwise": round(mean(apart.values()), 2),
+            "vertexwise_p95": round(mean(worst.values()), 1),
+            "worst_frame": latest,
+            "vertexwise_there": round(apart[latest], 1),
+            "expected": round(float(np.mean(expected)), 2),
+            "rank_correlation": round(float(spearmanr(np.concatenate(expected), np.concatenate(true))[0]), 2),
+            **self._drift(track, true),
+            "p2s": _rounded(surface.p2s),
+            "truth_to_mesh": _rounded(surface.truth_to_mesh),
+            "psnr": round(self._psnr(sequence, track, gaussians), 2),
+        }
+
+    def _drift(self, track: Track, true: list[np.ndarray]) -> dict[str, float]:
+        """Mean drift of a way back, mm, and its rank correlation with the points' mean error; nothing without one."""
+        if track.drift is None:
+            return {}
+        drift = 1e3 * track.cage(track.drift[:, None])[:, 0].numpy()[self.same.own]
+        correlation = float(spearmanr(drift, np.mean(true, axis=0))[0])
+        return {"drift": round(float(drift.mean()), 2), "drift_rank_correlation": round(correlation, 2)}
+
+    @torch.no_grad()
+    def _psnr(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> float:
+        """Mean dB over held-out views of some training frames, of the fit's Gaussians on the surface."""
+        avatar = TrackedAvatar(sequence.rig, gaussians, track.cage.count)
+        found = []
+        for frame in spread_inside(sequence.train_frames, LOOKED_AT):
+            avatar.controls.copy_(track.controls[track.row[frame]])
+            for camera in self.capture.splits.novel_view_cameras:
+                view = sequence.whole_view(camera, frame)
+                posed = avatar(sequence.motion(frame), camera_centers_of([view]))
+                seen = render_view(posed, 0, view, sequence.background)
+                quality = view_quality(view, seen.image, seen.alpha, sequence.background, head=None)
+                found.append(quality.psnr)
+        return mean(found)
+
+
+@dataclass(frozen=True, eq=False)
+class SamePoints:
+    """Vertices of the template and the points of true surfaces that they are."""
+
+    own: Int[np.ndarray, " K"]
+    corners: Int[np.ndarray, "K 3"]
+    weights: Float[np.ndarray, "K 3"]
+
+    @staticmethod
+    def found(scene: TrainScene, reference: BodyParams, part: str) -> SamePoints:
+        """Find the points of the truth that a part's vertices are, in the frame that the template was built from."""
+        template = scene.template
+        truth = None if scene.built_frame is None else scene.capture.truth_mesh(scene.built_frame)
+        own = np.unique(template.faces[template.part_faces(part)])
+        points = np.ascontiguousarray(template.pose(reference)[0][own])
+        if truth is None:
+            raise InputError("capture", expected="true surfaces of training frames", received="none")
+        squared, face, near = igl.point_mesh_squared_distance(points, truth.vertices, truth.faces)[:3]
+        close = squared < SAME**2
+        corners = truth.faces[face[close]]
+        a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
+        return SamePoints(own[close], corners, igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c))
+
+    def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
+        """Return where they are in another frame."""
+        return np.einsum("kc,kcd->kd", self.weights, truth.vertices[self.corners])
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
+
+
+if __name__ == "__main__":
+    tyro.cli(FollowedSurface, prog="python -m benchmarks followed_surface").run()

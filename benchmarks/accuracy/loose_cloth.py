@@ -1,0 +1,272 @@
+"""Loose clothes simulated in motion that training did not show: how far they are from the truth, and what they cost.
+
+    python -m benchmarks loose_cloth --run RUN --capture DIR
+
+The garments of a trained RUN are simulated along the held-out frames of its capture, each row from its own start, and
+held against the true surfaces beside skinning and the student's field. Poses are those that the run itself uses. The
+truth is for measuring alone. Chaos: the spread of the simulated surface over starts moved by half a millimetre.
+`--draws N` also drives the clothes by the run's poses with N draws of a tracker's noise: one draw is luck.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import Annotated, Any
+
+import igl
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+
+from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
+from avatar.data.sequence import AvatarSequence
+from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality
+from avatar.models.model_file import load_avatar
+from avatar.rig.rig import Motion
+from benchmarks.support.results import store_results
+from pipelines.runs.artefacts import load_params_of_run
+from pipelines.runs.layout import GARMENTS, STUDENT
+from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.synth.tracker import tracker_noise
+from smplxpp.cloth import ClothDriver, ClothShape, Garment
+from smplxpp.cloth.garment_file import load_garments
+from smplxpp.cloth.poses import CausalSmoother
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+
+SAMPLES = 50_000
+MOVED = 5e-4
+"""Metres, standard deviation, by which starts are moved for the chaos."""
+STARTS = 4
+SAME = 2e-3
+"""Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
+
+
+@dataclass(frozen=True)
+class LooseCloth:
+    """Simulate, measure, store."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Trained run with garments in 83_cloth."""
+    capture: Path
+    """Folder of its capture, with true surfaces of held-out frames."""
+    params: Path | None = None
+    """Poses that drive the clothes, as a tracker gives them; by default those of the run."""
+    draws: int = 0
+    """Draws of a tracker's noise (`smplxpp capture degrade`) on the poses, each measured; 2 or more, or none."""
+    name: str = ""
+    """Of the stored file; by default that of the capture."""
+
+    def run(self) -> None:
+        """Print and store all rows.
+
+        Raises:
+            InputError: one draw, or fewer than none.
+        """
+        if self.draws == 1 or self.draws < 0:
+            raise InputError("draws", expected="0 or at least 2: one draw is luck", received=str(self.draws))
+        bench = _Bench(self.run_folder, self.capture, self.params)
+        figures: dict[str, Any] = {
+            "protocol": bench.protocol,
+            "frames": list(bench.truths),
+            "parts": {
+                g.part: {"particles": len(g.particles), "drag_per_s": g.config.fabric.drag} for g in bench.garments
+            },
+            "rows": {},
+        }
+        for name, shapes in bench.rows():
+            figures["rows"][name] = bench.measured(shapes)
+            print(f"{name:44s} {figures['rows'][name]}", flush=True)
+        figures["rows"] |= self._noisy(bench) if self.draws else {}
+        figures["chaos_mm"] = bench.chaos()
+        figures["milliseconds"] = bench.times()
+        print(figures["chaos_mm"], figures["milliseconds"])
+        command = "python -m benchmarks loose_cloth --run RUN --capture DIR"
+        command += "" if self.params is None else f" --params {self.params.name}"
+        command += f" --draws {self.draws}" if self.draws else ""
+        path = store_results(f"loose_cloth_{self.name or bench.sequence.capture.name}", command, figures)
+        print(f"stored {path.name}")
+
+    def _noisy(self, bench: _Bench) -> dict[str, dict[str, float | None]]:
+        """Rows of `bench` with noise on its poses: every draw's simulation, mean and standard deviation over draws."""
+        poses = BodyParams.concatenate([bench.sequence.params(frame) for frame in bench.sequence.capture.frames])
+        skinned, simulated = [], {}
+        for seed in range(self.draws):
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "noisy.npz"
+                tracker_noise(poses, seed=seed, betas=0.0).save(file)
+                noisy = _Bench(self.run_folder, self.capture, file)
+            shapes = dict(islice(noisy.rows(), 3))
+            skinned.append(noisy.measured(shapes["skinning"]))
+            row = f"simulated, poses with noise, draw {seed}"
+            simulated[row] = noisy.measured(shapes["simulated, cold start 0.7 s before"])
+            print(f"{row:44s} {simulated[row]}", flush=True)
+        found = {"skinning": skinned, "simulated": [*simulated.values()]}
+        return {
+            f"{name}, {what} of {self.draws} draws": _over(rows, of)
+            for name, rows in found.items()
+            for what, of in (("mean", mean), ("standard deviation", stdev))
+        } | simulated
+
+
+class _Bench:
+    def __init__(self, run: Path, capture: Path, params: Path | None) -> None:
+        scene = open_scene(run, TrainInputs(capture, params, None, (), 1.0, None))
+        self.sequence = AvatarSequence(scene.capture, scene.template)
+        self.template = scene.template
+        self.protocol = scene.capture.protocol or ("as given" if params is None else f"poses of {params.name}")
+        self.garments = load_garments(run / GARMENTS, scene.template)
+        if not self.garments or scene.capture.fps is None:
+            raise InputError("run", expected="loose parts in 83_cloth, frames a second", received="none")
+        self.fps = scene.capture.fps
+        self.student = load_avatar(run / STUDENT, self.sequence.rig)
+        self.held_out = scene.capture.splits.novel_pose_frames
+        truths = {frame: scene.capture.truth_mesh(frame) for frame in self.held_out}
+        self.truths = {frame: mesh for frame, mesh in truths.items() if mesh is not None}
+        if not self.truths:
+            raise InputError("capture", expected="true surfaces of held-out frames", received="none")
+        self.label = max(self.garments, key=lambda g: len(g.vertices)).part
+        self.same = _same_points(self.sequence, load_params_of_run(run).frame(0), self.garments, scene.built_frame)
+
+    def rows(self) -> Iterator[tuple[str, Mapping[int, Motion]]]:
+        """Motions of the measured frames, row by row."""
+        plain = {frame: self.sequence.motion(frame) for frame in self.truths}
+        yield "skinning", plain
+        with torch.no_grad():
+            field = {f: self.student.displacements(motion) for f, motion in plain.items()}  # type: ignore[union-attr]
+        yield "student's field", {f: _moved(plain[f], field[f]) for f in plain}
+        for name, config in (
+            ("simulated, cold start 0.7 s before", ClothMotionConfig()),
+            ("the same, motion not smoothed", ClothMotionConfig(smoothing=0.0)),
+            ("simulated, cold start at the first held-out frame", ClothMotionConfig(pre_roll=0.0)),
+            ("simulated from the first frame on", ClothMotionConfig(pre_roll=1e6)),
+        ):
+            yield name, self._simulated(config)
+        yield "online: causal filter, from 0.7 s before", self._online()
+
+    def measured(self, motions: Mapping[int, Motion]) -> dict[str, float | None]:
+        """Distances of the loose part to the truth, mm, means over the frames."""
+        rig, found, apart = self.sequence.rig, [], []
+        for frame, truth in self.truths.items():
+            vertices = rig.pose(motions[frame]).double().numpy()
+            mesh = TriangleMesh(vertices, self.template.faces)
+            parts = surface_quality(mesh, self.template.vertex_labels, truth, samples=SAMPLES).labels
+            found.append(parts[self.label])
+            if self.same is not None and len(truth.vertices) == self.same.vertices:
+                apart.append(1e3 * float(np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1).mean()))
+        return {**_rounded(mean_surface(found)), "vertexwise": round(mean(apart), 2) if apart else None}
+
+    def chaos(self) -> dict[str, float]:
+        """Mean distance of vertices over starts moved by `MOVED` to their mean place, and the starts' number."""
+        rng = np.random.default_rng(0)
+        surfaces = []
+        for _ in range(STARTS):
+            shapes = self._rolled(None, rng)
+            at = [self.sequence.rig.pose(self._with(frame, shapes[frame])).numpy() for frame in self.truths]
+            surfaces.append(np.stack(at)[:, self.garments[0].vertices])
+        stacked = np.stack(surfaces)
+        spread = np.linalg.norm(stacked - stacked.mean(axis=0), axis=-1).mean()
+        return {"starts": STARTS, "moved_mm": 1e3 * MOVED, "spread_mm": round(1e3 * float(spread), 2)}
+
+    def times(self) -> dict[str, float]:
+        """Milliseconds of CPU a step, medians: of a frame of the capture, and of 1/30 s."""
+        out = {}
+        frames = [f for f in self.sequence.capture.frames if self.sequence.capture.params(f) is not None][-24:]
+        for name, seconds in (("a frame of the capture", 1.0 / self.fps), ("1/30 s", 1.0 / 30.0)):
+            driver = ClothDriver(self.template, self.garments)
+            took = []
+            for frame in frames:
+                params = self.sequence.params(frame)
+                posed = self.template.posed_body(params.without_shape())
+                begin = time.process_time()
+                driver.step(params, seconds, posed=posed)
+                took.append(time.process_time() - begin)
+            out[name] = round(1e3 * median(took[1:]), 2)
+        return out
+
+    def _simulated(self, config: ClothMotionConfig) -> dict[int, Motion]:
+        capture = self.sequence.capture
+        clothes = ClothMotions(
+            self.template, self.garments, params=capture.params, frames=capture.frames, fps=self.fps, config=config
+        )
+        clothes.simulate(self.held_out)
+        return {frame: self._with(frame, clothes.shape(frame)) for frame in self.truths}
+
+    def _online(self) -> dict[int, Motion]:
+        shapes = self._rolled(CausalSmoother(), None)
+        return {frame: self._with(frame, shapes[frame]) for frame in self.truths}
+
+    def _rolled(self, smoother: CausalSmoother | None, rng: np.random.Generator | None) -> dict[int, ClothShape]:
+        """Shapes by frame as a player makes them, frame by frame, from 0.7 s before the first held-out frame."""
+        driver = ClothDriver(self.template, self.garments)
+        first = self.held_out[0] - round(0.7 * self.fps)
+        shapes, last = {}, None
+        for frame in (f for f in self.sequence.capture.frames if first <= f <= self.held_out[-1]):
+            params: BodyParams = self.sequence.params(frame)
+            seconds = 1.0 / self.fps if last is None else (frame - last) / self.fps
+            shapes[frame] = driver.step(params if smoother is None else smoother(params, seconds), seconds)
+            if rng is not None and last is None:
+                part = self.garments[0].part
+                particles = driver.particles(part)
+                driver.place(part, particles + rng.normal(scale=MOVED, size=particles.shape).astype(np.float32))
+            last = frame
+        return shapes
+
+    def _with(self, frame: int, shape: ClothShape) -> Motion:
+        return self.sequence.rig.with_cloth(self.sequence.motion(frame), shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _SamePoints:
+    """Vertices of the template and the points of true surfaces that they are."""
+
+    own: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    vertices: int
+
+    def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
+        return np.einsum("kc,kcd->kd", self.weights, truth.vertices[self.faces])
+
+
+def _same_points(
+    sequence: AvatarSequence, reference: BodyParams, garments: list[Garment], frame: int | None
+) -> _SamePoints | None:
+    """Find the points of the truth that the garments' vertices are, in the frame that the template was built from."""
+    truth = None if frame is None else sequence.capture.truth_mesh(frame)
+    if truth is None:
+        return None
+    own = np.concatenate([garment.vertices for garment in garments])
+    points = np.ascontiguousarray(sequence.rig.template.pose(reference)[0][own])
+    squared, face, near = igl.point_mesh_squared_distance(points, truth.vertices, truth.faces)[:3]
+    close = squared < SAME**2
+    corners = truth.faces[face[close]]
+    a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
+    weights = igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c)
+    return _SamePoints(own[close], corners, weights, len(truth.vertices)) if close.any() else None
+
+
+def _moved(motion: Motion, displacements: torch.Tensor | None) -> Motion:
+    return motion if displacements is None else replace(motion, rest=motion.rest + displacements)
+
+
+def _over(rows: Sequence[Mapping[str, float | None]], of: Callable[[list[float]], float]) -> dict[str, float | None]:
+    columns = {key: [value for row in rows if (value := row[key]) is not None] for key in rows[0]}
+    return {key: round(of(column), 2) if len(column) == len(rows) else None for key, column in columns.items()}
+
+
+def _rounded(quality: SurfaceQuality) -> dict[str, float | None]:
+    names = ("p2s", "truth_to_mesh", "p95")
+    return {name: None if (value := getattr(quality, name)) is None else round(value, 2) for name in names}
+
+
+if __name__ == "__main__":
+    tyro.cli(LooseCloth, prog="python -m benchmarks loose_cloth").run()

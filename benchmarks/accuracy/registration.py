@@ -1,0 +1,178 @@
+"""How near registered bodies come to the truth, from each kind of input and from bad starts; baselines beside them.
+
+    smplxpp capture degrade DIR --out TRACKED
+    python -m benchmarks registration --capture TRACKED [--run RUN]
+
+TRACKED has a tracker's inputs by protocol `tracked`: noisy parameters, a detector's keypoints (3 px of noise, 5 %
+outliers, 10 % missing), label maps with 5 % of wrong pixels. The truth is looked at in measuring alone. Baselines:
+keypoints without anything else, and a symmetric fit, which attracts the whole scan and the body to each other as
+iterated closest points do (all of it counts as skin). RUN: a build by that protocol and its refined poses, if it has
+any.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+from jaxtyping import Bool
+
+from benchmarks.accuracy.refinement import bare_and_under
+from benchmarks.support.results import store_results
+from pipelines.commands.options import OptionalPath
+from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REFINED_PARAMS
+from pipelines.stages.observe import observe
+from pipelines.stages.register_config import RegisterInputs
+from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.core.labels import SKIN
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.metrics.pose_error import pose_error
+from smplxpp.register.config import RegisterConfig
+from smplxpp.register.fit import register
+from smplxpp.register.kinematics import BodyState
+from smplxpp.register.observations import Observations, ScanObservation
+
+OFF_DEGREES = 15.0
+"""A start this far off: the length of each joint's error, in a random direction."""
+COMMAND = "smplxpp capture degrade DIR --out TRACKED; python -m benchmarks registration --capture TRACKED --run RUN"
+
+
+@dataclass(frozen=True)
+class RegistrationBenchmark:
+    """Register from every kind of input and measure."""
+
+    capture: Path
+    """Folder of a capture with the protocols exact and tracked, and true vertices in geometry/."""
+    run_folder: OptionalPath = None
+    """Run of the capture with refined poses, whose errors are printed too."""
+    cases: tuple[str, ...] = ()
+    """Names of cases; all by default."""
+    store: bool = True
+    """Write benchmarks/results/registration_CAPTURE.json."""
+    name: str = ""
+    """Name of the capture in the result, its folder's by default."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        body = load_body()
+        observed = observe(RegisterInputs(capture=self.capture, protocol="tracked"), body)
+        seen, capture = observed.observations, observed.capture
+        assert capture is not None and seen.initial is not None
+        exact = load_params(self.capture / "params" / "params.npz", body=body)
+        truth = _Truth(body, exact, bare_and_under(self.capture, body.vertex_count)[1], capture.splits.train_frames)
+        rows: dict[str, object] = {"as tracked": truth.errors(seen.frames, seen.initial)}
+        off = replace(seen, initial=_off(body, seen.initial))
+        rows[f"{OFF_DEGREES:g} degrees off"] = truth.errors(off.frames, off.initial)
+        for name, case in _cases(seen, off).items():
+            if self.cases and name not in self.cases:
+                continue
+            begin, cpu = time.perf_counter(), time.process_time()
+            fit = register(body, case, RegisterConfig())
+            seconds, spent = time.perf_counter() - begin, time.process_time() - cpu
+            rows[name] = truth.errors(fit.frames, fit.params) | {
+                "frames": len(fit.frames),
+                "seconds": seconds,
+                "cpu_seconds": spent,
+                "residuals": {key: float(np.nanmean(values)) for key, values in fit.residuals.items()},
+            }
+            print(name, rows[name], *fit.problems, sep="\n  ", flush=True)
+        rows |= self._refined(truth)
+        if self.store:
+            figures = {
+                "protocol": "tracked",
+                "cameras": len(seen.cameras),
+                "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+                "rows": rows,
+            }
+            path = store_results(f"registration_{self.name or self.capture.name}", COMMAND, figures)
+            print(f"stored {path.name}")
+
+    def _refined(self, truth: _Truth) -> dict[str, object]:
+        """What refinement on photographs made of a run's registration."""
+        if self.run_folder is None or not (self.run_folder / REFINED_PARAMS).is_file():
+            return {}
+        frames, params = load_stacked_params(self.run_folder / REFINED_PARAMS)
+        rows = {"registered, then refined on photographs": truth.errors(tuple(frames), params)}
+        apart = self.run_folder / REFINED_HELD_OUT_PARAMS
+        if apart.is_file():
+            frames, params = load_stacked_params(apart)
+            rows["the same, held-out frames refined on training cameras"] = truth.errors(tuple(frames), params)
+        print(rows)
+        return dict(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """What errors are measured by."""
+
+    body: BodyModel
+    exact: BodyParams
+    covered: Bool[np.ndarray, " V"]
+    train_frames: tuple[int, ...]
+
+    def errors(self, frames: tuple[int, ...], params: BodyParams | None) -> dict[str, object]:
+        """Errors of training frames, and of held-out frames where there are any."""
+        assert params is not None
+        train = np.isin(frames, self.train_frames)
+        out: dict[str, object] = {}
+        for name, rows in (("training", np.flatnonzero(train)), ("held_out", np.flatnonzero(~train))):
+            if len(rows):
+                numbers = np.asarray(frames)[rows]
+                found = pose_error(params.select(rows), self.exact.select(numbers), self.body, self.covered)
+                out[name] = asdict(found)
+        return out
+
+
+def _cases(seen: Observations, off: Observations) -> dict[str, Observations]:
+    """Inputs in mixtures."""
+    no_keypoints: Mapping = {}
+    cases = {
+        "keypoints alone": replace(seen, initial=None, mask=None, labels=None, scans={}),
+        "keypoints, masks": replace(seen, initial=None, labels=None, scans={}),
+        "keypoints, masks, labels, scan": replace(seen, initial=None),
+        "tracked parameters, masks": replace(seen, keypoints=no_keypoints, labels=None, scans={}),
+        "tracked parameters, masks, labels, scan": replace(seen, keypoints=no_keypoints),
+        "everything": seen,
+        f"everything, from {OFF_DEGREES:g} degrees off": off,
+    }
+    scanned = [frame for frame in seen.frames if frame in seen.scans]
+    if scanned:
+        one = _one_frame(seen, scanned[0])
+        cases["one scan, ours"] = one
+        cases["one scan, symmetric"] = replace(one, scans={k: _all_skin(scan) for k, scan in one.scans.items()})
+    return {name: case for name, case in cases.items() if case.keypoints or case.initial is not None}
+
+
+def _one_frame(seen: Observations, frame: int) -> Observations:
+    """A scan and a fit to start from, nothing else."""
+    assert seen.initial is not None
+    return Observations(
+        (frame,),
+        scans={frame: seen.scans[frame]},
+        initial=seen.initial.select([seen.frames.index(frame)]),
+        fps=seen.fps,
+    )
+
+
+def _all_skin(scan: ScanObservation) -> ScanObservation:
+    return replace(scan, labels=np.full(scan.mesh.vertex_count, SKIN.id))
+
+
+def _off(body: BodyModel, params: BodyParams) -> BodyParams:
+    """The parameters with each joint of each frame turned by `OFF_DEGREES` about a random axis."""
+    state, rng = BodyState.of_params(body, params), np.random.default_rng(0)
+    axes = rng.normal(size=(*state.rotations.shape[:2], 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    turned = matrix_from_rotvec(np.radians(OFF_DEGREES) * axes) @ state.rotations
+    return replace(state, rotations=turned).to_params(body, fps=params.fps)
+
+
+if __name__ == "__main__":
+    tyro.cli(RegistrationBenchmark).run()

@@ -1,0 +1,313 @@
+"""The parts of `python -m benchmarks gpu`, each run in a process of its own.
+
+    python -m benchmarks.gpu.parts PART JOB.json
+
+JOB.json holds a `Job`; what the part finds goes to `PART.json` in the job's folder, anew with every figure, so that a
+part that is stopped leaves what it had.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
+from benchmarks.gpu.views import enlarge, fitted
+from benchmarks.support.results import ROOT
+from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
+from smplxpp.capture import open_capture
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_values import jsonable
+from smplxpp.template.template import Template
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a part works on.
+
+    Attributes:
+        work: folder of this benchmark's files. run: with the template. capture: of the person.
+        seconds: that the part should take at most; what is longer is stopped.
+        device: "cuda", or "cpu" in a dry run, which takes toy sizes.
+    """
+
+    work: Path
+    run: Path
+    capture: Path
+    seconds: float
+    device: str
+
+    @property
+    def toy(self) -> bool:
+        return self.device == "cpu"
+
+    def save(self, path: Path) -> None:
+        """Write it for the part's process."""
+        path.write_text(json.dumps({name: str(value) for name, value in vars(self).items()}))
+
+    @classmethod
+    def load(cls, path: Path) -> Job:
+        """What `save` wrote."""
+        stored = json.loads(path.read_text())
+        folders = {name: Path(stored[name]) for name in ("work", "run", "capture")}
+        return cls(**folders, seconds=float(stored["seconds"]), device=stored["device"])
+
+
+Note = Callable[..., None]
+
+
+def mapping(job: Job, note: Note) -> None:
+    """Our calls of gsplat draw what the float64 reference draws: the tests of the CUDA backend."""
+    results = job.work / "mapping.xml"
+    tests = [
+        str(ROOT / "tests" / "render" / f"{name}.py") for name in ("test_gsplat_backend", "test_rasterize_invariance")
+    ]
+    chosen = tests[:1] if job.toy else tests
+    tool = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", f"--junitxml={results}"]
+    code = subprocess.run([*tool, *chosen], cwd=ROOT, check=False).returncode
+    cases = list(ET.parse(results).iter("testcase"))
+    outcome = {
+        tag: [case.get("name", "") for case in cases if case.find(tag) is not None] for tag in ("failure", "skipped")
+    }
+    note(tests=len(cases), failed=outcome["failure"], skipped=outcome["skipped"])
+    if code:
+        raise RuntimeError(f"{len(outcome['failure'])} of {len(cases)} tests failed")
+    if not job.toy and any("cuda" in name for name in outcome["skipped"]):
+        raise RuntimeError("the comparison on CUDA was skipped")
+
+
+def template(job: Job, note: Note) -> None:
+    """The template that the parts after it need, built on the CPU unless the run has one."""
+    if not (job.run / TEMPLATE).is_file():
+        command("build", "--capture", job.capture, "--out", job.run, "--no-report")
+    note(faces=len(_template(job).faces))
+
+
+def demo(job: Job, note: Note) -> None:
+    """The preset `demo`: a surface that is followed, loose clothes that are simulated; and its evaluation."""
+    _to_the_end(job, note, "demo")
+
+
+def cpu(job: Job, note: Note) -> None:
+    """The preset `cpu` on the GPU, in the same way."""
+    _to_the_end(job, note, "cpu")
+
+
+def fit(job: Job, note: Note) -> None:
+    """The fit."""
+    size = ("--gaussians", 300, "--iterations", 2) if job.toy else ("--max-minutes", 0.6 * job.seconds / 60)
+    where = ("--capture", job.capture, "--device", job.device, "--force", "--no-report")
+    answer = command("fit", job.run, *where, *size)
+    note(**{key: answer[key] for key in answer if key != "run"}, **_memory(job))
+
+
+def training(job: Job, note: Note) -> None:
+    """The preset `gpu` from the fit to the student: once for its steps' speed, then as long as the time allows."""
+    preset, first = ("demo", 1e-9) if job.toy else ("gpu", 5e-4)
+    begin = time.perf_counter()
+    short = _train(job, "training_short", preset, "--cloth", "none", "--iterations-share", first)
+    seconds = time.perf_counter() - begin
+    note(preset=preset, short=_stages(short) | {"share": first, "seconds": seconds}, **_memory(job))
+    if job.toy:
+        return
+    of_steps = sum(stage["seconds_of_steps"] for stage in short["stages"].values())
+    left = 0.7 * (job.seconds - seconds) - (seconds - of_steps)
+    share = min(1.0, first * left / of_steps)
+    if share <= first:
+        note(longer="no time left")
+        return
+    longer = _train(job, "training", preset, "--cloth", "none", "--iterations-share", share)
+    note(longer=_stages(longer) | {"share": share, "finished": longer["finished"]}, **_memory(job))
+
+
+def paper_step(job: Job, note: Note) -> None:
+    """One step of every stage of the preset `paper` on images of 1500x2000."""
+    size, preset = ((60, 80), "demo") if job.toy else ((1500, 2000), "paper")
+    capture = enlarge(job.capture, job.work / "large", size)
+    note(preset=preset, width=size[0], height=size[1])
+    answer = _train(replace(job, capture=capture), "paper", preset, "--cloth", "none", "--iterations-share", 1e-9)
+    note(**_stages(answer), **_memory(job))
+
+
+def student(job: Job, note: Note) -> None:
+    """Frames a second of a student with the paper's sizes: float32 and half, with and without a CUDA graph."""
+    import avatar
+    from avatar.models.networks.blend_shapes import BlendShapeConfig
+    from avatar.models.student import StudentConfig
+
+    count, pictures = (300, 2) if job.toy else (270_000, 100)
+    sizes = ((48, 64),) if job.toy else ((1500, 2000), (512, 512))
+    rig = avatar.Rig(_template(job), job.device)
+    bound = avatar.sample_on_mesh(rig.template, avatar.SamplingConfig(count=count)).to(device=job.device)
+    config = StudentConfig(blend_shapes=BlendShapeConfig(expression_size=rig.expression_size))
+    model = avatar.Student(config, rig, bound, (0,)).eval()
+    _shake(model)
+    capture = open_capture(job.capture)
+    params = [found for frame in capture.frames[:16] if (found := capture.params(frame)) is not None]
+    motions = [rig.motion(each, frame=0) for each in params]
+    camera = next(iter(capture.cameras.values()))
+    center = torch.tensor(camera.position[None], dtype=torch.float32, device=job.device)
+    note(gaussians=count, vertices=len(rig.vertices), trained=False, rows={})
+    rows: dict[str, Any] = {}
+    for name, dtype in (("float32", torch.float32), ("half", torch.float16)):
+        deform = Deformer(model, dtype)
+        with torch.no_grad():
+            truth = model(motions[-1], center).gaussians
+        rows[name] = {"difference_mm": largest_difference_mm(deform(motions[-1], center), truth)}
+        note(rows=rows)
+        ways: dict[str, Callable] = {"eager": deform}
+        if not job.toy:
+            try:
+                ways["graph"] = Replayed(deform, motions[0], center)
+                rows[name]["graph_difference_mm"] = largest_difference_mm(ways["graph"](motions[-1], center), truth)
+            except RuntimeError as error:
+                rows[name]["graph_error"] = str(error)[:500]
+        for way, work in ways.items():
+            for width, height in sizes:
+                seen = fitted(camera, width, height)
+                rows[name][f"{way} {width}x{height}"] = frames_a_second(work, motions, seen, pictures=pictures)
+                note(rows=rows)
+    note(rows=rows, **_memory(job))
+
+
+def nccl(job: Job, note: Note) -> None:
+    """What processes say to each other, by NCCL with one process (gloo in a dry run)."""
+    import torch.distributed as dist
+
+    from avatar.training.engine.processes import join_processes
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), WORLD_SIZE="1", RANK="0", LOCAL_RANK="0")
+    with join_processes(job.device) as together:
+        # `Distributed` sends nothing where there is one process: the same messages, sent here.
+        gradient = torch.full((1 << (10 if job.toy else 24),), 2.0, device=together.device)
+        begin = time.perf_counter()
+        dist.all_reduce(gradient)
+        parts: list[Any] = [None]
+        dist.all_gather_object(parts, [1.5])
+        box: list[Any] = ["found"]
+        dist.broadcast_object_list(box, src=0, device=torch.device(together.device))
+        right = bool((gradient == 2.0).all()) and parts == [[1.5]] and box == ["found"]
+        note(backend=dist.get_backend(), device=str(together.device), right=right, seconds=time.perf_counter() - begin)
+    if not right:
+        raise RuntimeError("messages came back changed")
+
+
+PARTS: dict[str, Callable[[Job, Note], None]] = {
+    part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl, cpu)
+}
+"""In the order of what matters."""
+
+
+def command(*arguments: object) -> dict[str, Any]:
+    """The answer of `smplxpp ARGUMENTS --json`.
+
+    Raises:
+        RuntimeError: the command's own message.
+    """
+    from pipelines.cli import main
+
+    words = io.StringIO()
+    with redirect_stdout(words):
+        code = main([*map(str, arguments), "--json"])
+    text = words.getvalue()
+    answer = json.loads(text) if text.strip() else {}
+    if code:
+        raise RuntimeError(answer.get("error", {}).get("message", f"exit status {code}: {text[-500:]}"))
+    return answer
+
+
+def _to_the_end(job: Job, note: Note, preset: str) -> None:
+    """A whole training, and the evaluation of its student."""
+    begin = time.perf_counter()
+    size = ("--iterations-share", 0.01) if job.toy else ()
+    answer = _train(job, preset, "demo" if job.toy else preset, "--cloth", "auto", *size)
+    note(**_stages(answer), seconds=time.perf_counter() - begin, **_memory(job))
+    begin = time.perf_counter()
+    views = ("--every", 8, "--samples", 300) if job.toy else ()
+    run = ("evaluate", job.work / preset, "--capture", job.capture, "--device", job.device, "--no-report")
+    report = command(*run, *views)
+    student = report["models"]["student"]
+    note(
+        views={name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
+        counts=student["counts"],
+        seconds_of_evaluation=time.perf_counter() - begin,
+    )
+
+
+def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]:
+    """A training in a run of its own with the template of the job's, and what a build knows beside it."""
+    run = job.work / name
+    for stage in BUILD_STAGES:
+        if (job.run / stage).is_dir():
+            shutil.copytree(job.run / stage, run / stage, dirs_exist_ok=True)
+    if (job.run / BUILD_FILE).is_file():
+        shutil.copyfile(job.run / BUILD_FILE, run / BUILD_FILE)
+    toy = ("--gaussians", 300) if job.toy else ()
+    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report")
+    return command("train", *where, "--preset", preset, *toy, *options)
+
+
+def _stages(answer: dict[str, Any]) -> dict[str, Any]:
+    """Of each stage: steps, their seconds, how many a second, PSNR of held-out views."""
+    out = {}
+    for name, numbers in answer["stages"].items():
+        done, seconds = numbers["iterations_done"], numbers["seconds_of_steps"]
+        held_out = numbers.get("novel_view") or numbers.get("mean", {}).get("held_out", {})
+        out[name] = {
+            "steps": done,
+            "seconds": seconds,
+            "steps_a_second": done / max(seconds, 1e-9),
+            "psnr": held_out.get("psnr"),
+        }
+    return {"stages": out}
+
+
+def _template(job: Job) -> Template:
+    return Template.load(job.run / TEMPLATE)
+
+
+def _shake(model: torch.nn.Module) -> None:
+    """Give every parameter that starts at zero some value, so that nothing is left out."""
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            if not name.startswith("gaussians.") and not bool(value.any()):
+                value.normal_(0.0, 1e-3)
+
+
+def _memory(job: Job) -> dict[str, float]:
+    return {} if job.toy else {"gpu_memory_gib": torch.cuda.max_memory_allocated() / 2**30}
+
+
+def main() -> int:
+    """Run one part; its error ends the process."""
+    name, job = sys.argv[1], Job.load(Path(sys.argv[2]))
+    found: dict[str, Any] = {}
+
+    def note(**figures: Any) -> None:
+        found.update(figures)
+        atomic_write_text(job.work / f"{name}.json", json.dumps(jsonable(found)))
+
+    PARTS[name](job, note)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Milliseconds, seconds and memory: kernels, stages, players."""

@@ -1,0 +1,194 @@
+"""How long an answer takes, part by part, and whether sound and poses are together: a conversation with a made voice.
+
+    python -m benchmarks chat --avatar me.avatar
+
+A Piper voice (extra `[chat]`) says short sentences into a websocket of `smplxpp chat`'s server, as a microphone would:
+in pieces of 64 ms, in real time. Rules answer. The client is no browser: "heard" is when the message with the sound has
+come, "seen" when a picture of 512 x 640 was drawn by `avatar.runtime` after it. Times count from the end of the speech,
+which the server finds out only after a pause that it is set to wait for. How many words were recognised is counted too.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import tyro
+
+from avatar.runtime import AvatarPlayer
+from avatar.speech.voice import PiperVoice
+from benchmarks.support.results import store_results
+from pipelines.chat.conversation import ChatParts
+from pipelines.chat.hearing import BLOCK, RATE
+from pipelines.chat.server import ChatServer
+from pipelines.commands.chat import Chat
+from pipelines.figures import fit_cameras
+from smplxpp.core.files.tensor_bytes import unpack_tensors
+from smplxpp.core.files.wave_file import Sound
+
+SENTENCES = (
+    "What is your name?",
+    "I am tired today.",
+    "Tell me a story about a little dog.",
+    "I want to go home.",
+    "Can you help me?",
+    "My brother is a good cook.",
+    "Why is the sky blue?",
+    "Thank you, that was nice.",
+)
+T = TypeVar("T")
+PIECE = 1024
+"""Samples of a message: 64 ms."""
+SILENCE = 2.0
+"""Seconds between two sentences at least."""
+
+
+@dataclass(frozen=True)
+class ChatBenchmark:
+    """Speak, wait for the answer, measure, store."""
+
+    avatar: Path
+    """A bundle, NAME.avatar."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        command = Chat(self.avatar)
+        from pipelines.commands.animate_student import open_student
+
+        bundle = open_student(self.avatar)
+        cast = command.engines(bundle, command.partner())
+        cast.voice.say("Hello.")
+        turns: list[dict[str, float]] = []
+        server = ChatServer(
+            self.avatar.read_bytes(), cast, name="benchmark", report=lambda turn: turns.append(turn.marks)
+        )
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = _Page(server, self.avatar)
+        right = words = 0
+        for sentence in SENTENCES:
+            heard = page.speak(PiperVoice(threads=1).say(sentence).sound)
+            wanted = re.findall(r"[a-z']+", sentence.lower())
+            matcher = difflib.SequenceMatcher(None, wanted, heard.split(), autojunk=False)
+            right += sum(block.size for block in matcher.get_matching_blocks())
+            words += len(wanted)
+            print(f"{sentence:40s} {heard:40s} {turns[-1]}")
+        page.close()
+        server.shutdown()
+        figures = {
+            "sentences": len(SENTENCES),
+            "words recognised": f"{right} of {words}",
+            "seconds from the end of the speech": {
+                part: {
+                    "median": round(float(np.median([turn[part] for turn in turns])), 3),
+                    "worst": round(max(turn[part] for turn in turns), 3),
+                }
+                for part in turns[0]
+            },
+            "seconds of CPU": _cpu(cast, page),
+            "gaussians": bundle.sizes["N"],
+        }
+        for name, value in figures.items():
+            print(f"{name:38s} {value}")
+        print(f"stored {store_results('chat', 'python -m benchmarks chat --avatar me.avatar', figures).name}")
+
+
+class _Page:
+    """A client that speaks, listens and draws."""
+
+    def __init__(self, server: ChatServer, avatar: Path) -> None:
+        from urllib.request import urlopen
+
+        from websockets.sync.client import connect
+
+        with urlopen(server.address) as reply:
+            secret = re.search('data-chat="([^"]+)"', reply.read().decode())
+        assert secret is not None
+        origin = server.address.rstrip("/")
+        self._socket = connect(f"{origin.replace('http', 'ws')}/{secret[1]}", origin=origin, max_size=None)
+        self._player = AvatarPlayer(avatar)
+        motion = self._player.motion
+        assert motion is not None
+        points = self._player.pose(motion.frame(0)).means.astype(np.float64)
+        (self._camera,) = fit_cameras(points, directions=[(0.0, 0.0, 1.0)], height=640, width=512)
+        self._pose = motion.frame(0)
+        self._done, self._heard = threading.Event(), list[str]()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def speak(self, sound: Sound) -> str:
+        """Say a sentence in real time; return the words that were heard, when the answer has come and is drawn."""
+        samples = sound.at_rate(RATE).integers()
+        quiet = np.zeros(int(SILENCE * RATE), np.int16)
+        self._done.clear()
+        self._heard.clear()
+        whole = np.concatenate([quiet[: RATE // 2], samples, quiet])
+        began = time.monotonic()
+        for k in range(0, len(whole), PIECE):
+            time.sleep(max(0.0, began + k / RATE - time.monotonic()))
+            self._socket.send(whole[k : k + PIECE].tobytes())
+        assert self._done.wait(900)
+        time.sleep(SILENCE)
+        return " ".join(self._heard)
+
+    def _listen(self) -> None:
+        """Take whatever comes, until the end."""
+        for message in self._socket:
+            if isinstance(message, str):
+                told = json.loads(message)
+                self._heard.extend([told["text"]] if told["kind"] == "heard" else [])
+                if told["kind"] in ("latency", "note"):
+                    self._done.set()
+            else:
+                tensors, about = unpack_tensors(message, subject="message")
+                if "sound" in tensors:
+                    self._tell(about["turn"], "sound")
+                    self.draw()
+                    self._tell(about["turn"], "picture")
+
+    def draw(self) -> None:
+        """Draw one picture."""
+        self._player.pose(self._pose)
+        self._player.draw(self._camera)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._socket.close()
+
+    def _tell(self, turn: Any, what: str) -> None:
+        self._socket.send(json.dumps({"kind": "began", "turn": turn, "what": what}))
+
+
+def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
+    """Seconds of CPU of the parts on their own, means over the sentences; a block is 32 ms of sound."""
+    out: dict[str, list[float]] = {}
+    activity, performer, recogniser = cast.activity(), cast.performer(), cast.recogniser
+    assert recogniser is not None
+
+    def timed(part: str, do: Callable[[], T]) -> T:
+        began = time.process_time()
+        result = do()
+        out.setdefault(part, []).append(time.process_time() - began)
+        return result
+
+    for sentence in SENTENCES:
+        spoken = timed("voice, a sentence", lambda text=sentence: cast.voice.say(text))
+        samples = spoken.sound.at_rate(RATE).integers()
+        recogniser.begin()
+        timed("words, while they are spoken", lambda heard=samples: recogniser.hear(heard))
+        timed("words, at the end", recogniser.end)
+        block = samples[RATE // 2 : RATE // 2 + BLOCK].astype(np.float32) / np.float32(32768.0)
+        timed("voice activity, a block", lambda heard=block: activity(heard))
+        timed("frames, a sentence", lambda said=spoken.speech: performer.talk(said))
+        timed("picture", page.draw)
+    return {part: round(float(np.mean(seconds)), 4) for part, seconds in out.items()}
+
+
+if __name__ == "__main__":
+    tyro.cli(ChatBenchmark, prog="python -m benchmarks chat").run()

@@ -1,0 +1,187 @@
+"""The page's kernels against the runtime's, and both renderers of the page where the CPU plays the GPU.
+
+    python -m benchmarks web_player --run RUN [--before MODULES] [--repeats 20] [--no-store]
+
+Milliseconds by part, the least of all poses: of the processor's time on one thread for the native kernels
+(`avatar.runtime`) and for the same C++ as WebAssembly in Node, which other work on the machine disturbs little, and of
+the clock for pictures in Chromium, which it disturbs much. Rows: the run's own student, and students of the run's sizes
+with Gaussians as they are sampled before any training. `--before` is the modules of the player when it deformed in
+TypeScript: in a checkout of `dfe96b4`, `cd web && npm ci && node build.mjs --tests` makes `web/build/modules.mjs`.
+Needs Node with `web/`'s tools (`npm ci` there), and Chromium for the pictures.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from avatar.export.bundle import BundleExtras, write_bundle
+from avatar.runtime import AvatarPlayer
+from benchmarks.speed.runtime import from_the_front, poses_of, students_of
+from benchmarks.support.results import ROOT, store_results
+from pipelines.web.page import PageContent, PageLight, single_page
+from smplxpp.cloth.garment_file import load_garments
+from smplxpp.core.camera import Camera
+from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.panoramas import STUDIO, panoramas
+from smplxpp.core.params import BodyParams
+from tests.web.chromium import Page, find_chromium
+
+WEB = ROOT / "web"
+PARTS = ("pose", "field", "blend", "world")
+STEP = 1.0 / 30.0
+# Both players have the same names for what they share; the older one has one function for a pose, and sorts elsewhere.
+_SCRIPT = """
+import { readFileSync } from "node:fs";
+const [path, modules, repeats] = process.argv.slice(1), m = await import(modules);
+const avatar = await m.readBundle(new Uint8Array(readFileSync(path))), N = avatar.gaussians.count;
+const clock = () => { const { user, system } = process.cpuUsage(); return (user + system) / 1000; };
+const best = {}, note = (part, ms) => { best[part] = Math.min(best[part] ?? Infinity, ms); };
+const timed = (part, work) => { const start = clock(), out = work(); note(part, clock() - start); return out; };
+const deformer = new m.Deformer(avatar, clock), row = [0, 0, -1, 3.5], eye = [0, 1, 3.5], near = 0.01;
+const driver = m.ClothDriver && avatar.garments.length ? new m.ClothDriver(deformer, avatar.garments) : null;
+const sorter = m.DepthSorter && new m.DepthSorter(N), records = new Float32Array(m.RECORD * N);
+for (let k = 0; k < repeats; ++k) {
+  const pose = m.poseAt(avatar.motion, (k % avatar.motion.frames) / avatar.motion.framesPerSecond);
+  timed("all", () => {
+    timed("pose to world", () => deformer.pose(pose));
+    if (sorter) {
+      const order = timed("sort", () => sorter.sort(deformer.centers, row, near, avatar.gaussians.part, new Set()));
+      timed("records", () => deformer.records(eye, order, records));
+    } else {
+      const { count } = timed("sort", () => deformer.order(row, near, [], true));
+      timed("records", () => deformer.recordsFor(eye, count));
+    }
+  });
+  for (const [part, ms] of Object.entries(deformer.milliseconds ?? {})) note(part, ms);
+}
+for (let k = 0; driver && k < repeats; ++k) {
+  const pose = m.poseAt(avatar.motion, Math.min(k / 30, (avatar.motion.frames - 1) / avatar.motion.framesPerSecond));
+  timed(k ? "cloth, a step" : "cloth, a cold start", () => driver.step(pose, 1 / 30));
+}
+process.stdout.write(JSON.stringify(best));
+"""
+_PICTURES = """(async () => {
+  const { player } = smplxppPlayer, best = {};
+  const note = (part, ms) => { if (ms !== null) best[part] = Math.min(best[part] ?? Infinity, ms); };
+  player.lit = %s;
+  for (let k = 0; k < %d; ++k) {
+    const start = performance.now();
+    // Rates are means over pictures: those of this one alone.
+    Object.assign(player.rates, { deform: 0, sort: 0 });
+    await player.picture({ time: 0.1 * k, seconds: null, camera: %s });
+    note("picture", performance.now() - start);
+    note("pose and records", player.rates.deform);
+    if (!player.renderer.sorts) note("sort", player.rates.sort);
+    // A renderer knows the time of a picture when the next one comes.
+    const { sorts, sorting, milliseconds } = player.renderer;
+    if (k) note(sorts && sorting === null ? "sort and drawing" : "drawing", milliseconds);
+    if (k) note("projection and sort", sorting);
+  }
+  return JSON.stringify(best);
+})()"""
+
+
+@dataclass(frozen=True)
+class WebPlayerBenchmark:
+    """Time the page's parts."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Trained run."""
+    before: Path | None = None
+    """Modules of the player that deformed in TypeScript."""
+    repeats: int = 20
+    """Poses of each."""
+    pictures: int = 6
+    """Pictures of each renderer; 0: none."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        students = students_of(self.run_folder)
+        trained = next(iter(students.values()))
+        template = trained.rig.template
+        loose = self.run_folder / "83_cloth" / "garments.npz"
+        garments = load_garments(loose, template) if loose.exists() else []
+        subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
+        ways = {"WebAssembly": WEB / "build" / "modules.mjs"}
+        ways |= {} if self.before is None else {"TypeScript": self.before.resolve()}
+        figures: dict[str, Any] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for name, student in students.items():
+                path = Path(folder) / "me.avatar"
+                own = garments if student is trained else []
+                extras = BundleExtras(name="benchmark", garments=own, motion=poses_of(student))
+                write_bundle(path, student, extras)
+                figures[f"{name} Gaussians, native"] = native(path, self.repeats)
+                for way, modules in ways.items():
+                    figures[f"{name} Gaussians, {way}"] = in_node(path, modules, self.repeats)
+                if student is trained and self.pictures and find_chromium():
+                    figures |= drawn(path, from_the_front(template), self.pictures)
+        print(json.dumps(figures, indent=1))
+        if self.store:
+            command = f"python -m benchmarks web_player --run {self.run_folder.name}"
+            store_results("web_player", command + (" --before MODULES" if self.before else ""), figures)
+
+
+def native(path: Path, repeats: int) -> dict[str, float]:
+    """Return the least milliseconds of the native kernels' parts, and of a step of the loose clothes."""
+    player, best = AvatarPlayer(path, threads=1, clock=time.process_time), {}
+    motion = player.motion
+    assert motion is not None
+
+    def note(part: str, ms: float) -> None:
+        best[part] = min(best.get(part, float("inf")), ms)
+
+    for k in range(repeats):
+        player.pose(motion.frame(k % len(motion)))
+        for part in PARTS:
+            note(part, 1e3 * player.seconds[part])
+        note("pose to world", 1e3 * sum(player.seconds[part] for part in PARTS))
+    for k in range(repeats if player.bundle.garments else 0):
+        frame: BodyParams = motion.frame(min(k, len(motion) - 1))
+        begin = time.process_time()
+        player.step(frame, STEP)
+        spent = 1e3 * (time.process_time() - begin - sum(player.seconds[part] for part in PARTS))
+        note("cloth, a step" if k else "cloth, a cold start", spent)
+    return best
+
+
+def in_node(path: Path, modules: Path, repeats: int) -> dict[str, float]:
+    """Return the least milliseconds of the page's parts."""
+    command = ["node", "--input-type=module", "-e", _SCRIPT, str(path), modules.as_uri(), str(repeats)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def drawn(path: Path, camera: Camera, pictures: int) -> dict[str, dict[str, float]]:
+    """Return the least milliseconds of a picture, its bytes read back, and of its parts, by renderer and light."""
+    K = camera.K
+    view = {"view": camera.cam_from_world[:3].ravel().tolist(), "width": camera.width, "height": camera.height}
+    view |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    out = {}
+    with tempfile.TemporaryDirectory() as folder, Page(Path(folder) / "profile") as page:
+        file = Path(folder) / "player.html"
+        studio = Irradiance.of_environment(panoramas()[STUDIO]).exposed()
+        light = PageLight(STUDIO, Relighting(studio, Irradiance.uniform()))
+        file.write_bytes(single_page(path.read_bytes(), PageContent(name="benchmark", light=light)))
+        for renderer in ("webgl2", "webgpu"):
+            page.go(f"{file.as_uri()}?renderer={renderer}")
+            page.evaluate("smplxppPlayer.player.playing = false")
+            name = page.evaluate("smplxppPlayer.player.renderer.name")
+            for lit in (False, True):
+                best = json.loads(page.evaluate(_PICTURES % (json.dumps(lit), pictures, json.dumps(view))))
+                words = ", in another light" if lit else ""
+                out[f"pictures of {camera.width}x{camera.height} by {name} on SwiftShader{words}"] = best
+    return out
+
+
+if __name__ == "__main__":
+    tyro.cli(WebPlayerBenchmark).run()

@@ -1,0 +1,1 @@
+"""What several benchmarks share: the store of results, scenes and voices, the page of results."""
