@@ -1,6 +1,7 @@
-"""Captures: images a second through a loader, memory over a long capture, every reader on a known scene."""
+"""Captures: images a second through a loader, memory over a long capture, every reader on a known scene.
 
-    python -m benchmarks capture_loader
+python -m benchmarks capture_loader
+"""
 
 from __future__ import annotations
 
