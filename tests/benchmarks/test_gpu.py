@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.gpu import __main__ as gpu
+import benchmarks.gpu.__main__ as gpu
 from benchmarks.gpu.__main__ import GpuBenchmark, run_part
 from benchmarks.gpu.parts import PARTS, Job
 from benchmarks.gpu.views import enlarge
