@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from benchmarks.people import CAST, PersonScan, captured, captured_names, person
 from benchmarks.support.results import store_results
-from pipelines.viewer.landmark_choice import lies_within
+from pipelines.viewer.session import lies_within
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread

@@ -19,9 +19,8 @@ from avatar.losses.perceptual import load_metric
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset
-from pipelines.ablation.measure import PICTURES, closure, measure_row
+from pipelines.ablation.measure import PICTURES, AblationResult, ablation_table, closure, measure_row, row_figures
 from pipelines.ablation.rows import Row, ablation_stages
-from pipelines.ablation.table import AblationResult, ablation_table, row_figures
 from pipelines.figures import caption, contact_sheet, encode_png
 from pipelines.runs.layout import ABLATION
 from pipelines.stages.evaluate_inputs import input_protocol

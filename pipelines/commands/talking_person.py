@@ -52,7 +52,7 @@ def face_of_bundle(bundle: AvatarBundle) -> Face:
 
 def live_lips(bundle: AvatarBundle) -> bytes | None:
     """Return what moves a bundle's mouth by live sound in a page; None for a face without a mouth that speaks."""
-    from pipelines.web.lips import lips_of
+    from pipelines.web.page import lips_of
 
     try:
         return lips_of(face_of_bundle(bundle))

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from pipelines.viewer.run_session import Coloring, Layer, RunSession
-from pipelines.viewer.shapes import colored_glb
+from pipelines.viewer.scene import colored_glb
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 

@@ -11,9 +11,17 @@ from jaxtyping import Float, Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
 from pipelines.figures import blend_joint_colors, heat_colors
-from pipelines.viewer.run_models import SplatSource, Surface, covariances, newest_splats, open_player, tracked_surface
+from pipelines.viewer.run_models import (
+    SplatSource,
+    Surface,
+    TrainingNow,
+    covariances,
+    newest_splats,
+    open_player,
+    tracked_surface,
+    training_now,
+)
 from pipelines.viewer.run_motion import ShownMotion, capture_of_run, motion_of_run
-from pipelines.viewer.training_now import TrainingNow, training_now
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
 from smplxpp.core.labels import display_colors

@@ -7,17 +7,100 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
 
 from pipelines.runs.layout import CORRECTIONS_FILE, LANDMARKS_FILE
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.core.topology import component_labels
 from smplxpp.register.landmark_file import write_landmarks
 from smplxpp.segment import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.corrected_faces import ScanSurface
 from smplxpp.segment.corrections import Correction, faces_of
+
+_OF_SIDES = (
+    "shoulder",
+    "elbow",
+    "wrist",
+    "hip",
+    "knee",
+    "ankle",
+    "heel",
+    "big_toe",
+    "index_tip",
+    "thumb_tip",
+    "ear",
+)
+_WITHIN = {"shoulder", "elbow", "wrist", "hip", "knee", "ankle"}
+CHOICE: tuple[str, ...] = (
+    "nose",
+    "neck",
+    "pelvis",
+    *(f"{side}_{part}" for part in _OF_SIDES for side in ("left", "right")),
+)
+"""In the order in which they help most: face and trunk say where the front is, limbs follow."""
+
+
+def lies_within(name: str) -> bool:
+    """Whether a landmark is a joint's centre, within the limb, and no point of the skin."""
+    return name in ("neck", "pelvis") or name.removeprefix("left_").removeprefix("right_") in _WITHIN
+
+
+DOUBTFUL = 0.6
+"""Confidence below which a face is doubtful."""
+_LEAST_AREA = 2e-4  # square metres
+_MOST = 40
+
+
+@dataclass(frozen=True, eq=False)
+class DoubtfulRegion:
+    """A patch of doubtful faces.
+
+    Attributes:
+        label: that most of its area has. area: square metres. confidence: its mean.
+        center: of its area, metres. normal: its mean, outward, unit length.
+    """
+
+    label: int
+    area: float
+    confidence: float
+    center: Float64[np.ndarray, " 3"]
+    normal: Float64[np.ndarray, " 3"]
+
+
+def doubtful_regions(
+    surface: ScanSurface,
+    labels: Int[np.ndarray, " M"],
+    confidence: Float[np.ndarray, " M"],
+    corrected: Bool[np.ndarray, " M"],
+) -> list[DoubtfulRegion]:
+    """Connected patches of faces with a confidence below 0.6 that no hand has set, of 2 square centimetres and more,
+    at most 40, by area times doubt."""
+    doubtful = (confidence < DOUBTFUL) & ~corrected
+    mesh, pairs = surface.mesh, surface.pairs
+    patch = component_labels(pairs[doubtful[pairs].all(axis=1)], mesh.face_count)
+    area = mesh.face_areas * doubtful
+    of_patch = np.bincount(patch, area)
+    doubt = np.bincount(patch, area * (1.0 - confidence))
+    out = []
+    for k in np.argsort(-doubt, kind="stable")[:_MOST]:
+        if of_patch[k] < _LEAST_AREA:
+            continue
+        own = np.flatnonzero((patch == k) & doubtful)
+        weight = mesh.face_areas[own]
+        center = weight @ mesh.face_centers[own] / weight.sum()
+        out.append(
+            DoubtfulRegion(
+                label=int(np.bincount(labels[own], weight).argmax()),
+                area=float(weight.sum()),
+                confidence=float(weight @ confidence[own] / weight.sum()),
+                center=center,
+                normal=normalize_rows((weight @ mesh.face_normals[own])[None])[0],
+            )
+        )
+    return out
+
 
 _MOST_UNDONE = 200
 Line = tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]

@@ -11,14 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pipelines.viewer.doubtful import DoubtfulRegion, doubtful_regions
-from pipelines.viewer.landmark_choice import CHOICE, lies_within
 from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
 from pipelines.viewer.run_scan import label_again
-from pipelines.viewer.scene import MODES, ScanScene
+from pipelines.viewer.scene import MODES, ScanScene, legend
 from pipelines.viewer.server import address_of, one_at_a_time, start_server, stop_server
-from pipelines.viewer.session import LabelSession
-from pipelines.viewer.shapes import legend
+from pipelines.viewer.session import CHOICE, DoubtfulRegion, LabelSession, doubtful_regions, lies_within
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, UPPER
 from smplxpp.segment.corrected_faces import stroked_faces
 

@@ -8,10 +8,33 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import read_text
+from smplxpp.core.files.paths import read_bytes, read_text
+from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
 from smplxpp.core.light import Relighting
+
+if TYPE_CHECKING:
+    from avatar.speech import Face
+
+
+def lips_of(face: Face) -> bytes:
+    """Return tensors in the layout of safetensors: those of `avatar.speech.lips.WEIGHTS`, and `face.NAME`.
+
+    Of the face: `basis` (6, E) of the articulators, `neutral`, `lowest`, `highest` (E), `jaw` (3) at rest, and
+    `jaw_reach` (2), the radians that an open vowel hangs it and that it hangs at most.
+    """
+    from avatar.speech.face import JAW_ANGLE
+    from avatar.speech.lips import WEIGHTS
+
+    tensors, about = unpack_tensors(read_bytes(WEIGHTS, subject="lip network"), subject="lip network")
+    own = {name: getattr(face, name) for name in ("basis", "neutral", "lowest", "highest", "jaw")}
+    own["jaw_reach"] = np.array([JAW_ANGLE, face.jaw_reach])
+    return pack_tensors({**tensors, **{f"face.{name}": value for name, value in own.items()}}, about)
+
 
 PLAYER = Path(__file__).parent / "assets" / "player.js"
 """Built of `web/` by `npm run build`; a test holds it against its sources."""
@@ -68,7 +91,7 @@ class PageContent:
     Attributes:
         name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
         light: that the avatar is shown in; None: the capture's.
-        lips: of `pipelines.web.lips.lips_of`, by which live sound moves the mouth; None: it does not.
+        lips: of `pipelines.web.page.lips_of`, by which live sound moves the mouth; None: it does not.
     """
 
     name: str

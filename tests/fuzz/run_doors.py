@@ -18,8 +18,8 @@ from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_
 from avatar.training.engine.metrics_log import read_metrics
 from pipelines.commands.inspect import summarise_run
 from pipelines.report import Report, write_report
+from pipelines.report.builder import readable
 from pipelines.report.sections.fit import fit_section
-from pipelines.report.sections.readable import readable
 from pipelines.report.sections.refine import refine_section
 from pipelines.runs.artefacts import load_arrays, save_arrays
 from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE

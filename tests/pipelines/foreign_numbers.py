@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from pipelines.report import KeyNumber, Section
-from pipelines.report.sections.readable import readable, readable_numbers
+from pipelines.report.builder import readable, readable_numbers
 from pipelines.runs.stage import StageRecord
 from smplxpp.core.errors import GeometryWarning
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.commands.build import Build
-from pipelines.report.sections.locate import locate_section
+from pipelines.report.sections.register import locate_section
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, SEGMENT_STAGE
 from pipelines.runs.stage import require_stage
 from pipelines.stages import locate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.report.sections.relight import relight_section, standing_relighting
+from pipelines.report.sections.evaluation import relight_section, standing_relighting
 from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import read_manifest
 from tests.core.files.radiance import write_radiance

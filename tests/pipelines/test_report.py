@@ -25,7 +25,7 @@ from pipelines.report import (
     write_report,
 )
 from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
-from pipelines.report.sections.talking import talking_section
+from pipelines.report.sections.evaluation import talking_section
 from pipelines.runs.layout import TALKING_FILM
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError

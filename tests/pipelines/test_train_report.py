@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from pipelines.report import Report, write_report
-from pipelines.report.sections.cloth import cloth_section
-from pipelines.report.sections.readable import readable
-from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
+from pipelines.report.builder import readable
+from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.train_names import kind_name
 from smplxpp.core.errors import GeometryWarning

@@ -22,10 +22,9 @@ from avatar.training.engine.checkpoint import Checkpoint, save_checkpoint
 from pipelines.cli import main
 from pipelines.commands import view as view_command
 from pipelines.runs.layout import GAUSSIANS, STUDENT
-from pipelines.viewer.run_models import covariances
+from pipelines.viewer.run_models import covariances, training_now
 from pipelines.viewer.run_session import open_run
 from pipelines.viewer.run_window import RunWindow, open_run_window
-from pipelines.viewer.training_now import training_now
 from smplxpp.core.colors import linear_from_srgb
 from smplxpp.core.errors import InputError
 from smplxpp.core.light import Irradiance, Relighting

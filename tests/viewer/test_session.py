@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.viewer.doubtful import doubtful_regions
-from pipelines.viewer.session import LabelledScan, LabelSession
+from pipelines.viewer.session import LabelledScan, LabelSession, doubtful_regions
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import concatenate_meshes

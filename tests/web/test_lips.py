@@ -14,8 +14,7 @@ from avatar.speech import ARTICULATORS, Face
 from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, steady
 from avatar.speech.sound_features import FRAME, RATE, hear
 from pipelines.commands.talking_page import write_talking_page
-from pipelines.web.lips import lips_of
-from pipelines.web.page import PageContent, page_files, single_page
+from pipelines.web.page import PageContent, lips_of, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.body import load_body
 from smplxpp.core.files.wave_file import Sound, wave_bytes

@@ -11,21 +11,20 @@ from pipelines.figures import (
     render_shaded,
 )
 from pipelines.report import CheckRow, KeyNumber, Picture, Report, Section, write_report
-from pipelines.report.sections.cloth import cloth_section
+from pipelines.report.builder import readable, readable_numbers
 from pipelines.report.sections.evaluation import (
     evaluation_figures,
     evaluation_key_numbers,
     evaluation_views,
+    relight_section,
     standing_evaluation,
+    standing_relighting,
+    talking_section,
 )
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
-from pipelines.report.sections.locate import locate_section
-from pipelines.report.sections.readable import readable, readable_numbers
 from pipelines.report.sections.reconstruct import reconstruct_section
 from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
-from pipelines.report.sections.register import register_section
-from pipelines.report.sections.relight import relight_section, standing_relighting
-from pipelines.report.sections.talking import talking_section
+from pipelines.report.sections.register import locate_section, register_section
 from pipelines.report.sections.template import (
     fidelity_section,
     parts_section,
@@ -34,7 +33,7 @@ from pipelines.report.sections.template import (
     template_section,
     weights_section,
 )
-from pipelines.report.sections.training import standing_trainings, training_key_numbers, training_section
+from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
 from pipelines.runs.artefacts import load_params_of_run, load_scan, values_of
 from pipelines.runs.code import versions
 from pipelines.runs.layout import (

@@ -12,10 +12,10 @@ from jaxtyping import UInt8
 from avatar.evaluation.input_protocol import InputProtocol, counted
 from pipelines.figures import encode_jpeg, encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, enlarge, error_colors, error_legend, read_tiles
-from pipelines.report import CheckRow, Comparison, KeyNumber, Picture, Section, Table
+from pipelines.report import CheckRow, Comparison, Film, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
 from pipelines.runs.code import sha256_file
-from pipelines.runs.layout import EVALUATE_STAGE, TEMPLATE
+from pipelines.runs.layout import EVALUATE_STAGE, RELIGHT_STAGE, STUDENT, TALKING_FILM, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.evaluate_config import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES
 from smplxpp.core.files.paths import path_inside, read_bytes
@@ -144,3 +144,47 @@ def _listed(names: list[str]) -> str:
     """Names in a sentence, the first with a capital."""
     text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     return text[0].upper() + text[1:]
+
+
+def standing_relighting(run: Path, template_digest: str) -> StageRecord | None:
+    """The pictures in a run, None where there are none or those of another template or student than it has now."""
+    manifest = read_manifest(run / RELIGHT_STAGE)
+    if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest or not (run / STUDENT).is_file():
+        return None
+    if manifest["inputs"].get(STUDENT) != sha256_file(run / STUDENT):
+        return None
+    return StageRecord(run / RELIGHT_STAGE, manifest, ran=False)
+
+
+def relight_section(record: StageRecord) -> Section:
+    """All pictures, and the first two with a slider."""
+    numbers = record.manifest["numbers"]
+    pictures = [
+        Picture(said, read_bytes(path_inside(record.folder, file, subject="picture of a light"), subject="picture"))
+        for said, file in numbers["pictures"].items()
+    ]
+    return Section(
+        title="Avatar: another light",
+        text=(
+            f"The student in the light of a panorama ({numbers['light']}), turned about the vertical: harmonics of "
+            "its irradiance on drawn normals, the capture's light taken for white unless its panorama was given. "
+            "Shadows stay as they were captured.",
+        ),
+        pictures=tuple(pictures),
+        comparisons=(Comparison(f"{pictures[0].caption}, and {pictures[1].caption}", pictures[0], pictures[1]),),
+    )
+
+
+_MOST_BYTES = 3_000_000
+
+
+def talking_section(run: Path) -> tuple[Section, ...]:
+    """The film with its sound; none where there is no film, or one too large to be part of a page."""
+    path = run / TALKING_FILM
+    if not path.is_file() or path.stat().st_size > _MOST_BYTES:
+        return ()
+    text = (
+        "A text to a made voice; its phonemes to mouth and jaw, its stresses to gestures. The capture has none of it."
+    )
+    film = Film("the student, drawn by the runtime; press play for the sound", read_bytes(path, subject="film"))
+    return (Section("It talks", text=(text,), films=(film,)),)

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from pipelines.figures import body_cameras, caption, encode_jpeg, render_heat, render_shaded, row
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
-from pipelines.report.sections.readable import readable, readable_numbers
+from pipelines.report.builder import readable, readable_numbers
 from pipelines.runs.artefacts import read_named
 from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import StageRecord

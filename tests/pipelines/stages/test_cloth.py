@@ -8,7 +8,7 @@ import pytest
 
 from avatar.data.sequence import AvatarSequence
 from avatar.training.engine.session import Session
-from pipelines.report.sections.cloth import cloth_section
+from pipelines.report.sections.training import cloth_section
 from pipelines.runs.stage import StageOutput, run_stage
 from pipelines.stages.cloth import ClothConfig, Outlines, _checks, _numbers_of, find_garments, measure_outlines
 from smplxpp.capture import open_capture
