@@ -21,7 +21,7 @@ from pipelines.commands.terminal import OutputError, end_of_output, error_in_wor
 from pipelines.runs.folders import refuse_old_run
 from smplxpp import __version__
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 
 # command -> (module, dataclass, one line of help)
 COMMANDS: dict[str, tuple[str, str, str]] = {

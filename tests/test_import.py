@@ -255,7 +255,7 @@ DOORS: dict[str, set[str]] = {
     "pickle.loads": set(),
     "Image.open": {"smplxpp/core/files/image_file.py"},
     "zipfile.ZipFile": {
-        *("smplxpp/core/files/array_file.py", "smplxpp/core/files/zip_file.py", "smplxpp/core/files/package_file.py"),
+        *("smplxpp/core/files/array_file.py", "smplxpp/core/files/package_file.py"),
     },
     "safe_open": {"avatar/gaussians/tensor_file.py"},
     "load_file": set(),  # of safetensors

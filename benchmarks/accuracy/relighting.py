@@ -30,9 +30,8 @@ from pipelines.synth.person_file import person_of, read_layers
 from pipelines.synth.soft_light import LightConfig, environment_light, stage_light, vertex_light
 from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.light import Irradiance, Relighting, panoramas
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.panoramas import panoramas
 
 _LIGHT = LightConfig(directions=144)
 

@@ -30,7 +30,7 @@ from smplxpp.capture import Capture
 from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.files.image_file import open_image
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 
 RESULTS_FILE = "results.json"
 COLUMNS = 7

@@ -16,15 +16,17 @@ from typing import Literal
 
 from pipelines.captures.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture import Capture
-from smplxpp.capture.meshes import PosedTopology
-from smplxpp.capture.writers.arrays import save_params_by_row
-from smplxpp.capture.writers.cameras import RigCamera, write_calibration_csv, write_plain_cameras_json
-from smplxpp.capture.writers.description import write_description
-from smplxpp.capture.writers.keypoints import write_keypoints
+from smplxpp.capture.sources import PosedTopology
+from smplxpp.capture.writers.arrays import save_params_by_row, write_keypoints
+from smplxpp.capture.writers.metadata import (
+    RigCamera,
+    write_calibration_csv,
+    write_description,
+    write_plain_cameras_json,
+)
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes, atomic_write_text
-from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import as_object, jsonable, read_json
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.params import BodyParams

@@ -18,9 +18,9 @@ from jaxtyping import UInt8
 from pipelines.figures import contact_sheet
 from pipelines.figures.body_drawings import draw_keypoints
 from smplxpp.capture import Capture
-from smplxpp.capture.images import read_alpha, read_color
 from smplxpp.capture.keypoint_files import read_keypoints
-from smplxpp.capture.writers.keypoints import write_keypoints
+from smplxpp.capture.views import read_alpha, read_color
+from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.paths import read_bytes

@@ -13,8 +13,8 @@ from jaxtyping import UInt8
 
 from smplxpp.capture import Capture
 from smplxpp.capture.files import IMAGE_SUFFIXES, subfolders
-from smplxpp.capture.images import read_color
-from smplxpp.capture.matting import write_mattes
+from smplxpp.capture.masks import write_mattes
+from smplxpp.capture.views import read_color
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_object, read_json

@@ -160,7 +160,7 @@ class CaptureConvertCommand:
         """Run the model over every image that has no matte yet."""
         from pipelines.commands.progress import shared_progress
         from smplxpp.capture import open_capture
-        from smplxpp.capture.matting import MattingModel, write_mattes
+        from smplxpp.capture.masks import MattingModel, write_mattes
 
         if self.masks is None:
             raise InputError("--matting", expected="--masks FOLDER for the mattes", received="no folder")

@@ -16,8 +16,7 @@ from pipelines.commands.options import ClothMode, OptionalPath, OptionalText, re
 from pipelines.commands.progress import shared_progress
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
-from smplxpp.core.light import Irradiance, Relighting
-from smplxpp.core.panoramas import STUDIO, panoramas
+from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
 
 log = logging.getLogger(__name__)
 

@@ -41,7 +41,7 @@ class KeypointsConvert:
         """Convert; returns what was found of each camera."""
         from smplxpp.capture import open_capture
         from smplxpp.capture.keypoint_files import KeypointFiles, KeypointOptions, find_places
-        from smplxpp.capture.writers.keypoints import write_keypoints
+        from smplxpp.capture.writers.arrays import write_keypoints
 
         if not self.input.is_dir():
             raise InputError("keypoints", expected="an existing folder", received=str(self.input))

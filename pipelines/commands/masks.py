@@ -78,7 +78,7 @@ class CaptureMasks:
         matter: Matter
         if self.matting is not None:
             from pipelines.runs.code import sha256_file
-            from smplxpp.capture.matting import MattingModel
+            from smplxpp.capture.masks import MattingModel
 
             matter, identity = MattingModel(self.matting), f"matting model {sha256_file(self.matting)}"
         else:

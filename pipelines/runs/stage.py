@@ -32,7 +32,7 @@ from pipelines.runs.manifest import SCHEMA, read_record
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3

@@ -41,7 +41,7 @@ from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import load_body, load_params
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.validation import require_choice
 from smplxpp.detect import load_detector
 from smplxpp.segment import find_label_set

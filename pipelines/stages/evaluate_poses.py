@@ -16,9 +16,9 @@ from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture, open_capture
-from smplxpp.capture.params import StackedParams
 from smplxpp.capture.protocols import EXACT
 from smplxpp.capture.recording import ParamSource
+from smplxpp.capture.sources import StackedParams
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread

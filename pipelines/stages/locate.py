@@ -19,7 +19,7 @@ from pipelines.stages.scan_keypoints import facing, keypoints_of_scan
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import smooth_if_rough
 from smplxpp.core.checks import Check
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams

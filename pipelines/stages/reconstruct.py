@@ -32,8 +32,7 @@ from smplxpp.clean import sanitize
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_folder
-from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import as_object, jsonable, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct
 from smplxpp.reconstruct.agreement import silhouette_agreement

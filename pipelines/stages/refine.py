@@ -34,11 +34,11 @@ from pipelines.stages.said_of_inputs import SaidOfInputs, path_of_params
 from pipelines.stages.scene import TrainInputs, TrainScene, of_protocol, open_cameras, open_scene
 from pipelines.stages.usable import with_cameras
 from smplxpp.capture import Capture
-from smplxpp.capture.writers.cameras import write_plain_cameras_json
+from smplxpp.capture.writers.metadata import write_plain_cameras_json
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.register.kinematics import BodyState
 from smplxpp.template.template import Template

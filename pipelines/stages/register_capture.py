@@ -18,7 +18,7 @@ from pipelines.stages.register_config import RegisterInputs, save_register
 from pipelines.stages.registration import registration_checks, stacked_rows, summary
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.fit import register
 from smplxpp.register.follow import follow, lost_frames

@@ -15,10 +15,10 @@ from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.register_config import load_register
 from pipelines.stages.segment import label_source
 from smplxpp.capture import Capture
-from smplxpp.capture.params import ParamFiles, StackedParams
 from smplxpp.capture.protocols import ProtocolFiles, description_file, read_description, read_protocols
 from smplxpp.capture.readers import simple
 from smplxpp.capture.recording import ParamSource
+from smplxpp.capture.sources import ParamFiles, StackedParams
 from smplxpp.core.errors import InputError
 
 OWN_PARAMETERS = "params.npz"

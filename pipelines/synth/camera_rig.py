@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.capture.writers.cameras import BODY, FACE, RigCamera
+from smplxpp.capture.writers.metadata import BODY, FACE, RigCamera
 from smplxpp.core.camera import Camera
 from smplxpp.core.spread import spread_inside
 

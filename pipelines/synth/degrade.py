@@ -25,8 +25,7 @@ from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.writers.arrays import save_params_by_row
-from smplxpp.capture.writers.cameras import write_cameras_json
-from smplxpp.capture.writers.description import write_description
+from smplxpp.capture.writers.metadata import write_cameras_json, write_description
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_file import read_json

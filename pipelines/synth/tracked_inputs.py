@@ -16,10 +16,10 @@ from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimate
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
 from smplxpp.capture.files import FileSeries
-from smplxpp.capture.images import read_labels
 from smplxpp.capture.keypoints import moved_keypoints
+from smplxpp.capture.views import read_labels
+from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.capture.writers.images import write_gray_png
-from smplxpp.capture.writers.keypoints import write_keypoints
 from smplxpp.core.camera import Camera
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.params import BodyParams

@@ -2,7 +2,7 @@
 
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.capture import Capture
-from smplxpp.capture.matting import MattingConfig, MattingModel, write_mattes
+from smplxpp.capture.masks import MattingConfig, MattingModel, write_mattes
 from smplxpp.capture.problems import find_problems
 from smplxpp.capture.recording import Problem
 from smplxpp.capture.reference import ReferenceFrame, find_reference, find_scans, scans_in

@@ -1,15 +1,22 @@
-"""Masks of any matting tool: a folder of mattes, matched to a capture's images by their names."""
+"""Masks of a capture: folders of mattes matched to images by name, and mattes from an ONNX model of the user."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
+
+from smplxpp.capture.capture import Capture
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, subfolders
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.onnx_file import OnnxModel
 
 
 def with_masks(recording: Recording, folder: Path) -> Recording:
@@ -74,3 +81,130 @@ def _by_image(stem: str, by_stem: Mapping[str, int]) -> int | None:
             return None
         stem = shorter
     return by_stem[stem]
+
+
+# Side of the square that models of free input size are fed with.
+_DEFAULT_SIDE = 1024
+_LONGEST_SIDE = 8192
+_FLOATS: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+@dataclass(frozen=True)
+class MattingConfig:
+    """How images are put to the model.
+
+    Attributes:
+        mean, std: (3,) of the normalisation `(rgb - mean) / std` with rgb in [0, 1]; ImageNet's, as BiRefNet, ISNet's
+            descendants and most others were trained with.
+        threads: of the model's computation.
+    """
+
+    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
+    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+    threads: int = 2
+
+
+class MattingModel:
+    """An ONNX model that takes a (1, 3, H, W) float image; of what it gives, the first matte of H x W values counts.
+
+    The matte's values are read as opacities if they lie in [0, 1], otherwise as logits. The image is stretched to the
+    model's input (or to 1024 x 1024 where that is free) and the matte back.
+
+    Raises:
+        MissingExtraError: onnxruntime is not installed.
+        InputError: no such file, not a model, or one with another input.
+    """
+
+    def __init__(self, path: str | Path, config: MattingConfig | None = None) -> None:
+        self.config = config or MattingConfig()
+        self._model = OnnxModel(path, kind="matting model", extra="matting", threads=self.config.threads)
+        self._subject = self._model.subject
+        entries = self._model.inputs
+        sizes = [self._size_of(entry) for entry in entries]
+        if len(sizes) != 1 or sizes[0] is None:
+            raise InputError(
+                self._subject,
+                expected=f"one input of floats of shape (1, 3, H, W), sides of at most {_LONGEST_SIDE}",
+                received=f"{[(one.name, one.type, one.shape) for one in entries]}"[:400],
+            )
+        self._name, self._dtype, self._size = entries[0].name, _FLOATS[entries[0].type], sizes[0]
+
+    @staticmethod
+    def _size_of(entry: Any) -> tuple[int, int] | None:
+        """Width and height that an input asks for; None where it is no image of floats. Sides that are no numbers are
+        free."""
+        if entry.type not in _FLOATS or len(entry.shape) != 4:
+            return None
+        batch, channels, *sides = entry.shape
+        height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in sides)
+        wanted = (not isinstance(batch, int) or batch == 1) and (not isinstance(channels, int) or channels == 3)
+        return (width, height) if wanted and min(height, width) > 0 and max(height, width) <= _LONGEST_SIDE else None
+
+    def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
+        """Return the opacity of the person in an sRGB image."""
+        from PIL import Image
+        from PIL.Image import Resampling
+
+        small = np.asarray(Image.fromarray(image).resize(self._size, Resampling.BILINEAR), dtype=np.float32) / 255.0
+        tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
+            2, 0, 1
+        )[None]
+        outputs = self._model.run({self._name: tensor.astype(self._dtype)})
+        matte = self._opacity(outputs)
+        back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
+        return np.clip(np.asarray(back) * 255.0 + 0.5, 0, 255).astype(np.uint8)
+
+    def _opacity(self, outputs: list[Any]) -> np.ndarray:
+        arrays = [o for o in outputs if isinstance(o, np.ndarray) and o.dtype.kind in "fiub"]
+        mattes = [o.astype(np.float32) for o in arrays if o.ndim >= 2 and o.size == self._pixels]
+        if not mattes or not np.isfinite(mattes[0]).all():
+            raise InputError(
+                self._subject,
+                expected=f"an output of {self._size[1]} x {self._size[0]} finite values",
+                received=f"NaN or infinity in {mattes[0].size}" if mattes else f"shapes {[o.shape for o in arrays]}",
+            )
+        matte = mattes[0].reshape(self._size[1], self._size[0])
+        inside = matte.min() >= -1e-3 and matte.max() <= 1.0 + 1e-3
+        return np.clip(matte, 0.0, 1.0) if inside else 1.0 / (1.0 + np.exp(-np.clip(matte, -30, 30)))
+
+    @property
+    def _pixels(self) -> int:
+        return self._size[0] * self._size[1]
+
+
+def matte_path(folder: str | Path, camera: str, frame: int) -> Path:
+    """Where the matte of a view lies in a folder of masks."""
+    return Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
+
+
+def write_mattes(
+    capture: Capture,
+    model: Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]],
+    folder: str | Path,
+    *,
+    views: Iterable[tuple[str, int]] | None = None,
+) -> Iterator[Path]:
+    """Make the mattes of a capture's views, `folder/CAM/CAM_maskFFFFFF.png`; those that exist are left as they are.
+
+    The files are in the pixels of the images on disk, as masks have to be: open the capture with `masks=folder`.
+
+    Args:
+        capture: at full size; distorted images are matted as the lens drew them.
+        model: gives the opacity of the person in an sRGB image: a `MattingModel`, or anything else that does.
+        folder: where to.
+        views: (camera, frame); None: every image there is.
+
+    Yields:
+        Each file when it stands, so that the caller can show progress.
+    """
+    from PIL import Image
+
+    from smplxpp.capture.views import read_color
+
+    for camera, frame in capture.views() if views is None else views:
+        target = matte_path(folder, camera, frame)
+        if not target.is_file():
+            image = np.asarray(read_color(capture.required_file(camera, frame)))
+            with atomic_path(target) as temporary:
+                Image.fromarray(model(image)).save(temporary, format="PNG")
+        yield target

@@ -10,8 +10,8 @@ from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import with_keypoints
-from smplxpp.capture.lens_loss import lens_problems
 from smplxpp.capture.masks import with_masks
+from smplxpp.capture.problems import lens_problems
 from smplxpp.capture.readers import (
     actorshq,
     avatarrex,
@@ -23,7 +23,7 @@ from smplxpp.capture.readers import (
     talkbody4d,
     thuman4,
 )
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.window import Window
 from smplxpp.core.errors import InputError

@@ -10,7 +10,7 @@ import pygltflib
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
-from smplxpp.core.files.zip_file import zip_bytes
+from smplxpp.core.files.package_file import zip_bytes
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.core.validation import require_choice

@@ -10,7 +10,7 @@ import pytest
 
 from smplxpp.capture import open_capture, read_cameras
 from smplxpp.capture.distortion import FISHEYE, FOV, Distortion, RationalDistortion, undistort
-from smplxpp.capture.lens_loss import lost_share
+from smplxpp.capture.problems import lost_share
 from smplxpp.core.errors import InputError
 from tests.capture.scene import HEIGHT, LENS, WIDTH, make_scene, overlap
 from tests.capture.writers import write_simple

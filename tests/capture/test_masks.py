@@ -121,7 +121,7 @@ def model_file(path, *, side: int | str, logits: bool) -> None:
 @pytest.mark.parametrize(("side", "logits"), [(64, False), ("side", True)])
 def test_a_users_model_writes_masks_in_our_layout(rig, tmp_path, side, logits):
     pytest.importorskip("onnxruntime")
-    from smplxpp.capture.matting import MattingModel, write_mattes
+    from smplxpp.capture.masks import MattingModel, write_mattes
 
     model_file(tmp_path / "red.onnx", side=side, logits=logits)
     picture = np.zeros((40, 30, 3), np.uint8)
@@ -157,7 +157,7 @@ def test_convert_takes_the_mattes_of_a_users_model(rig, tmp_path, capsys):
 
 def test_what_is_no_matting_model_is_refused(tmp_path):
     pytest.importorskip("onnxruntime")
-    from smplxpp.capture.matting import MattingModel
+    from smplxpp.capture.masks import MattingModel
 
     with pytest.raises(InputError, match="existing ONNX file"):
         MattingModel(tmp_path / "none.onnx")
@@ -197,7 +197,7 @@ def small_model(path, nodes, *, kind="FLOAT", shape=(1, 3, 8, 8), inputs=1):
 )
 def test_models_for_something_else_are_refused_when_they_are_opened(tmp_path, options):
     pytest.importorskip("onnxruntime")
-    from smplxpp.capture.matting import MattingModel
+    from smplxpp.capture.masks import MattingModel
 
     small_model(tmp_path / "other.onnx", [("Identity", ["image"], ["matte"], {})], **options)
     with pytest.raises(InputError, match=r"other\.onnx"):
@@ -210,7 +210,7 @@ def test_models_for_something_else_are_refused_when_they_are_opened(tmp_path, op
 )
 def test_models_that_give_no_matte_are_refused_when_they_run(tmp_path, operation, words):
     pytest.importorskip("onnxruntime")
-    from smplxpp.capture.matting import MattingConfig, MattingModel
+    from smplxpp.capture.masks import MattingConfig, MattingModel
 
     reduced = ("ReduceMean", ["image"], ["mean"], {"keepdims": 0})
     nodes = {
@@ -233,7 +233,7 @@ def test_models_that_give_no_matte_are_refused_when_they_run(tmp_path, operation
 def test_matting_without_onnxruntime_names_the_extra(tmp_path):
     code = (
         "import sys; sys.modules['onnxruntime'] = None\n"
-        "from smplxpp.capture.matting import MattingModel\n"
+        "from smplxpp.capture.masks import MattingModel\n"
         "try: MattingModel('x.onnx')\n"
         "except ImportError as error: print(error)\n"
     )

@@ -14,9 +14,9 @@ from PIL import Image
 from pipelines.captures.detect_keypoints import standing_rows
 from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
-from smplxpp.capture.images import read_alpha, read_color, read_normals
-from smplxpp.capture.images import read_labels as read_label_image
 from smplxpp.capture.keypoint_files import read_keypoints
+from smplxpp.capture.views import read_alpha, read_color, read_normals
+from smplxpp.capture.views import read_labels as read_label_image
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz

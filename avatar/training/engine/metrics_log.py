@@ -10,8 +10,7 @@ from typing import Any
 
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_json
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import as_integer, as_object, as_text, jsonable, parse_json
 from smplxpp.core.files.paths import read_bytes
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from smplxpp.capture.check.check import CaptureCheck
 from smplxpp.capture.check.findings import AREAS, grouped
 from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.spread import spread
 
 SHOWN_MESSAGES, SHOWN_FRAMES = 12, 200

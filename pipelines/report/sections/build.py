@@ -54,7 +54,7 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_body
-from smplxpp.core.files.json_values import jsonable
+from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.template.template import Template
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.files import FileSeries, image_name
-from smplxpp.capture.readers.common import chosen_params
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, chosen_params
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.readers.common import chosen_params, numbered_images, pinhole, required
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, chosen_params, numbered_images, pinhole, required
 from smplxpp.capture.recording import Recording
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError

@@ -9,9 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.readers.colmap_model import ColmapImage, model_folder, read_model
-from smplxpp.capture.readers.common import chosen_params, pinhole
-from smplxpp.capture.readers.image_cameras import camera_names, number_at_end
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, camera_names, chosen_params, number_at_end, pinhole
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import path_inside

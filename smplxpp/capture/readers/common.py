@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.capture.files import FileSeries, image_name
-from smplxpp.capture.params import find_params
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.body import BodyModel
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name
 from smplxpp.capture.recording import ParamSource
+from smplxpp.capture.sources import find_params
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.image_file import image_size
 from smplxpp.core.files.json_file import as_integer, as_numbers
 from smplxpp.core.files.paths import check_name
+
+
+@dataclass(frozen=True, eq=False)
+class ReaderOptions:
+    """Choices of the user.
+
+    Attributes:
+        params: a parameter file or folder instead of the set's own.
+        protocol: name of the protocol whose files are read; None: without one.
+        body: the body model that the parameters are for; None: the open body.
+        person: whose keypoints are taken, where there are several people; None: the surest.
+    """
+
+    params: Path | None = None
+    protocol: str | None = None
+    body: BodyModel | None = None
+    person: int | None = None
+
 
 # Largest deviation of R R^T from the identity: calibrations are written with six digits and more.
 _ROTATION_TOLERANCE = 1e-3
@@ -128,3 +149,50 @@ def required(mapping: Any, key: str, *, source: str) -> Any:
         have = ", ".join(map(str, list(mapping)[:12])) if isinstance(mapping, Mapping) else type(mapping).__name__
         raise InputError(source, expected=f"an entry {key!r}", received=have or "nothing")
     return mapping[key]
+
+
+# Folders that say nothing of a camera, with nerfstudio's reductions (images_4).
+_IMAGE_FOLDER = re.compile(r"(?:images?|imgs?|rgbs?)(?:_\d+)?")
+# What an int64 holds.
+_NUMBERED = re.compile(r"(.*?)([0-9]{1,18})", re.DOTALL)
+
+
+def camera_names(paths: Iterable[PurePosixPath], *, subject: str) -> dict[PurePosixPath, str]:
+    """A name of its own for each path: its parts joined by `_`.
+
+    Left out are a first folder such as `images` and the suffix, as long as names stay different without.
+
+    Raises:
+        InputError: names that remain alike, or that no file can bear.
+    """
+    distinct = list(dict.fromkeys(paths))
+    for folder, suffix in ((False, False), (True, False), (True, True)):
+        names = {path: _spelled(path, folder=folder, suffix=suffix) for path in distinct}
+        if len(set(names.values())) == len(distinct):
+            return {path: check_name(name, subject=f"{subject}: image {path}") for path, name in names.items()}
+    alike = sorted(names, key=lambda path: names[path])
+    pair = next((a, b) for a, b in pairwise(alike) if names[a] == names[b])
+    raise InputError(
+        f"{subject}: images {pair[0]} and {pair[1]}",
+        expected="paths that give cameras different names",
+        received=f"{names[pair[0]]} for both",
+        remedy="rename one of the folders",
+    )
+
+
+def without_suffix(path: PurePosixPath) -> PurePosixPath:
+    """The path without the suffix of an image; a dot in a name alone is none."""
+    return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+
+
+def number_at_end(path: PurePosixPath) -> tuple[str, int] | None:
+    """What precedes the number at the end of an image's name, and the number; None where there is none."""
+    match = _NUMBERED.fullmatch(without_suffix(path).name)
+    return None if match is None else (match[1], int(match[2]))
+
+
+def _spelled(path: PurePosixPath, *, folder: bool, suffix: bool) -> str:
+    parts = (path if suffix else without_suffix(path)).parts
+    if not folder and len(parts) > 1 and _IMAGE_FOLDER.fullmatch(parts[0].lower()):
+        parts = parts[1:]
+    return "_".join(parts) or "camera"

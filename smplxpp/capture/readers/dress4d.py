@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from smplxpp.capture.files import FileSeries, image_name
-from smplxpp.capture.meshes import MeshFiles
-from smplxpp.capture.params import ParamFiles
-from smplxpp.capture.readers.common import chosen_params, pinhole, required, size_of_first_image
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, chosen_params, pinhole, required, size_of_first_image
 from smplxpp.capture.recording import Problem, Recording
+from smplxpp.capture.sources import MeshFiles, ParamFiles
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers

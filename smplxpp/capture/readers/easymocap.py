@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.keypoints import found_keypoints
-from smplxpp.capture.params import ParamFiles
 from smplxpp.capture.readers.common import (
+    ReaderOptions,
     chosen_params,
     first_folder,
     numbered_images,
@@ -19,10 +20,10 @@ from smplxpp.capture.readers.common import (
     required,
     size_of_first_image,
 )
-from smplxpp.capture.readers.opencv_yaml import read_opencv_yaml
-from smplxpp.capture.readers.options import ReaderOptions
 from smplxpp.capture.recording import Problem, Recording
+from smplxpp.capture.sources import ParamFiles
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import read_text
 from smplxpp.core.rotations import matrix_from_rotvec
 
 NAME = "easymocap"
@@ -105,3 +106,55 @@ def _params(root: Path, options: ReaderOptions) -> Any:
         if len(files):
             return ParamFiles(files, "easymocap", options.body)
     return None
+
+
+_KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
+
+
+def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | str]:
+    """Entries of a file that `cv2.FileStorage` writes: `!!opencv-matrix` as float64 arrays, lists of texts, numbers.
+
+    Raises:
+        InputError: missing, not text, or a matrix whose numbers do not fit its size.
+    """
+    lines = read_text(path).splitlines()
+    blocks: dict[str, list[str]] = {}
+    current: list[str] | None = None
+    for line in lines:
+        if match := _KEY.match(line):
+            current = blocks.setdefault(match["key"].strip().strip('"'), [])
+            current.append(match["value"].strip())
+        elif current is not None and line.strip() and not line.startswith(("%", "---")):
+            current.append(line.strip())
+    return {key: _value(key, block, path) for key, block in blocks.items()}
+
+
+def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | float | str:
+    if block[0].startswith("!!opencv-matrix"):
+        return _matrix(key, " ".join(block[1:]), path)
+    if len(block) == 1 and block[0] and not block[0].startswith("["):
+        try:
+            return float(block[0])
+        except ValueError:
+            return block[0].strip('"')
+    if block[0].startswith("["):
+        items = " ".join(block).strip("[] ").split(",")
+    else:
+        items = [line.removeprefix("-") for line in block if line.startswith("-")]
+    return [item.strip().strip('"') for item in items if item.strip()]
+
+
+def _matrix(key: str, text: str, path: Path) -> np.ndarray:
+    size = {name: re.search(rf"{name}:\s*(\d+)", text) for name in ("rows", "cols")}
+    data = re.search(r"data:\s*\[([^\]]*)\]", text)
+    rows, cols = size["rows"], size["cols"]
+    try:
+        if data is None or rows is None or cols is None:
+            raise ValueError("one of them is missing")
+        # OpenCV writes `.Nan` and `.Inf`.
+        values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in data[1].split(",")]
+        return np.array(values).reshape(int(rows[1]), int(cols[1]))
+    except ValueError as error:
+        raise InputError(
+            f"file {path}: {key}", expected="rows, cols and as many numbers in data", received=str(error)
+        ) from None

@@ -14,8 +14,6 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfolders
 from smplxpp.capture.keypoint_files import KeypointFiles
 from smplxpp.capture.keypoints import found_keypoints
-from smplxpp.capture.meshes import PosedTopology
-from smplxpp.capture.params import ParamFiles, find_params
 from smplxpp.capture.protocols import (
     ProtocolFiles,
     choose_protocol,
@@ -23,8 +21,9 @@ from smplxpp.capture.protocols import (
     read_description,
     read_protocols,
 )
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions
 from smplxpp.capture.recording import ParamSource, Problem, Recording
+from smplxpp.capture.sources import ParamFiles, PosedTopology, find_params
 from smplxpp.capture.splits import Splits
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError

@@ -12,10 +12,16 @@ import numpy as np
 from smplxpp.body import BodyModel, UpAxis, load_body
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries, subfolders
-from smplxpp.capture.params import ParamFiles
-from smplxpp.capture.readers.common import chosen_params, first_folder, numbered_images, pinhole, required
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import (
+    ReaderOptions,
+    chosen_params,
+    first_folder,
+    numbered_images,
+    pinhole,
+    required,
+)
 from smplxpp.capture.recording import ParamSource, Problem, Recording
+from smplxpp.capture.sources import ParamFiles
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers, read_json

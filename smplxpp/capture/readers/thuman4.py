@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from smplxpp.capture.readers.avatarrex import read_calibration
-from smplxpp.capture.readers.common import chosen_params, numbered_images
-from smplxpp.capture.readers.options import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, chosen_params, numbered_images
 from smplxpp.capture.recording import Recording
 
 NAME = "thuman4"

@@ -12,7 +12,7 @@ import numpy as np
 
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES
-from smplxpp.capture.readers.image_cameras import camera_names, number_at_end, without_suffix
+from smplxpp.capture.readers.common import camera_names, number_at_end, without_suffix
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.paths import path_inside
 

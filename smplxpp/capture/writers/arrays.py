@@ -12,6 +12,7 @@ from jaxtyping import Float
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 # Coordinates of truth meshes are rounded to this many metres (0.06 mm): they compress better.
@@ -49,3 +50,21 @@ def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
     arrays |= joined.offsets_by_row(rows)
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # numpy: the names might be `allow_pickle`
+
+
+# Pixels and confidences are rounded to these: far below what a detector knows, and files are half as large.
+_PIXEL, _CONFIDENCE = 2.0**-4, 2.0**-7
+
+
+def write_keypoints(path: Path, keypoints: Keypoints2D, extra: Mapping[str, np.ndarray] | None = None) -> None:
+    """Write one camera's keypoints, rounded to 1/16 pixel; a confidence above 0 stays above 0.
+
+    Args:
+        extra: arrays of other names that are written beside them; readers of keypoints pass over these.
+    """
+    points = np.round(keypoints.points / _PIXEL) * _PIXEL
+    confidence = np.round(keypoints.confidence / _CONFIDENCE) * _CONFIDENCE
+    confidence = np.where(keypoints.confidence > 0, np.maximum(confidence, _CONFIDENCE), 0.0)
+    table = np.concatenate([points, confidence[..., None]], axis=2).astype(np.float32)
+    names = np.array(keypoints.names, dtype=str)
+    save_compact(path, {"keypoints": table, "joint_names": names, "frames": keypoints.frames, **(extra or {})})

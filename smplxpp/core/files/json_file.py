@@ -1,4 +1,4 @@
-"""The one door for JSON: files and texts of bounded size and depth, and their values by type."""
+"""Read JSON files and texts of bounded size and depth, check their values by type, and turn values into JSON."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 import math
 import numbers
 import re
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -195,3 +197,22 @@ def _number_array(value: Any) -> np.ndarray | None:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # unequal lengths, integers beyond a float
         return None
+
+
+def jsonable(value: Any) -> Any:
+    """Configs, paths and numpy values as JSON values; non-finite numbers as null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return jsonable(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [jsonable(v) for v in (sorted(value, key=str) if isinstance(value, set | frozenset) else value)]
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, np.generic):
+        return jsonable(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return value.name
+    return value

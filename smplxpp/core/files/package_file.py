@@ -1,7 +1,11 @@
-"""The one door for packages: a zip of a few pieces, whose names and sizes are looked at before anything is unpacked."""
+"""Read and write zip packages: checked ones of named pieces, and small ones of texts in memory.
+
+The same content gives the same bytes. Names and sizes are checked before anything is unpacked.
+"""
 
 from __future__ import annotations
 
+import io
 import re
 import zipfile
 from collections.abc import Mapping
@@ -109,3 +113,20 @@ def _unpacked(package: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
         if left or stream.read(1):
             raise zipfile.BadZipFile(f"{entry.filename}: not the {entry.file_size} bytes that it says")
     return b"".join(parts)
+
+
+def zip_bytes(files: Mapping[str, str]) -> bytes:
+    """A compressed zip of texts by their names, in their order."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as package:
+        for name, text in files.items():
+            entry = zipfile.ZipInfo(name, _TIME)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            package.writestr(entry, text)
+    return stream.getvalue()
+
+
+def zip_member(data: bytes, name: str) -> str:
+    """A text of a zip that `zip_bytes` made; nothing bounds what it unfolds to, so it is not for files of others."""
+    with zipfile.ZipFile(io.BytesIO(data)) as package:
+        return package.read(name).decode()

@@ -15,9 +15,19 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.number_text import IS_SPACE, as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.mesh_files.obj_material import Material, read_materials
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices, warn
+from smplxpp.core.mesh_files.raw_mesh import (
+    IS_SPACE,
+    RawMesh,
+    as_bytes,
+    color_bytes,
+    count_between,
+    fan_triangles,
+    parse_numbers,
+    require_indices,
+    warn,
+    word_starts,
+)
 from smplxpp.core.mesh_files.texture import CLAMP, LOST, REPEAT, Pictures, mean_of_corners, sample_texture
 
 # Lines that are numbers are read together up to this many bytes, so that the work space stays small.

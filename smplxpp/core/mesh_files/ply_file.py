@@ -10,9 +10,17 @@ from jaxtyping import Float64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.number_text import as_bytes, count_between, parse_numbers, word_starts
 from smplxpp.core.mesh_files.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
+from smplxpp.core.mesh_files.raw_mesh import (
+    RawMesh,
+    as_bytes,
+    color_bytes,
+    count_between,
+    fan_triangles,
+    parse_numbers,
+    require_indices,
+    word_starts,
+)
 from smplxpp.core.mesh_files.texture import LOST, Pictures, mean_of_corners, sample_texture
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}

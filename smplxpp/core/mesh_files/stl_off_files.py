@@ -13,8 +13,16 @@ from jaxtyping import Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.number_text import as_bytes, count_between, parse_numbers, word_starts
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, fan_triangles, require_indices
+from smplxpp.core.mesh_files.raw_mesh import (
+    RawMesh,
+    as_bytes,
+    color_bytes,
+    count_between,
+    fan_triangles,
+    parse_numbers,
+    require_indices,
+    word_starts,
+)
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84

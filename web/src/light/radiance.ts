@@ -1,4 +1,4 @@
-/** Radiance pictures (.hdr), as `smplxpp.core.files.hdr_file` reads them. */
+/** Radiance pictures (.hdr), as `smplxpp.core.files.panorama_file` reads them. */
 
 import type { Panorama } from "./irradiance.ts";
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.hdr_file import read_radiance
+from smplxpp.core.files.panorama_file import read_radiance
 from tests.core.files.radiance import write_radiance
 
 
