@@ -25,7 +25,7 @@ import scipy.ndimage
 import tyro
 from jaxtyping import Bool, Float64, UInt8
 
-from benchmarks.accuracy.refinement import bare_and_under
+from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.people import captured, captured_names, people, variant
 from benchmarks.people.person_scan import PersonScan
 from benchmarks.support.results import store_results

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from scipy.spatial import cKDTree
 
-from benchmarks.accuracy.refinement import bare_and_under
+from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.accuracy.training import evaluation_conditions, evaluation_figures
 from benchmarks.support.results import RESULTS, store_results
 from pipelines.runs.artefacts import load_params_of_run, load_scan, load_scan_labels, load_stacked_params

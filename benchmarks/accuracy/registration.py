@@ -22,7 +22,6 @@ import numpy as np
 import tyro
 from jaxtyping import Bool
 
-from benchmarks.accuracy.refinement import bare_and_under
 from benchmarks.support.results import store_results
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.artefacts import load_stacked_params
@@ -172,6 +171,17 @@ def _off(body: BodyModel, params: BodyParams) -> BodyParams:
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     turned = matrix_from_rotvec(np.radians(OFF_DEGREES) * axes) @ state.rotations
     return replace(state, rotations=turned).to_params(body, fps=params.fps)
+
+
+def bare_and_under(root: Path, count: int) -> tuple[Bool[np.ndarray, " V"], Bool[np.ndarray, " V"]]:
+    """Body vertices of some visible face, and those of hidden faces alone."""
+    topology = np.load(root / "geometry" / "topology.npz")
+    faces, hidden = topology["faces"], topology["face_hidden"]
+    body = (faces < count).all(axis=1)
+    bare, covered = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    bare[faces[body & ~hidden]] = True
+    covered[faces[body & hidden]] = True
+    return bare, covered & ~bare
 
 
 if __name__ == "__main__":

@@ -25,8 +25,13 @@ from avatar.render import rasterize
 from avatar.render.native import STAGES, CameraCall, Workspace
 from avatar.render.reference import rasterize_reference
 from avatar.render.settings import RasterSettings
-from benchmarks.peers.rasterizer_peers import EarlierLibrary, build_opensplat, time_opensplat
-from benchmarks.support.gaussian_scene import BenchmarkScene, body_scene
+from benchmarks.peers.rasterizer_peers import (
+    BenchmarkScene,
+    EarlierLibrary,
+    body_scene,
+    build_opensplat,
+    time_opensplat,
+)
 from benchmarks.support.results import store_results
 from smplxpp import native
 
