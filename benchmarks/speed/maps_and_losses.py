@@ -2,8 +2,8 @@
 
     python -m benchmarks maps_and_losses
 
-SSIM: forward and backward with the gradient to the first image, float32, channels last; errors are against the reference
-in float64, as a share of the largest entry. Mesh maps: the open body, subdivided and simplified to 45k faces, fills the
+SSIM: forward and backward with the gradient to the first image, float32, channels last; errors against the reference
+in float64 as a share of the largest entry. Mesh maps: the open body, subdivided and simplified to 45k faces, fills the
 height of images of 512 and 1024 pixels, 9 interpolated channels. Rivals take turns in one process, on all of torch's
 threads.
 """
