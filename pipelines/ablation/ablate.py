@@ -1,4 +1,4 @@
-"""The ablation of a run: rows trained as ordinary stages in `RUN/ablation/`, measured, in one table."""
+"""Train the rows of an ablation as stages in `RUN/ablation/`, measure them, and write one table."""
 
 from __future__ import annotations
 
@@ -34,16 +34,18 @@ from smplxpp.core.files.json_file import jsonable
 
 RESULTS_FILE = "results.json"
 COLUMNS = 7
-"""Pictures beside each other in a sheet of rows: all of them in one line could be read by scrolling alone."""
+"""Pictures in a line of a sheet; all rows in one line would need scrolling."""
 
 
 @dataclass(frozen=True, eq=False)
 class AblationRun:
-    """How it runs; nothing in it changes a figure.
+    """How an ablation runs; no field changes a figure.
 
     Attributes:
-        command: in words, for `results.json`.
-        device: "cpu" or "cuda". max_seconds: of this call. force: train the rows' stages anew.
+        command: the command line, for `results.json`.
+        device: "cpu" or "cuda".
+        max_seconds: limit of this call.
+        force: train the rows' stages again.
         training: called with the name of a stage and its progress.
         measuring: called with the name of a row and the share of its frames that are measured.
     """
@@ -58,11 +60,13 @@ class AblationRun:
 
 @dataclass(frozen=True)
 class AblationOutcome:
-    """What there is after a call.
+    """Result of a call.
 
     Attributes:
-        folder: `RUN/ablation`. table: of the finished rows. results: as in `results.json`.
-        waiting: stages still to be trained, then rows still to be measured; none when all is finished.
+        folder: `RUN/ablation`.
+        table: figures of the finished rows.
+        results: content of `results.json`.
+        waiting: stages still to be trained, then rows still to be measured; empty when all are finished.
     """
 
     folder: Path
@@ -84,13 +88,14 @@ def ablate(
     config: EvaluationConfig,
     how: AblationRun | None = None,
 ) -> AblationOutcome:
-    """Train and measure rows on a capture with a run's template, as far as time allows; what stands is kept.
+    """Train and measure rows on a capture with a run's template, as far as time allows; finished stages are kept.
 
-    The full system comes first, whatever its place: most rows share its stages.
+    The full system comes first, because most rows share its stages.
 
     Raises:
         InputError: no template, or a capture that cannot be trained or measured on.
     """
+    # Open the capture and the metric once; all rows use the same frames, cameras and measuring protocol.
     how = how or AblationRun()
     scene = open_scene(run, inputs)
     config = _measured(config, scene.capture)
@@ -105,6 +110,7 @@ def ablate(
         training_frames=len(own.train_frames),
         training_cameras=len(own.train_cameras),
     )
+    # A row whose stages are not finished in time waits; its finished stages are kept for the next call.
     made: set[str] = set()
     found: dict[str, Any] = {}
     for name in sorted(rows, key=lambda name: name != "full"):
@@ -133,14 +139,14 @@ def ablate(
 
 
 def _train(trainer: Trainer, stage: ModelStage, how: AblationRun, made: set[str]) -> bool:
-    """Make a stage unless it stands; whether it is finished then. `made` holds those of this call."""
-    anew = how.force and stage.name not in made
-    if not anew and _stands(trainer, stage):
+    """Run a stage unless it is finished; return whether it is then. `made` holds the stages of this call."""
+    again = how.force and stage.name not in made
+    if not again and _stands(trainer, stage):
         return True
     if not trainer.seconds_left():
         return False
     made.add(stage.name)
-    return trainer.make(stage, force=anew).finished
+    return trainer.make(stage, force=again).finished
 
 
 def _stands(trainer: Trainer, stage: ModelStage) -> bool:
@@ -149,7 +155,7 @@ def _stands(trainer: Trainer, stage: ModelStage) -> bool:
 
 
 def _bar(how: AblationRun) -> Bar:
-    """The progress of a stage under its name alone."""
+    """Return a progress callback that uses a stage's name without its folder."""
 
     def bar(name: str, total: int) -> AbstractContextManager[Callable[[Progress], None]]:
         return nullcontext(lambda progress: how.training(Path(name).name, progress))
@@ -158,7 +164,7 @@ def _bar(how: AblationRun) -> Bar:
 
 
 def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:
-    """Novel views and novel poses where the capture holds any out; all that there is where it does not."""
+    """Restrict a protocol to novel views and novel poses if the capture holds some out; else keep every set."""
     splits = capture.splits
     if config.protocol.sets or not splits.novel_view_cameras:
         return config
@@ -167,7 +173,7 @@ def _measured(config: EvaluationConfig, capture: Capture) -> EvaluationConfig:
 
 
 def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiting: list[str]) -> AblationOutcome:
-    """Table, figures and strips of the finished rows."""
+    """Write table, figures and picture sheets of the finished rows."""
     table = ablation_table(result)
     rows = {
         name: {"title": one.row.title, "note": one.row.note, "figures": row_figures(one), "seconds": one.seconds}
@@ -192,7 +198,7 @@ def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiti
 
 
 def _write_sheets(folder: Path, result: AblationResult) -> None:
-    """A sheet a view: the photograph, then what each row shows, under their titles."""
+    """Write a sheet for each view: the photograph, then the picture of each row, with titles."""
     first = next(iter(result.rows))
     for path in sorted(result.rows[first].folder.glob("*.png")):
         pictures: list[np.ndarray] = []

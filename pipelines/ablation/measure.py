@@ -1,4 +1,4 @@
-"""A row of the ablation is measured: a stage whose model is what a player's file holds."""
+"""Measure a row of the ablation on the model that its player file holds, and put rows into a table."""
 
 from __future__ import annotations
 
@@ -39,11 +39,14 @@ TIMED = ("seconds_of_steps", "seconds_of_tracking", "seconds_of_pretraining")
 
 @dataclass(frozen=True)
 class RowResult:
-    """A row that was trained and measured.
+    """A trained and measured row.
 
     Attributes:
-        row: what it is. report: of its one model, named by the row's title. folder: of its pictures.
-        seconds: of training steps, over all stages that it took. iterations: likewise.
+        row: definition of the row.
+        report: figures of its one model, named by the row's title.
+        folder: folder of its pictures.
+        seconds: time of training steps, over all of its stages.
+        iterations: number of iterations, over all of its stages.
     """
 
     row: Row
@@ -54,7 +57,7 @@ class RowResult:
 
 
 def closure(stage: ModelStage) -> list[ModelStage]:
-    """A stage after all that it is made from, each once."""
+    """Return the stages that a stage is made from, each once, and the stage at the end."""
 
     def walk(one: ModelStage) -> Iterator[ModelStage]:
         for needed in one.needs.values():
@@ -67,7 +70,7 @@ def closure(stage: ModelStage) -> list[ModelStage]:
 def row_stage(
     trainer: Trainer, name: str, row: Row, model: ModelStage, config: EvaluationConfig, refined: Capture | None
 ) -> Stage:
-    """What decides the figures of a row whose model is trained; `refined`: the capture with refined held-out poses."""
+    """Return the stage of a trained row's figures; `refined` is the capture with refined held-out poses."""
     trained = trainer.path(model)
     record = trainer.found(model)
     assert record is not None
@@ -99,10 +102,11 @@ def measure_row(
     in_time: bool = True,
     progress: ProgressCallback = ignore_progress,
 ) -> RowResult | None:
-    """Measure a row unless it stands; None where it does not stand and there is no time left for it.
+    """Measure a row unless it is finished; None if it is not and no time is left.
 
     Args:
-        known: what is known of the inputs, for the report. in_time: whether there is time left.
+        known: protocol of the inputs, for the report.
+        in_time: whether there is time left.
     """
     again = refined_poses(trainer.run, trainer.scene.capture)
     stage = row_stage(trainer, name, row, model, config, again)
@@ -111,6 +115,7 @@ def measure_row(
         return None
 
     def work(folder: Path) -> StageOutput:
+        # Measure what a player would read, compression included, and not the model in memory.
         player = folder / PLAYER_FILE
         model.write_player(player, trainer.model(model))
         loaded = model.read_by(trainer, player)
@@ -123,6 +128,7 @@ def measure_row(
             progress=progress,
         )
         report = replace(evaluation.report, inputs=known)
+        # Where the run has refined held-out poses, novel poses are measured in them too.
         if again is not None and (held_out := of_held_out_poses(config, again)) is not None:
             there = clothed_sequence(_seeing(trainer, again), CLOTHED, simulated)
             refined = evaluate_models({row.title: shown}, there, held_out, progress=progress).report
@@ -137,7 +143,7 @@ def measure_row(
 
 
 def _seeing(trainer: Trainer, capture: Capture) -> Trainer:
-    """The same run, its capture with other poses."""
+    """Return a trainer of the same run whose capture has other poses."""
     scene = replace(trainer.scene, capture=capture)
     return Trainer(trainer.run, scene, trainer.options, trainer.together, scale=trainer.scale)
 
@@ -166,22 +172,22 @@ def _keep_pictures(folder: Path, evaluation: Evaluation) -> None:
 
 NOVEL_POSE = "novel_pose"
 REFINED = "refined."
-"""Begins the names of figures in held-out poses that were refined on training cameras."""
+"""Prefix of the figures in held-out poses that were refined on training cameras."""
 
 
 @dataclass(frozen=True)
 class AblationResult:
-    """Rows in their order.
+    """Finished rows of an ablation, in the order of the table.
 
     Attributes:
-        rows: by name, those that are finished.
+        rows: results by the row's name.
     """
 
     rows: dict[str, RowResult]
 
     @property
     def report(self) -> EvalReport:
-        """All rows' models in one."""
+        """Return one report with the models of all rows."""
         reports = [one.report for one in self.rows.values()]
         models = {title: model for report in reports for title, model in report.models.items()}
         alone = next((report.skinning_alone for report in reports if report.skinning_alone), {})
@@ -192,7 +198,8 @@ class AblationResult:
 
 
 def ablation_table(result: AblationResult) -> FigureTable:
-    """One line a row: novel views, novel poses, distances to the true surface, bytes and time of training."""
+    """Return a table of a line a row: novel views, novel poses, distances to the true surface, bytes, training time."""
+    # Columns only for the image sets that some row has; the order is that of the paper's tables.
     metric, capture = (result.report.metric or "", result.report.capture) if result.rows else ("", "")
     shown = [
         name
@@ -234,9 +241,9 @@ def _caption(result: AblationResult, capture: str) -> str:
 
 
 def row_figures(result: RowResult) -> dict[str, float | None]:
-    """Every mean figure of a row, see `summary_figures`; `minutes` and `iterations` of training.
+    """Return every mean figure of a row, see `summary_figures`, with `minutes` and `iterations` of training.
 
-    Those of views in refined poses begin with `REFINED`.
+    Names of figures in refined poses begin with `REFINED`.
     """
     figures = summary_figures(result.report.models[result.row.title])
     again = result.report.refined_poses.get(result.row.title)

@@ -1,4 +1,4 @@
-"""What the ablation's rows are, and the stages that make their models."""
+"""Define the rows of the ablation and the stages that make their models."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage
 from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
 
+# Settings of single rows: share of Gaussians with blend shapes and size limit (MB) of `pruned`, field vertices of
+# `control`, and the share of poses without codes in rows that need them (the lean presets' value).
 PRUNED_SHARE, PRUNED_MEGABYTES = 0.3, 20.0
 CONTROL_POINTS = 400
 NULL_SHARE = 0.2
@@ -32,11 +34,13 @@ NULL_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table.
+    """Definition of a line of the table.
 
     Attributes:
-        title: as tables have it. model: the stage that makes what is measured. note: what is different, in words.
-        null_code: every frame is shown as a new pose is.
+        title: title in tables.
+        model: stage that makes the measured model.
+        note: how it differs from the full system.
+        null_code: whether every frame is shown as a new pose.
     """
 
     title: str
@@ -67,7 +71,7 @@ OPTION_ROWS: Mapping[str, Row] = {
     "control": Row("control points", "control", f"the field on {CONTROL_POINTS} vertices, interpolated to the rest"),
     "ungated": Row("ungated", "ungated", "all blend shapes act on all Gaussians, as published"),
     "no-cloth": Row("w/o simulation", "no_cloth", "the field moves loose clothes in new poses too"),
-    "null-code": Row("null code", "null_code", "every frame shown as a new pose is, as online", null_code=True),
+    "null-code": Row("null code", "null_code", "every frame shown as a new pose, as online", null_code=True),
 }
 BASELINE_ROWS: Mapping[str, Row] = {
     "lbs": Row("LBS Gaussians", "lbs", "Gaussians on the template, which follows its joints alone; photographs"),
@@ -86,7 +90,7 @@ ROWS: Mapping[str, Row] = {name: row for group in ROW_GROUPS.values() for name, 
 
 
 def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
-    """Rows by their names and those of groups ("paper", "options", "all"), in the table's order.
+    """Return rows by their names and group names ("paper", "options", "all"), in the table's order.
 
     Raises:
         InputError: an unknown name, or none.
@@ -105,12 +109,13 @@ def ablation_rows(names: Sequence[str]) -> dict[str, Row]:
 
 
 def ablation_stages(preset: TrainingPreset, *, training_frames: int) -> dict[str, ModelStage]:
-    """Every stage that rows may need, by name; a preset decides all sizes and iterations.
+    """Return every stage that rows may need, by name; the preset gives all sizes and iterations.
 
-    Those of the full system may stand in the run already, made by `smplxpp train`.
+    Stages of the full system may be in the run already, from `smplxpp train`.
 
     Args:
-        training_frames: number of them, which decides how long the bake without a teacher trains.
+        preset: preset of the training.
+        training_frames: number of training frames, which determines the iterations of the bake without a teacher.
     """
     plan = _Plan(preset)
     plan.full_system(training_frames)
@@ -120,7 +125,7 @@ def ablation_stages(preset: TrainingPreset, *, training_frames: int) -> dict[str
 
 
 class _Plan:
-    """Stages by name, each made from those before it."""
+    """Collect stages by name, each made from earlier ones."""
 
     def __init__(self, preset: TrainingPreset) -> None:
         self.preset, self.student = preset, preset.student()
@@ -128,13 +133,13 @@ class _Plan:
 
     @property
     def teacher(self) -> TeacherStage:
-        """The full system's."""
+        """Return the teacher of the full system."""
         stage = self.stages["teacher"]
         assert isinstance(stage, TeacherStage)
         return stage
 
     def full_system(self, training_frames: int) -> None:
-        """The paper's rows."""
+        """Add the stages of the paper's rows."""
         preset = self.preset
         for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
             own = {} if prefix else {"fit": (FIT_STAGE,), "teacher": (TEACHER_STAGE,), "bake": (BAKE_STAGE,)}
@@ -171,7 +176,7 @@ class _Plan:
         self._compensate("no_teacher", "no_teacher_bake", teacher=None)
 
     def options(self) -> None:
-        """Variants of ours."""
+        """Add the stages of our own variants."""
         preset, teacher = self.preset, self.preset.teacher
         if teacher.track is None:
             self.stages["untracked"] = self.stages["full"]
@@ -201,7 +206,7 @@ class _Plan:
             self._compensate("null_code", "null_code_bake", null_share=NULL_SHARE)
 
     def baselines(self) -> None:
-        """Avatars of other kinds: as many steps on photographs as the student's bake and compensation together."""
+        """Add avatars of other kinds, with as many steps on photographs as the student's bake and compensation."""
         preset = self.preset
         steps = preset.bake.iterations + preset.compensate.iterations
         own = {f.name: getattr(preset.bake, f.name) for f in fields(PhotographConfig)}
@@ -209,7 +214,7 @@ class _Plan:
         fixed, skinned = StudentConfig(field=None), replace(preset.bake, iterations=steps)
         self._bake("lbs", "gaussians", student=fixed, config=skinned)
         self._bake("lbs_naked", "naked_gaussians", ground=NAKED, student=fixed, config=skinned)
-        # As fine as half the teacher's maps: charts of an atlas waste less of them than two views of a body.
+        # Half the size of the teacher's maps, because charts of an atlas waste less of it than two views of a body.
         unet = UVUNetConfig(size=preset.networks.teacher.out_size // 2)
         mesh = TexturedMeshConfig(preset.networks.field, preset.fit.sampling)
         for name, ground, model, config in (
@@ -243,7 +248,7 @@ class _Plan:
         elsewhere: tuple[str, ...] = (),
     ) -> None:
         student = student or self.student
-        # Loose clothes are simulated in the field's place, and found on a surface that a teacher followed.
+        # Loose clothes are simulated in the place of the field, and found on the surface that a teacher has tracked.
         simulates = ground == CLOTHED and source == "teacher" and student.field is not None
         self._add(
             BakeStage(
@@ -288,15 +293,15 @@ class _Plan:
 
 
 def _folder(name: str) -> str:
-    """The folder of a stage that an ablation makes."""
+    """Return the folder of a stage of the ablation."""
     return f"{ABLATION}/{name}"
 
 
 def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
-    """Steps of the bake from photographs alone.
+    """Return the number of steps of the bake from photographs alone.
 
-    Where the teacher's stage follows the surface, and rows with a teacher so compare with photographs in three
-    trainings, as many views as those three together; otherwise the bake's own, as in the paper.
+    Where the teacher's stage tracks the surface, rows with a teacher see photographs in three trainings; the bake
+    without a teacher sees as many views as those three. Otherwise it has its own number of steps, as in the paper.
     """
     teacher, bake = preset.teacher, preset.bake
     if teacher.track is None:

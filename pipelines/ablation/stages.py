@@ -1,4 +1,4 @@
-"""Stages that only an ablation has: students without most of their blend shapes, and avatars of other kinds."""
+"""Run the stages that only an ablation has: students with pruned blend shapes, and avatars of other kinds."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ from smplxpp.core.files.atomic import atomic_write_bytes
 
 @dataclass(frozen=True, kw_only=True)
 class PruneConfig:
-    """What is left of a student's blend shapes.
+    """How a student's blend shapes are pruned.
 
     Attributes:
-        keep: share of the Gaussians that keep theirs, or less: the compact file has at most `max_bytes`.
-        seed, iterations: nothing is drawn, and it is done in one.
+        keep: share of the Gaussians that keep their blend shapes, less if `max_bytes` requires it.
+        max_bytes: limit of the compact file's size.
+        seed: unused, because nothing is random; stages ask for it.
+        iterations: one, because pruning is a single step.
     """
 
     keep: float
@@ -43,7 +45,7 @@ class PruneConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PrunedStage(ModelStage):
-    """A student whose least important Gaussians lost their blend shapes.
+    """A student whose least important Gaussians have lost their blend shapes.
 
     Attributes:
         student: the stage that trains it.
@@ -77,6 +79,8 @@ class BaselineStage(ModelStage):
 
     Attributes:
         gaussians: the fit that it starts from.
+        model: configuration of the kind of avatar.
+        config: configuration of the training.
     """
 
     file = "baseline.safetensors"
@@ -125,7 +129,7 @@ class BaselineStage(ModelStage):
 
 
 def read_baseline(path: Path, model: Baseline) -> None:
-    """Give a baseline the state that `write_baseline` wrote; what is in half precision is cast.
+    """Load the state that `write_baseline` wrote into a baseline; half precision is cast.
 
     Raises:
         InputError: a missing or damaged file, tensors that are not the model's, or not finite.
@@ -133,7 +137,7 @@ def read_baseline(path: Path, model: Baseline) -> None:
     subject = f"baseline {path}"
     tensors = open_tensor_file(path, subject=subject, header=None).tensors()
     own: Mapping[str, Tensor] = model.state_dict()
-    # A player's file has integers for bools.
+    # A player's file stores bools as integers.
     given = {
         name: value.bool() if name in own and own[name].dtype == torch.bool else value
         for name, value in tensors.items()
@@ -144,11 +148,11 @@ def read_baseline(path: Path, model: Baseline) -> None:
 
 
 def write_baseline(path: Path, model: Baseline, *, compact: bool = False) -> None:
-    """Write the state of a baseline; `compact`: in half precision, as a player needs it."""
+    """Write the state of a baseline, in half precision with `compact`, as players take it."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     atomic_write_bytes(path, save({name: _halved(v) for name, v in tensors.items()} if compact else tensors))
 
 
 def _halved(value: Tensor) -> Tensor:
-    """The value as a player's file has it."""
+    """Return a value as a player's file stores it."""
     return value.half() if value.is_floating_point() else value.int()

@@ -112,7 +112,7 @@ def convert_capture(
         left_out += _write_rest(capture, source, out, (cameras, frames), config)
     except OSError as error:
         error.add_note(
-            f"{out} holds {len(outcomes)} of {len(views)} views and is no capture yet: the same command goes on there."
+            f"{out} holds {len(outcomes)} of {len(views)} views and is no capture yet: the same command continues it."
         )
         raise
     copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
-from pipelines.runs.stage import goes_on
+from pipelines.runs.stage import how_to_continue
 from smplxpp.core.errors import InputError, ProgressCallback
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Ablate:
                 ),
             )
         if not self.json:
-            _print(outcome, goes_on(force=self.force))
+            _print(outcome, how_to_continue(force=self.force))
         return outcome.results
 
     def command(self) -> str:
@@ -174,10 +174,10 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
         yield training, measuring
 
 
-def _print(outcome: AblationOutcome, goes_on: str) -> None:
+def _print(outcome: AblationOutcome, how_to_continue: str) -> None:
     console = Console()
     if outcome.results["rows"]:
         console.print(outcome.table.text(), soft_wrap=True, highlight=False)
     if outcome.waiting:
-        console.print(f"still to do: {', '.join(outcome.waiting)}; {goes_on}", soft_wrap=True)
+        console.print(f"still to do: {', '.join(outcome.waiting)}; {how_to_continue}", soft_wrap=True)
     console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False, markup=False)

@@ -88,7 +88,7 @@ class CaptureConvertCommand:
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the capture, in any layout of docs/captures.md."""
     out: Path
-    """New folder to write; the same command goes on with one that was interrupted."""
+    """New folder to write; the same command continues with one that was interrupted."""
     layout: Literal["simple", "actorshq"] = "simple"
     """Ours, or ActorsHQ's: images on black, masks, cameras, parameters."""
     format: FormatName = "auto"

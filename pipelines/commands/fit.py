@@ -17,7 +17,7 @@ from rich.table import Table
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import shared_progress, training_progress
 from pipelines.runs.artefacts import values_of
-from pipelines.runs.stage import StageRecord, goes_on
+from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _print(record: StageRecord, report: Path, *, force: bool) -> None:
             add(label, numbers["mean"][which], style="bold" if which == "held_out" else "dim")
     console.print(table)
     done, total = numbers["iterations_done"], numbers["iterations"]
-    state = "finished" if numbers["finished"] else f"stopped; {goes_on(force=force)}"
+    state = "finished" if numbers["finished"] else f"stopped; {how_to_continue(force=force)}"
     console.print(
         f"{numbers['gaussians']:,} Gaussians, {done:,} of {total:,} iterations in {numbers['seconds_of_steps']:.1f} s "
         f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}",

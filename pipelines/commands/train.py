@@ -19,7 +19,7 @@ from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath,
 from pipelines.commands.progress import training_progress
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import FIT_STAGE
-from pipelines.runs.stage import StageRecord, goes_on
+from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _STEPPED = ("fit", "teacher", "bake", "compensate")
 
 @dataclass(frozen=True)
 class Train:
-    """Options of `smplxpp train`. It trains what a run lacks; the same command goes on with what was interrupted."""
+    """Options of `smplxpp train`. It trains what a run lacks; the same command continues with what was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
     """Folder that `smplxpp build` wrote; 66_refine, 70_fit, 80_teacher, 83_cloth, 85_bake and 90_compensate go into
@@ -301,7 +301,7 @@ def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:
         else (numbers.get("novel_view", {}))
     )
     poses = numbers.get("novel_pose", {})
-    state = "" if numbers["finished"] else f"stopped: {goes_on(force=force)}"
+    state = "" if numbers["finished"] else f"stopped: {how_to_continue(force=force)}"
     return (
         stage,
         f"{numbers['iterations_done']:,} of {numbers['iterations']:,}",

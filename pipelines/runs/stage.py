@@ -1,17 +1,17 @@
-"""The one resumable stage: skipped while it stands, resumed where it was, made anew, or refused; recorded once.
+"""Run a stage of a run folder unless it is finished: skip, resume, run or refuse it, and record it once.
 
-A stage lies in `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so that a
-kill at any moment loses at most the stage under way. A stage that takes long keeps its state in `RUN/<NN_stage>_work/`,
-which goes when it is finished.
+A stage is the folder `RUN/<NN_stage>/` with a `manifest.json`. It is written to a temporary folder and renamed, so that
+a kill at any moment loses at most the running stage. A long stage keeps its state in `RUN/<NN_stage>_work/`, which is
+deleted when the stage is finished.
 
-| what lies there | what is done |
+| state of the folder | action |
 |---|---|
-| the stage with its key, finished, its files unchanged | skipped |
-| the stage with its key, stopped before its end, or state with its key | resumed |
-| state with another key | refused: hours may lie in it, only the user can say that they may go |
-| anything else | made anew |
+| the stage with its key, finished, its files unchanged | skip |
+| the stage with its key, stopped before its end, or state with its key | resume |
+| state with another key | refuse, because it may hold hours of work and only the user may delete it |
+| anything else | run |
 
-The key is a digest of configuration, inputs, code (`pipelines.runs.code`), versions of libraries.
+The key is a digest of configuration, inputs, code (`pipelines.runs.code`) and versions of libraries.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ from smplxpp.core.files.json_file import jsonable
 
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3
+"""Differences of each kind that an error lists."""
 _STATE = ("*.safetensors", "*.npz")
-"""Files of a work folder in which hours may lie."""
+"""Files of a work folder that count as work done."""
 Decision = Literal["skip", "resume", "redo"]
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stage:
-    """What decides a stage.
+    """Everything that determines the result of a stage.
 
     Attributes:
-        name: its folder in the run, `85_bake` or `ablation/full`; not part of the key.
+        name: folder in the run, `85_bake` or `ablation/full`; not part of the key.
         config: dataclass or mapping of every choice.
         inputs: SHA-256 by name of everything that it reads.
-        code: modules that do its work; what they import belongs to them.
-        libraries: whose versions decide what comes out.
-        seed: of what is drawn.
-        resumable: it keeps state in a work folder.
-        sources: files of the run by the names that `inputs` has for them, where those differ.
+        code: modules that do its work; their imports are followed.
+        libraries: libraries whose versions affect the result.
+        seed: seed of its random numbers.
+        resumable: whether it keeps state in a work folder.
+        sources: files of the run by their names in `inputs`, where those differ.
     """
 
     name: str
@@ -68,7 +69,7 @@ class Stage:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """All that the key is made of, as JSON values."""
+        """Return the contents of the key as JSON values."""
         return {
             "schema": SCHEMA,
             "config": jsonable(self.config),
@@ -79,24 +80,24 @@ class Stage:
 
     @cached_property
     def key(self) -> str:
-        """The hash by which the stage is recognised."""
+        """Return the hash that identifies the stage."""
         return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
 
     @property
     def recorded(self) -> dict[str, Any]:
-        """`identity` with the names of files in the place of those of inputs, as manifests have it."""
+        """Return `identity` with file names in the place of input names, as manifests hold it."""
         inputs = {self.sources.get(name, name): digest for name, digest in self.inputs.items()}
         return {**self.identity, "inputs": inputs}
 
     @property
     def work_name(self) -> str:
-        """The folder of the state of a stage under way."""
+        """Return the name of the folder with the state of a running stage."""
         return f"{self.name}_work"
 
 
 @dataclass
 class StageOutput:
-    """What a stage's function hands back beside the files it wrote into its folder."""
+    """Checks and numbers that a stage's function returns beside its files."""
 
     checks: list[Check] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
@@ -104,7 +105,13 @@ class StageOutput:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage that stands: its folder and manifest, and whether this call ran it."""
+    """A stage in its folder.
+
+    Attributes:
+        folder: folder of the stage.
+        manifest: content of its `manifest.json`.
+        ran: whether this call ran it.
+    """
 
     folder: Path
     manifest: dict[str, Any]
@@ -112,27 +119,27 @@ class StageRecord:
 
     @property
     def finished(self) -> bool:
-        """False for a stage that a limit of time stopped."""
+        """Return False for a stage that a limit of time stopped."""
         return is_finished(self.manifest)
 
 
 def is_finished(manifest: Mapping[str, Any]) -> bool:
-    """Whether a stage came to its end; one that says nothing of it did."""
+    """Return whether a stage came to its end; manifests without this entry did."""
     return bool(manifest.get("numbers", {}).get("finished", True))
 
 
-def goes_on(*, force: bool) -> str:
-    """What to say of a stage that a limit of time stopped."""
-    return "the same command without --force goes on" if force else "the same command goes on"
+def how_to_continue(*, force: bool) -> str:
+    """Return the hint for a stage that a limit of time stopped."""
+    return "the same command without --force continues" if force else "the same command continues"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a stage, or None where there is none of this version that can be read."""
+    """Return the manifest of a stage, or None if none of this version can be read."""
     return _record(Path(folder) / MANIFEST)
 
 
 def standing(folder: Path, stage: Stage) -> StageRecord | None:
-    """What lies in a folder, if it is this stage with its files unchanged; it may be unfinished."""
+    """Return the stage in a folder if its key and files are unchanged, else None; it may be unfinished."""
     manifest = read_manifest(folder)
     if manifest is None or manifest.get("key") != stage.key or not _intact(folder, manifest):
         return None
@@ -140,10 +147,10 @@ def standing(folder: Path, stage: Stage) -> StageRecord | None:
 
 
 def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
-    """What `run_stage` will do.
+    """Return the action that `run_stage` will take.
 
     Raises:
-        InputError: the state of a stage under way is of another configuration, other inputs or other code.
+        InputError: the state of a running stage has another configuration, other inputs or other code.
     """
     if force:
         return "redo"
@@ -152,7 +159,8 @@ def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
     record = _record(work / STATE_RECORD) or {}
     own = record.get("key") == stage.key
     begun = any(any(work.rglob(pattern)) for pattern in _STATE)
-    if own and begun and record.get("forced"):  # a training anew that was killed goes on, whatever it is to replace
+    # A forced training that was killed resumes, although the finished stage that it replaces is still there.
+    if own and begun and record.get("forced"):
         return "resume"
     if found is not None and found.finished:
         return "skip"
@@ -163,19 +171,21 @@ def decide(run: Path, stage: Stage, *, force: bool = False) -> Decision:
             f"state of {stage.name} in {work}",
             expected="these options, inputs and code",
             received=f"another one's: {differences(record, stage)}",
-            remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
+            remedy="give the options that it was made with, or take another run folder; to start again, delete it "
             "(--force does)",
         )
     return "resume"
 
 
 def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, force: bool = False) -> StageRecord:
-    """Run `work(folder)` and keep its files as `run/name`, unless the stage already stands.
+    """Run `work(folder)` and keep its files as `run/name`, unless the stage is finished.
 
     Args:
-        work: writes its files into the folder it is given and returns checks and numbers. A resumable stage finds its
-            state in `run/work_name`.
-        force: run even if the stage stands; state of one under way goes.
+        run: folder of the run.
+        stage: everything that determines the result.
+        work: writes files into the given folder and returns checks and numbers. A resumable stage finds its state in
+            `run/work_name`.
+        force: run even a finished stage, and delete the state of a running one.
 
     Raises:
         InputError: see `decide`.
@@ -184,7 +194,7 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
     folder, state = run / stage.name, run / stage.work_name
     decision = decide(run, stage, force=force)
     if decision == "skip":
-        log.info("%s: stands, skipped", stage.name)
+        log.info("%s: finished, skipped", stage.name)
         if (_record(state / STATE_RECORD) or {}).get("key") == stage.key:
             shutil.rmtree(state, ignore_errors=True)
         elif state.is_dir():
@@ -192,12 +202,14 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
         return StageRecord(folder, read_manifest(folder) or {}, ran=False)
     if decision == "redo":
         shutil.rmtree(state, ignore_errors=True)
+    # The record of the state is written before the work, so that a killed stage can be told from another one's.
     if stage.resumable:
-        _tell_replaced(folder, stage)
+        _warn_of_replacement(folder, stage)
         forced = force or bool((_record(state / STATE_RECORD) or {}).get("forced"))
         state.mkdir(parents=True, exist_ok=True)
         record = {"key": stage.key, "forced": forced, **stage.recorded}
         atomic_write_text(state / STATE_RECORD, json.dumps(record, indent=1))
+    # The folder appears whole, with the manifest as its last file.
     begin = time.perf_counter()
     with atomic_folder(folder) as temporary:
         output = work(temporary)
@@ -209,17 +221,17 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
     return StageRecord(folder, manifest, ran=True)
 
 
-def _tell_replaced(folder: Path, stage: Stage) -> None:
-    """Log what a finished training differs in that this one will take the place of."""
+def _warn_of_replacement(folder: Path, stage: Stage) -> None:
+    """Log how a finished training that this one will replace differs from it."""
     old = read_manifest(folder)
     if old is not None and is_finished(old) and old.get("key") != stage.key:
-        log.warning("%s is trained anew and replaces one made otherwise: %s", stage.name, differences(old, stage))
+        log.warning("%s is trained again and replaces a different one: %s", stage.name, differences(old, stage))
 
 
 def require_stage(
     run: Path, name: str, *, remedy: str = "run the build without --from-stage, or from an earlier stage"
 ) -> StageRecord:
-    """A stage that must already be there (after `--from`).
+    """Return a stage that must already be finished.
 
     Raises:
         InputError: the stage is missing or its files have changed.
@@ -237,21 +249,21 @@ def require_stage(
 
 
 def differences(record: Mapping[str, Any], stage: Stage) -> str:
-    """What a record differs in from a stage, in words: options with both values, inputs, modules, libraries by name."""
-    words = []
+    """Describe how a record differs from a stage: options with both values; inputs, modules and libraries by name."""
+    notes = []
     for part in ("config", "inputs", "code", "versions"):
         old, new = (_leaves(one.get(part, {})) for one in (record, stage.recorded))
         changed = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
         for name in changed[:DIFFERENCES_SHOWN]:
             values = f" was {old.get(name)}, is {new.get(name)}" if part in ("config", "versions") else ""
-            words.append(f"{part} {name}{values}")
+            notes.append(f"{part} {name}{values}")
         if len(changed) > DIFFERENCES_SHOWN:
-            words.append(f"{len(changed) - DIFFERENCES_SHOWN} more of {part}")
-    return "; ".join(words) or "its record is missing"
+            notes.append(f"{len(changed) - DIFFERENCES_SHOWN} more of {part}")
+    return "; ".join(notes) or "its record is missing"
 
 
 def _leaves(value: Any, name: str = "") -> dict[str, Any]:
-    """The values of nested mappings by their dotted names."""
+    """Return the values of nested mappings by their dotted names."""
     if isinstance(value, Mapping) and value:
         return {k: v for key, one in value.items() for k, v in _leaves(one, f"{name}.{key}" if name else key).items()}
     return {name: value}

@@ -182,7 +182,7 @@ def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap
         gates.ITERATIONS.check(
             "iterations done",
             done.iteration / done.iterations,
-            explanation="below 1: the limit of time ended it; the same command goes on",
+            explanation="below 1: the limit of time ended it; the same command continues",
         ),
     ]
     numbers = {

@@ -157,7 +157,7 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
         gates.ITERATIONS.check(
             "iterations done",
             done,
-            explanation="below 1: the limit of time ended it; the same command goes on",
+            explanation="below 1: the limit of time ended it; the same command continues",
         )
     )
     return checks

@@ -102,7 +102,7 @@ def test_time_that_runs_out_is_told_and_the_same_command_goes_on(tmp_path, captu
     run = write_moving_run(tmp_path / "run")
     assert ablate(run, capture, "--max-minutes", "1e-6") == 0
     assert (
-        "still to do: gaussians, teacher, cloth, bake, lbs, no-gaussians; the same command goes on"
+        "still to do: gaussians, teacher, cloth, bake, lbs, no-gaussians; the same command continues"
         in capsys.readouterr().out
     )
     assert json.loads((run / "ablation" / "results.json").read_text())["rows"] == {}

@@ -289,7 +289,9 @@ def test_a_disk_that_fills_is_told_with_what_there_is_and_the_conversion_goes_on
     with file_size_limit(sizes[-1] - 1):
         assert main(command) == 2
     error = json.loads(capsys.readouterr().out)["error"]["message"]
-    assert "File too large" in error and str(tmp_path / "new" / "rgbs") in error and "the same command goes on" in error
+    assert (
+        "File too large" in error and str(tmp_path / "new" / "rgbs") in error and "the same command continues" in error
+    )
     assert not (tmp_path / "new" / "cameras.json").exists() and not list((tmp_path / "new").rglob(".*"))
     assert main(command) == 0
     assert open_capture(tmp_path / "new").views() == open_capture(rig).views()

@@ -197,7 +197,7 @@ def test_what_a_finished_training_is_replaced_for_is_told(tmp_path, caplog):
     Training(tmp_path)()
     assert "replaces" not in caplog.text
     Training(tmp_path, config={"lr": 0.2})()
-    assert "replaces one made otherwise: config lr was 0.1, is 0.2" in caplog.text
+    assert "replaces a different one: config lr was 0.1, is 0.2" in caplog.text
 
 
 def test_pipes_are_neither_digested_nor_waited_for(tmp_path):

@@ -91,7 +91,7 @@ def training_section(record: StageRecord) -> Section:
 
 
 def _how(numbers: Mapping[str, Any]) -> str:
-    stopped = "" if numbers["finished"] else " The limit of time ended it; the same command goes on."
+    stopped = "" if numbers["finished"] else " The limit of time ended it; the same command continues."
     memory = ", ".join(
         f"{size / 1e9:.1f} GB {where}"
         for where, size in (
