@@ -13,12 +13,13 @@ from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import StudentConfig
+from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shapes
 from avatar.training.student.bake import BakeConfig
 from pipelines.ablation.stages import BaselineStage, PruneConfig, PrunedStage
 from pipelines.runs.layout import ABLATION, BAKE_STAGE, CLOTH_STAGE, COMPENSATE_STAGE, FIT_STAGE, TEACHER_STAGE
 from pipelines.stages.bake import BakeStage
-from pipelines.stages.cloth import ClothConfig, ClothStage
+from pipelines.stages.cloth import ClothStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
 from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage

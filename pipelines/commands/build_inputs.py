@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.runs.folders import same_place
 from pipelines.runs.layout import REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import MOST_PHOTOGRAPHS, BuildInputs
@@ -17,6 +16,7 @@ from pipelines.stages.said_of_inputs import TRACKED, SaidOfInputs
 from smplxpp.capture import ReferenceFrame, find_reference
 from smplxpp.capture.protocols import choose_protocol, read_description
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import same_place
 from smplxpp.core.spread import spread
 
 if TYPE_CHECKING:

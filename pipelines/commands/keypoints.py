@@ -97,9 +97,10 @@ class KeypointsDetect:
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import shared_progress
         from pipelines.figures import encode_jpeg, encode_png
-        from pipelines.runs.folders import keep_out_of_capture, same_place
+        from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.capture import open_capture
         from smplxpp.core.files.atomic import atomic_write_bytes
+        from smplxpp.core.files.paths import same_place
         from smplxpp.detect import load_detector
 
         if not same_place(self.out, self.capture / "keypoints"):

@@ -44,8 +44,9 @@ class CaptureMasks:
         from pipelines.captures.masks import write_masks
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import shared_progress
-        from pipelines.runs.folders import keep_out_of_capture, same_place
+        from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.capture import open_capture
+        from smplxpp.core.files.paths import same_place
 
         if not same_place(self.out, self.capture / "masks"):
             keep_out_of_capture(self.out, self.capture)

@@ -7,7 +7,6 @@ import math
 import os
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,13 +22,11 @@ from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
-    from avatar.training.presets import TrainingPreset
-    from pipelines.stages.train import TrainConfig
+    from avatar.training.recipe import TrainConfig
 
 log = logging.getLogger(__name__)
-STAGES = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
-# Those that take steps, whose number options change.
-_STEPPED = ("fit", "teacher", "bake", "compensate")
+# As `avatar.training.recipe` has them, which would pull torch into `smplxpp train --help`.
+STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
 
 
 @dataclass(frozen=True)
@@ -120,50 +117,39 @@ class Train:
             logging.disable(logging.WARNING)  # the first process says it
         from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
-        from avatar.training.refinement.config import RefineConfig
+        from avatar.training.recipe import with_batch
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.models import TrainOptions
         from pipelines.stages.refine import wants_refinement
         from pipelines.stages.scene import TrainInputs, open_scene
-        from pipelines.stages.train import train, with_batch
+        from pipelines.stages.train import train
 
         keep_out_of_capture(self.run_folder, self.capture, subject="--run")
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
-        if not self.max_minutes > 0:
-            raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
-        config = self.config()
+        config, steps = self.config(), self.steps()
+        recipe = config.recipe(self.preset, cloth=self.cloth)
         with join_processes(choose_device(self.device)) as together:
-            config = replace(config, preset=with_batch(config.preset, least=together.world_size))
+            # Every process needs a pose of each step.
+            recipe = replace(recipe, preset=with_batch(recipe.preset, least=together.world_size))
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
-            refinement = RefineConfig(seed=self.seed, cameras=self.refine_cameras)
-            if self.refine_cameras and not first:
-                raise InputError(
-                    "option refine-cameras",
-                    expected="poses that are refined too",
-                    received="parameters that stand as they are",
-                    remedy="add --refine-poses on",
-                )
-            config = replace(config, refine=refinement if first else None)
-            again = first and "refine" in self.stages()
-            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not again))
+            recipe = replace(recipe, refine=config.refinement(wanted=first))
+            refines = first and "refine" in steps
+            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not refines))
             held_out = bool(scene.capture.splits.novel_view_cameras)
 
             def bar(name: str, total: int) -> AbstractContextManager:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
             options = TrainOptions(
-                max_seconds=60.0 * self.max_minutes,
-                force=self.force,
-                tensorboard=self.tensorboard,
-                bar=bar,
+                max_seconds=60.0 * self.max_minutes, force=self.force, tensorboard=self.tensorboard, bar=bar
             )
-            records = train(self.run_folder, inputs, scene, config, options, together, steps=self.stages())
+            records = train(self.run_folder, inputs, scene, recipe, options, together, steps=steps)
             if not together.first:
                 return None
         return self._finish(records)
 
-    def stages(self) -> tuple[str, ...]:
-        """Those to train, in order.
+    def steps(self) -> tuple[str, ...]:
+        """Return the steps to train, in order.
 
         Raises:
             InputError: options that exclude each other.
@@ -182,43 +168,32 @@ class Train:
                 )
         if self.stage is not None:
             return (self.stage,)
-        return STAGES[: STAGES.index(self.until) + 1]
+        return STEPS[: STEPS.index(self.until) + 1]
 
     def config(self) -> TrainConfig:
-        """The preset with the options' changes.
+        """Return the options as `avatar.train` takes them.
 
         Raises:
-            InputError: numbers out of range. MissingExtraError: a perceptual metric that is not installed.
+            InputError: numbers out of range.
         """
-        from avatar.training.presets import training_preset
-        from pipelines.stages.cloth import ClothConfig
-        from pipelines.stages.train import TrainConfig, with_batch, with_perceptual
+        from avatar.training.recipe import TrainConfig
 
-        given = {stage: getattr(self, f"{stage}_iterations") for stage in _STEPPED}
-        for name, value, least in (
-            ("gaussians", self.gaussians, 1),
-            ("batch", self.batch, 1),
-            ("seed", self.seed, 0),
-            ("max-megabytes", self.max_megabytes, 0),
-            *((f"{stage}-iterations", value, 1) for stage, value in given.items()),
-        ):
-            if value is not None and not value >= least:
-                raise InputError(f"option {name}", expected=f"a number, at least {least}", received=f"{value:g}")
-        share = 1.0 if self.iterations_share is None else self.iterations_share
-        if not 0.0 < share < math.inf:
-            raise InputError("option iterations-share", expected="a number above 0", received=f"{share:g}")
-        preset = _changed(training_preset(self.preset).with_seed(self.seed).shortened(share), given, self.gaussians)
-        if self.batch is not None:
-            preset = with_batch(preset, self.batch)
-        if self.perceptual in ("lpips", "st-lpips"):
-            preset = with_perceptual(preset)
+        given = {step: getattr(self, f"{step}_iterations") for step in ("fit", "teacher", "bake", "compensate")}
         return TrainConfig(
-            preset=preset,
-            teacher=not self.no_teacher,
-            perceptual=_perceptual(self.perceptual, preset),
+            refine_cameras=self.refine_cameras,
+            max_minutes=self.max_minutes,
+            iterations_share=1.0 if self.iterations_share is None else self.iterations_share,
+            iterations={step: count for step, count in given.items() if count is not None},
+            batch=self.batch,
+            gaussians=self.gaussians,
             blend_shapes=self.blend_shapes,
             max_megabytes=self.max_megabytes,
-            cloth=None if self.cloth == "none" else ClothConfig(parts=self.loose_parts or None),
+            teacher=not self.no_teacher,
+            loose_parts=self.loose_parts,
+            perceptual=self.perceptual,
+            seed=self.seed,
+            force=self.force,
+            tensorboard=self.tensorboard,
         )
 
     def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:
@@ -234,46 +209,9 @@ class Train:
             name: {**record.manifest["numbers"], "ran": record.ran, "checks": record.manifest["checks"]}
             for name, record in records.items()
         }
-        last = self.stages()[-1]
+        last = self.steps()[-1]
         finished = all(record.finished for record in records.values()) and (last in stages or last == "refine")
         return {"run": str(self.run_folder), "finished": finished, "stages": stages}
-
-
-def _changed(preset: TrainingPreset, iterations: dict[str, int | None], gaussians: int | None) -> TrainingPreset:
-    """The preset with other iterations and another number of Gaussians."""
-    from avatar.training.presets import with_iterations
-
-    changed = {}
-    for stage, count in iterations.items():
-        if count is not None:
-            own = getattr(preset, stage)
-            change = with_iterations if stage in ("teacher", "bake") else replace
-            changed[stage] = change(own, iterations=count)
-    if gaussians is not None:
-        fit = changed.get("fit", preset.fit)
-        changed["fit"] = replace(fit, sampling=replace(fit.sampling, count=gaussians))
-    return replace(preset, **changed)
-
-
-def _perceptual(name: str, preset: TrainingPreset) -> str:
-    """The metric's name for "auto"; "none" where the preset has no such term."""
-    from avatar.losses.perceptual import load_lpips, load_st_lpips
-
-    if name != "auto":
-        # The first use of a metric: what is missing is said now.
-        if name != "none":
-            (load_lpips if name == "lpips" else load_st_lpips)()
-        return name
-    if not any(stage.weights.perceptual for stage in (preset.teacher, preset.bake, preset.compensate)):
-        return "none"
-    for package, metric in (("lpips", "lpips"), ("stlpips_pytorch", "st-lpips")):
-        if find_spec(package) is not None:
-            return metric
-    log.warning(
-        "neither lpips nor stlpips-pytorch is installed: training without the perceptual term "
-        "(pip install lpips torchvision, or pip install --no-deps stlpips-pytorch)"
-    )
-    return "none"
 
 
 def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> None:

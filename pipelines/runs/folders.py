@@ -12,26 +12,11 @@ from pathlib import Path
 from pipelines.runs.layout import ABLATION, ALL_STAGES, OLD_STAGE_NAMES
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files.paths import absolute, read_bytes, same_place
 
 RUNS_OF_A_CAPTURE = "runs"
 """The one folder of a capture in which runs may lie, because no reader of captures looks there."""
 LOCK_NAME = ".lock"
-
-
-def same_place(one: Path, other: Path) -> bool:
-    """Tell whether two paths are the same as they are written, or lead to the same file or folder."""
-    return absolute(one) == absolute(other) or one.resolve() == other.resolve()
-
-
-def lies_in(path: Path, folder: Path) -> bool:
-    """Tell whether a path lies in a folder as it is written, or where its links lead."""
-    return absolute(path).is_relative_to(absolute(folder)) or path.resolve().is_relative_to(folder.resolve())
-
-
-def absolute(path: Path) -> Path:
-    """Return the absolute path without `..`, with links as they are."""
-    return Path(os.path.abspath(path))
 
 
 def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--out") -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.artefacts import values_of
-from pipelines.runs.folders import absolute
 from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp.assemble import DarnConfig
@@ -18,6 +17,7 @@ from smplxpp.clean import WebConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import read_json
+from smplxpp.core.files.paths import absolute
 from smplxpp.core.labels import LABELS
 
 log = logging.getLogger(__name__)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from avatar.data.capture_digests import params_digest
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
@@ -46,7 +47,6 @@ from pipelines.stages.evaluate_poses import (
 )
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
-from pipelines.stages.scene_digests import params_digest
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.core.checks import Check

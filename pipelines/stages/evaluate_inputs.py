@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
+from avatar.training.scene import normal_maps
 from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
-from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps, path_of_params
-from pipelines.stages.usable import normal_maps
+from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps
 from smplxpp.capture import Capture
+from smplxpp.capture.declared import path_of_params
 from smplxpp.core.files.json_file import as_integer, as_text
 
 

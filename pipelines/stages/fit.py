@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.data.views import View, read_views
+from avatar.data.views import View
 from avatar.formats import write_splat_ply
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.bound_file import load_bound, save_bound
@@ -21,15 +21,14 @@ from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.session import Session
 from avatar.training.fit.config import FitConfig
-from avatar.training.fit.fit import FitResult, FitScene, fit_gaussians
+from avatar.training.fit.fit import FitResult, fit_gaussians, fit_scene
+from avatar.training.scene import silhouette_overlap
 from pipelines.figures.comparison import write_strip
 from pipelines.runs import gates
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer
-from pipelines.stages.usable import silhouette_overlap
-from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
 
 PREVIEWED_TRAINING_VIEWS = 3
@@ -86,16 +85,8 @@ class FitStage(ModelStage):
         return out
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
-        capture, frame = trainer.scene.capture, trainer.scene.frame
-        template = GROUNDS[self.ground](trainer.scene.template)
-        scene = FitScene(
-            template,
-            template.pose(_params(trainer))[0],
-            read_views(capture, frame, capture.splits.train_cameras),
-            read_views(capture, frame, capture.splits.novel_view_cameras),
-            capture.recording.background or (0.0, 0.0, 0.0),
-        )
-        overlap = silhouette_overlap(template.mesh.with_vertices(scene.vertices), list(scene.train))
+        scene = fit_scene(trainer.scene, GROUNDS[self.ground](trainer.scene.template))
+        overlap = silhouette_overlap(scene.template.mesh.with_vertices(scene.vertices), list(scene.train))
         views = {view.name: view for view in (*scene.held_out, *scene.train)}
 
         def preview(images: Mapping[str, np.ndarray]) -> None:
@@ -129,14 +120,7 @@ class FitStage(ModelStage):
 
 def _posed(trainer: Trainer) -> np.ndarray:
     """(V, 3) vertices of the person's template in the frame's pose, metres."""
-    return trainer.scene.template.pose(_params(trainer))[0]
-
-
-def _params(trainer: Trainer) -> BodyParams:
-    """The frame's parameters, which were looked at when the scene was opened."""
-    params = trainer.scene.capture.params(trainer.scene.frame)
-    assert params is not None
-    return params
+    return trainer.scene.template.pose(trainer.scene.reference_params())[0]
 
 
 def _write_strips(

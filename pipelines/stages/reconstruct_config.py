@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipelines.runs.artefacts import values_of
-from pipelines.runs.folders import absolute
 from pipelines.runs.layout import RECONSTRUCT_FILE
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
+from smplxpp.core.files.paths import absolute
 
 log = logging.getLogger(__name__)
 _PATHS = ("capture", "masks", "mesh")

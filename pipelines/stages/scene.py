@@ -1,59 +1,42 @@
-"""What a training reads, opened and looked at before it starts: what cannot be trained on is said, or left out."""
+"""The template of a run and a capture, opened for a training: which parameters and cameras of the run are read."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avatar.data.views import read_views
+from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene, silhouette_overlap, with_cameras
+from pipelines.runs import layout
 from pipelines.runs.code import sha256_file
-from pipelines.runs.folders import lies_in
-from pipelines.runs.layout import (
-    RECONSTRUCT_STAGE,
-    REFINE_STAGE,
-    REFINED_CAMERAS,
-    REFINED_PARAMS,
-    REGISTER_STAGE,
-    REGISTERED_PARAMS,
-    TEMPLATE,
-)
+from pipelines.runs.layout import REFINE_STAGE, REFINED_CAMERAS, REFINED_PARAMS, TEMPLATE
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.protocol import chosen_protocol
-from pipelines.stages.scene_digests import capture_digests
-from pipelines.stages.usable import (
-    compare_shapes,
-    overlap_of,
-    silhouette_overlap,
-    with_cameras,
-    with_masks,
-    with_params,
-)
 from smplxpp.body import load_body
-from smplxpp.capture import Capture, open_capture, read_cameras
+from smplxpp.capture import Capture, Splits, open_capture, read_cameras
 from smplxpp.capture.readers.simple import stacked_params
-from smplxpp.capture.splits import Splits
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import lies_in
 from smplxpp.template.template import Template
 
 REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
-RECONSTRUCT_ANEW = "reconstruct without them (smplxpp reconstruct --hold-out, or the capture's split) and build anew"
+RECONSTRUCT_ANEW = "reconstruct without them (smplxpp reconstruct --hold-out, or the capture's split) and build again"
 REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
 
 
 @dataclass(frozen=True)
 class TrainInputs:
-    """Where a training takes its views from.
+    """What a training reads its views from.
 
     Attributes:
         capture: folder of any known layout.
-        params: other parameters than those that the run has made (`params_in_use`) or the capture's own. body: what
-            they are for, None for the open body.
+        params: parameters to read; None: those that the run has made (`params_in_use`), or the capture's own.
+        body: body model that `params` are for, None for the open body.
         hold_out: names of cameras kept from training; empty: those that the capture's splits hold out.
-        scale: of the images, 1 for all pixels.
-        protocol: of the capture; None: the run's.
+        scale: size of the images, 1 for all pixels.
+        protocol: protocol of the capture; None: the run's.
     """
 
     capture: Path
@@ -68,31 +51,8 @@ class TrainInputs:
             object.__setattr__(self, "params", stacked_params(self.capture, self.params))
 
 
-@dataclass(frozen=True, eq=False)
-class TrainScene:
-    """A capture that can be trained on; pickles.
-
-    Attributes:
-        template: of the run.
-        capture: its splits are what is trained on and held out; unusable frames and views are left out.
-        frame: the reference frame of the fit.
-        built_frame: the one that the template was built from, if it is trained on; then both are one.
-        template_frame: the one whose scan the template is made of, if that scan is the capture's own.
-        overlap: mean IoU of silhouettes and masks in `CHECKED_FRAMES` training frames.
-        digests: SHA-256 by name of everything that is read.
-    """
-
-    template: Template
-    capture: Capture
-    frame: int
-    built_frame: int | None
-    template_frame: int | None
-    overlap: float
-    digests: dict[str, str]
-
-
 def open_template(run: Path) -> Template:
-    """The template of a run.
+    """Load the template of a run.
 
     Raises:
         InputError: none has been built.
@@ -118,7 +78,7 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     template = open_template(run)
     inputs = of_protocol(run, inputs)
     inputs = replace(inputs, params=params_in_use(run, inputs.params))
-    capture, train, held_out = open_cameras(inputs)
+    capture = open_views(inputs)
     if inputs.params == run / REFINED_PARAMS:
         capture = _corrected(run, capture)
     if frame not in capture.frames:
@@ -137,9 +97,10 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
             "`smplxpp register`",
         )
-    capture = replace(capture, splits=Splits(train, held_out, (frame,), ()))
+    splits = capture.splits
+    capture = replace(capture, splits=Splits(splits.train_cameras, splits.novel_view_cameras, (frame,), ()))
     overlap = silhouette_overlap(
-        template.mesh.with_vertices(template.pose(params)[0]), read_views(capture, frame, train)
+        template.mesh.with_vertices(template.pose(params)[0]), read_views(capture, frame, splits.train_cameras)
     )
     digests = {TEMPLATE: sha256_file(run / TEMPLATE)}
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
@@ -160,36 +121,25 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
             or parameters of another body.
     """
     template = open_template(run)
-    if not template.cloth_mask.any():
-        warnings.warn("the template has no clothes: the whole of it moves as one body", GeometryWarning, stacklevel=2)
     inputs = of_protocol(run, inputs, measures=measures)
     inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
-    capture, params = with_params(_opened(inputs))
-    capture = with_masks(capture)
+    capture = open_views(inputs)
     made: dict[str, str] = {}
-    if inputs.params == run / REGISTERED_PARAMS:
-        refuse_seen(run, (REGISTER_STAGE,), capture.splits, anew=REGISTER_ANEW)
     if inputs.params == run / REFINED_PARAMS:
-        refuse_seen(run, (REFINE_STAGE,), capture.splits, anew=REFINE_ANEW)
-        made = {REFINED_PARAMS: sha256_file(inputs.params)}
-        if (run / REFINED_CAMERAS).is_file():
-            made[REFINED_CAMERAS] = sha256_file(run / REFINED_CAMERAS)
-            capture = _corrected(run, capture)
-    seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
-    frames = [number for number in capture.splits.train_frames if number in seen]
+        made = {name: sha256_file(run / name) for name in (REFINED_PARAMS, REFINED_CAMERAS) if (run / name).is_file()}
+        capture = _corrected(run, capture)
     built = load_build(run)
-    if built is not None and lies_in(built[0].scan, run / RECONSTRUCT_STAGE):
-        refuse_seen(run, (RECONSTRUCT_STAGE,), capture.splits, anew=RECONSTRUCT_ANEW)
-    built_frame = built[0].frame if built is not None and built[0].frame in frames else None
-    frame = frames[0] if built_frame is None else built_frame
-    for name in capture.splits.train_cameras:
-        if capture.file(name, frame) is not None:
-            capture.foreground(name, frame)  # a damaged image or one of another size is an error now
-    compare_shapes(template, [params[f] for f in frames])
-    overlap = overlap_of(template, capture, params)
-    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **made, **capture_digests(capture, params)}
+    scene = prepare_scene(template, capture, built_frame=None if built is None else built[0].frame)
+    # What the run made from photographs must not have seen those that are held out now.
+    splits = scene.capture.splits
+    if inputs.params == run / layout.REGISTERED_PARAMS:
+        refuse_seen(run, (layout.REGISTER_STAGE,), splits, anew=REGISTER_ANEW)
+    if inputs.params == run / REFINED_PARAMS:
+        refuse_seen(run, (REFINE_STAGE,), splits, anew=REFINE_ANEW)
+    if built is not None and lies_in(built[0].scan, run / layout.RECONSTRUCT_STAGE):
+        refuse_seen(run, (layout.RECONSTRUCT_STAGE,), splits, anew=RECONSTRUCT_ANEW)
     template_frame = _template_frame(run, inputs)
-    if template_frame in capture.splits.novel_pose_frames:
+    if template_frame in splits.novel_pose_frames:
         raise InputError(
             f"held-out frames of capture {capture.name}",
             expected="frames that neither the template nor a model has seen",
@@ -197,7 +147,8 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
             remedy="hold out other frames (in the capture's split, or with --hold-out-frames of evaluate), or build "
             "the template from a training frame",
         )
-    return TrainScene(template, capture, frame, built_frame, template_frame, overlap, digests)
+    digests = {TEMPLATE: sha256_file(run / TEMPLATE), **made, **scene.digests}
+    return replace(scene, template_frame=template_frame, digests=digests)
 
 
 def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainInputs:
@@ -223,49 +174,15 @@ def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     return built[0].frame
 
 
-def open_cameras(inputs: TrainInputs) -> tuple[Capture, tuple[str, ...], tuple[str, ...]]:
-    """The capture, and the names of the cameras to train on and of those held out.
+def open_views(inputs: TrainInputs) -> Capture:
+    """Open the capture at the scale that is asked for, its splits with the cameras that are held out.
 
     Raises:
-        InputError: unknown cameras, none, or none to train on.
+        InputError: unknown cameras, none, or none to train on; a scale out of range.
     """
     body = None if inputs.body is None else load_body(inputs.body)
     capture = open_capture(inputs.capture, params=inputs.params, body=body, protocol=inputs.protocol)
-    if not capture.cameras or not capture.presence().any():
-        raise InputError(
-            f"capture {capture.name}",
-            expected="cameras and their images",
-            received="none",
-            remedy="a scan alone makes a template; a fit needs the views: see docs/captures.md",
-        )
-    unknown = sorted(set(inputs.hold_out) - set(capture.cameras))
-    if unknown:
-        raise InputError(
-            "option hold-out", expected=f"cameras among {', '.join(capture.cameras)}", received=", ".join(unknown)
-        )
+    capture = hold_out_cameras(capture, inputs.hold_out)
     if not 0.0 < inputs.scale <= 1.0:
         raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
-    if inputs.scale != 1.0:
-        capture = capture.resized(inputs.scale)
-    splits = capture.splits
-    held_out = inputs.hold_out or splits.novel_view_cameras
-    # Cameras that the splits hold out and the option does not are trained on; those of neither are not.
-    known = {*splits.train_cameras, *splits.novel_view_cameras}
-    train = tuple(name for name in capture.cameras if name in known and name not in held_out)
-    if not train:
-        raise InputError("cameras", expected="at least one to train on", received="all held out")
-    return capture, train, tuple(held_out)
-
-
-def _opened(inputs: TrainInputs) -> Capture:
-    """The capture with the user's held-out cameras and scale; frames as it splits them."""
-    capture, train, held_out = open_cameras(inputs)
-    old = capture.splits
-    if not old.train_frames:
-        raise InputError(
-            f"capture {capture.name}",
-            expected="frames to train on",
-            received="none in its splits",
-            remedy="see docs/captures.md: splits are read from the capture",
-        )
-    return replace(capture, splits=Splits(train, held_out, old.train_frames, old.novel_pose_frames))
+    return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)

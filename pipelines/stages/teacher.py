@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ class TeacherStage(ModelStage):
 
     def settings(self, trainer: Trainer) -> Mapping[str, Any]:
         return {
-            "training": self._training(trainer),
+            "training": self.config.starting_at(trainer.scene.built_frame),
             "networks": self.networks,
             "perceptual": trainer.perceptual_name(self.config),
         }
@@ -43,13 +43,7 @@ class TeacherStage(ModelStage):
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
         sequence = trainer.sequence(self.ground)
         gaussians = self.gaussians.read(trainer.path(self.gaussians), sequence.rig)
-        model, done = fit_teacher(sequence, gaussians, self.networks, self._training(trainer), session)
+        model, done = fit_teacher(
+            sequence, gaussians, self.networks, self.config.starting_at(trainer.scene.built_frame), session
+        )
         return training_output(trainer, session, folder, model, done, lambda: write_model(folder / self.file, model))
-
-    def _training(self, trainer: Trainer) -> FitTeacherConfig:
-        """The configuration with what the tracking has to know of the scene."""
-        track = self.config.track
-        if track is None:
-            return self.config
-        own = replace(track, reference=trainer.scene.built_frame, seed=self.config.seed)
-        return replace(self.config, track=own)

@@ -4,104 +4,52 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
 
 from avatar.losses.perceptual import load_metric
-from avatar.losses.reconstruction import ReconstructionWeights
-from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.training.checks import check_training, note_missing_normals
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.presets import TrainingPreset, with_local_shapes
+from avatar.training.recipe import STEPS, Recipe
 from avatar.training.refinement.config import RefineConfig
+from avatar.training.scene import TrainScene
+from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.layout import (
-    BAKE_STAGE,
-    CLOTH_STAGE,
-    COMPENSATE_STAGE,
-    FIT_STAGE,
-    PARAMS,
-    REFINE_STAGE,
-    TEACHER_STAGE,
-    TEMPLATE,
-)
+from pipelines.runs.layout import PARAMS, TEMPLATE
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
 from pipelines.stages.bake import BakeStage
-from pipelines.stages.cloth import ClothConfig, ClothStage, why_none
+from pipelines.stages.cloth import ClothStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import refine
-from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
+from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.teacher import TeacherStage
-from pipelines.stages.usable import normal_maps
-from smplxpp.capture import Capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_known
-from smplxpp.template.template import BODY_PART
 
 log = logging.getLogger(__name__)
-Shapes = Literal["full", "local", "pruned"]
-STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
-"""The steps of a training in their order, as the command line calls them."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """What is trained.
-
-    Attributes:
-        preset: configurations of all stages.
-        refine: how poses are refined first; None: they are not.
-        teacher: bake from a teacher; False: from the photographs alone.
-        perceptual: metric of the perceptual term: "lpips", "st-lpips" or "none".
-        blend_shapes: "full": every Gaussian has its own columns (the paper); "local": 256 parts of the Gaussians have
-            coefficients of their own, and 16 columns; "pruned": full, and the compact file keeps those that fit.
-        max_megabytes: of the compact file of a pruned student.
-        cloth: which clothes are simulated in new motion; None: none is.
-    """
-
-    preset: TrainingPreset
-    refine: RefineConfig | None = None
-    teacher: bool = True
-    perceptual: str = "none"
-    blend_shapes: Shapes = "full"
-    max_megabytes: float = 20.0
-    cloth: ClothConfig | None = field(default_factory=ClothConfig)
-
-    @property
-    def shapes(self) -> BlendShapeConfig:
-        """The blend shapes of the student."""
-        shapes = self.preset.blend_shapes
-        return with_local_shapes(shapes) if self.blend_shapes == "local" else shapes
-
-    @property
-    def max_bytes(self) -> float | None:
-        """The compact file has at most as many bytes; None where it has all blend shapes."""
-        return 1e6 * self.max_megabytes if self.blend_shapes == "pruned" else None
-
-
-def model_stages(config: TrainConfig) -> dict[str, ModelStage]:
+def model_stages(config: Recipe) -> dict[str, ModelStage]:
     """The stages of a training by their steps."""
     preset = config.preset
-    fit = FitStage(name=FIT_STAGE, config=preset.fit)
-    teacher = TeacherStage(name=TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher)
+    fit = FitStage(name=layout.FIT_STAGE, config=preset.fit)
+    teacher = TeacherStage(
+        name=layout.TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher
+    )
     cloth = None
     if config.teacher and config.cloth is not None:
-        cloth = ClothStage(name=CLOTH_STAGE, teacher=teacher, config=config.cloth)
+        cloth = ClothStage(name=layout.CLOTH_STAGE, teacher=teacher, config=config.cloth)
     bake = BakeStage(
-        name=BAKE_STAGE,
+        name=layout.BAKE_STAGE,
         source=teacher if config.teacher else fit,
         cloth=cloth,
         student=preset.student(),
         config=preset.bake,
     )
     compensate = CompensateStage(
-        name=COMPENSATE_STAGE,
+        name=layout.COMPENSATE_STAGE,
         student=bake,
         teacher=teacher if config.teacher and preset.compensate.init_from_track else None,
         cloth=cloth,
@@ -121,7 +69,7 @@ def train(
     run: Path,
     inputs: TrainInputs,
     scene: TrainScene,
-    config: TrainConfig,
+    config: Recipe,
     options: TrainOptions,
     together: Distributed,
     *,
@@ -142,18 +90,9 @@ def train(
         InputError: an earlier stage is missing or unfinished or saw what is held out, a checkpoint is of another
             training, memory or disk ran out, or training diverged; checkpoints and finished stages stay.
     """
-    if "compensate" in steps and not scene.template.body.num_expressions:
-        raise InputError(
-            "template",
-            expected="a body with expressions, which drive the head's blend shapes",
-            received="none",
-            remedy="build the template on the open body or on SMPL-X, or stop with --until bake",
-        )
+    check_training(scene, config, steps, pose_known=(run / PARAMS).is_file())
     if "cloth" in steps and config.cloth is not None and config.cloth.parts:
-        names = [name for name in scene.template.part_names if name != BODY_PART]
-        require_known("loose parts", config.cloth.parts, names)
-        load_params_of_run(run)
-    _tell_of_clothes(run, scene, config, steps)
+        load_params_of_run(run)  # parts that the user named are simulated, so their pose has to be readable
     records: dict[str, StageRecord] = {}
     how = config.refine
     if "refine" in steps and how is not None:
@@ -162,7 +101,7 @@ def train(
         scene = together.run_on_rank0(lambda: open_scene(run, inputs))
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
-    _tell_of_normals(scene.capture, config, steps)
+    note_missing_normals(scene.capture, config, steps)
     metric = load_metric(config.perceptual, device=together.device)
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
@@ -182,37 +121,12 @@ def train(
 
 def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: TrainOptions) -> StageRecord:
     """Refine the poses of the training frames, and show the percentage done in a bar."""
-    with options.bar(REFINE_STAGE, 0) as report:
+    with options.bar(layout.REFINE_STAGE, 0) as report:
 
         def show(step: str, share: float) -> None:
             report(Progress(round(100 * share), 100, 0.0, 0.0))
 
         return refine(run, inputs, config, force=options.force, progress=show)
-
-
-def _tell_of_clothes(run: Path, scene: TrainScene, config: TrainConfig, steps: tuple[str, ...]) -> None:
-    """Warn before all work where a preset that follows the surface cannot simulate: loose clothes look worse then."""
-    follows = config.teacher and config.preset.teacher.track is not None
-    if config.cloth is None or not follows or not {"teacher", "cloth"} & set(steps):
-        return
-    known = (run / PARAMS).is_file()
-    why = why_none(scene.template, config.cloth, pose_known=known, followed=follows, fps=scene.capture.fps)
-    if why is not None:
-        log.warning("loose clothes: %s", why)
-
-
-def _tell_of_normals(capture: Capture, config: TrainConfig, steps: tuple[str, ...]) -> None:
-    """Say once what a loss with a normal term goes without."""
-    trainings = [getattr(config.preset, name) for name in ("teacher", "bake", "compensate") if name in steps]
-    there, views = normal_maps(capture)
-    if there == views or not any(training.weights.normal for training in trainings):
-        return
-    if there:
-        log.info("%d of %d training views have a normal map: the loss has no normal term in the others", there, views)
-    elif config.teacher and config.preset.teacher.track is not None and any(t.surface_normals for t in trainings):
-        log.info("capture %s has no normal maps: those of followed clothes stand for them", capture.name)
-    else:
-        log.info("capture %s has no normal maps: the loss has no normal term", capture.name)
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:
@@ -237,23 +151,3 @@ def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord |
         numbers.get("iterations"),
     )
     return record
-
-
-def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
-    """The preset with the paper's weight of the perceptual term where it has none."""
-    weight = ReconstructionWeights().perceptual
-    return _each(
-        preset,
-        lambda config: {"weights": replace(config.weights, perceptual=config.weights.perceptual or weight)},
-    )
-
-
-def with_batch(preset: TrainingPreset, items: int | None = None, *, least: int = 1) -> TrainingPreset:
-    """The preset with `items` poses in a step of every training (None: its own), and at least `least`."""
-    return _each(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
-
-
-def _each(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:
-    """The preset with changes of the three trainings."""
-    trainings = {name: getattr(preset, name) for name in ("teacher", "bake", "compensate")}
-    return replace(preset, **{name: replace(config, **changes(config)) for name, config in trainings.items()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -92,6 +93,27 @@ class ParamFiles:
     def read(self, frame: int) -> BodyParams:
         """Read the parameters of one frame."""
         return load_params(self.files.required(frame), layout=self.layout, body=self.body, up=self.up)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameParams:
+    """Parameters in memory, one frame of them for each frame number, such as those that a registration gives.
+
+    Attributes:
+        rows: parameters of one frame by its number.
+        estimated: whether they were fitted to images or scans; `avatar.train` refines such poses first.
+    """
+
+    rows: Mapping[int, BodyParams]
+    estimated: bool = True
+
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        """Return the frames that there are, ascending."""
+        return np.array(sorted(self.rows), dtype=np.int64)
+
+    def read(self, frame: int) -> BodyParams:
+        """Return the parameters of one frame."""
+        return self.rows[frame]
 
 
 def find_params(path: Path, *, body: BodyModel | None, layout: LayoutName = "auto") -> StackedParams | ParamFiles:

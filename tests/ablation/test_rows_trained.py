@@ -16,13 +16,14 @@ from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.processes import Distributed
+from avatar.training.recipe import Recipe
 from pipelines.ablation import measure
 from pipelines.ablation.ablate import AblationRun, ablate
 from pipelines.ablation.rows import PAPER_ROWS, PRUNED_SHARE, ablation_rows, ablation_stages
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.models import Trainer, TrainOptions
 from pipelines.stages.scene import TrainInputs, open_scene
-from pipelines.stages.train import TrainConfig, train
+from pipelines.stages.train import train
 from tests.dolls.swaying import write_moving_capture, write_moving_run
 from tests.dolls.tiny import tiny_preset
 
@@ -193,7 +194,7 @@ def test_force_trains_anew(own, capture):
 def test_what_a_training_made_is_taken_as_it_stands(capture, tmp_path, monkeypatch):
     run, inputs = write_moving_run(tmp_path / "run"), TrainInputs(capture)
     scene = open_scene(run, inputs)
-    train(run, inputs, scene, TrainConfig(preset=tiny_preset(2)), TrainOptions(), Distributed())
+    train(run, inputs, scene, Recipe(preset=tiny_preset(2)), TrainOptions(), Distributed())
     outcome = ablated(run, capture, ("full",), iterations=2)
     assert set(made(run)) == {"rows/full"} and outcome.waiting == []  # the row alone
     row = read_manifest(run / "ablation" / "rows" / "full")

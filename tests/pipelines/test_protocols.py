@@ -13,7 +13,9 @@ import pytest
 
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.report import EvalReport
+from avatar.training.checks import note_missing_normals
 from avatar.training.presets import training_preset
+from avatar.training.recipe import STEPS, Recipe
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.runs.stage import SCHEMA
@@ -22,7 +24,6 @@ from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.evaluate_poses import covered_vertices
 from pipelines.stages.protocol import chosen_protocol
 from pipelines.stages.scene import TrainInputs, open_frame, open_scene
-from pipelines.stages.train import STEPS, TrainConfig, _tell_of_normals
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -316,17 +317,17 @@ def test_exact_poses_are_not_compared_with_themselves(root, tmp_path):
 
 def test_what_the_loss_goes_without_is_said_once(root, caplog):
     caplog.set_level(logging.INFO)
-    config = TrainConfig(preset=training_preset("demo"))
-    paper = TrainConfig(preset=training_preset("paper"))
+    config = Recipe(preset=training_preset("demo"))
+    paper = Recipe(preset=training_preset("paper"))
 
     def told(capture, config, steps=STEPS) -> list[str]:
         caplog.clear()
-        _tell_of_normals(capture, config, steps)
+        note_missing_normals(capture, config, steps)
         return [record.getMessage() for record in caplog.records]
 
     bare = open_capture(root)
     assert told(bare, config) == ["capture doll has no normal maps: those of followed clothes stand for them"]
-    for alone in (paper, TrainConfig(preset=training_preset("cpu")), replace(config, teacher=False)):
+    for alone in (paper, Recipe(preset=training_preset("cpu")), replace(config, teacher=False)):
         assert told(bare, alone) == ["capture doll has no normal maps: the loss has no normal term"]
     assert told(bare, config, ("fit",)) == []
     (root / "normals" / "Ring0").mkdir()

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from avatar.training import recipe
 from pipelines.commands import options
-from pipelines.commands import train as command
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages import scene as scene_module
 from pipelines.stages.held_out import refuse_seen
@@ -208,15 +208,15 @@ def test_auto_takes_the_metric_that_is_there(monkeypatch, caplog):
     from avatar.training.presets import training_preset
 
     there: set[str] = set()
-    monkeypatch.setattr(command, "find_spec", lambda name: name if name in there else None)
+    monkeypatch.setattr(recipe, "find_spec", lambda name: name if name in there else None)
     paper = training_preset("paper")
-    assert command._perceptual("auto", training_preset("demo")) == "none" and not caplog.text
-    assert command._perceptual("auto", paper) == "none" and "pip install" in caplog.text
+    assert recipe.choose_perceptual("auto", training_preset("demo")) == "none" and not caplog.text
+    assert recipe.choose_perceptual("auto", paper) == "none" and "pip install" in caplog.text
     there.add("stlpips_pytorch")
-    assert command._perceptual("auto", paper) == "st-lpips"
+    assert recipe.choose_perceptual("auto", paper) == "st-lpips"
     there.add("lpips")
-    assert command._perceptual("auto", paper) == "lpips"
-    assert command._perceptual("none", paper) == "none"
+    assert recipe.choose_perceptual("auto", paper) == "lpips"
+    assert recipe.choose_perceptual("none", paper) == "none"
 
 
 def test_a_checkpoint_of_a_newer_version_is_refused_and_kept(run, original, capsys):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avatar.data.one_frame import FRAME, OneFrame
 from avatar.data.sequence import Item, camera_centers_of
-from avatar.data.views import View
+from avatar.data.views import View, read_views
 from avatar.export.posed import posed_splats
 from avatar.formats.splats import Splats
 from avatar.gaussians.binding import BoundGaussians
@@ -24,6 +24,7 @@ from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.initial_colors import initial_gaussians
+from avatar.training.scene import TrainScene
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
@@ -51,6 +52,23 @@ class FitScene:
             raise InputError(
                 "posed vertices", expected=f"shape {self.template.vertices.shape}", received=str(self.vertices.shape)
             )
+
+
+def fit_scene(scene: TrainScene, template: Template) -> FitScene:
+    """Return what the fit is made on: the reference frame's whole views, and a template in that frame's pose.
+
+    Args:
+        scene: its capture and reference frame.
+        template: the scene's, or one made from it.
+    """
+    capture, frame = scene.capture, scene.frame
+    return FitScene(
+        template,
+        template.pose(scene.reference_params())[0],
+        read_views(capture, frame, capture.splits.train_cameras),
+        read_views(capture, frame, capture.splits.novel_view_cameras),
+        capture.recording.background or (0.0, 0.0, 0.0),
+    )
 
 
 @dataclass(frozen=True, eq=False)

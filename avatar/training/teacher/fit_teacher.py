@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -44,6 +44,12 @@ class FitTeacherConfig(PhotometricConfig):
     view_jitter: float = 0.1
     displacement: float = 0.0
     track: TrackConfig | None = None
+
+    def starting_at(self, frame: int | None) -> FitTeacherConfig:
+        """Return the configuration with its tracking started in a frame, None for the tracking's own choice."""
+        if self.track is None:
+            return self
+        return replace(self, track=replace(self.track, reference=frame, seed=self.seed))
 
 
 class TeacherTask(PhotometricTask):

@@ -102,3 +102,18 @@ def check_name(name: str, *, subject: str) -> str:
             received=repr(name[:_LONGEST_NAME]),
         )
     return name
+
+
+def absolute(path: Path) -> Path:
+    """Return the absolute path without `..`; links stay as they are."""
+    return Path(os.path.abspath(path))
+
+
+def same_place(one: Path, other: Path) -> bool:
+    """Return whether two paths are the same as they are written, or lead to the same file or folder."""
+    return absolute(one) == absolute(other) or one.resolve() == other.resolve()
+
+
+def lies_in(path: Path, folder: Path) -> bool:
+    """Return whether a path lies in a folder as it is written, or where its links lead."""
+    return absolute(path).is_relative_to(absolute(folder)) or path.resolve().is_relative_to(folder.resolve())

@@ -1,0 +1,222 @@
+"""Which clothes of a template are loose, cut for simulation and fitted to the surface that a teacher followed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from avatar.data.cloth_motion import ClothMotions
+from avatar.data.sequence import AvatarSequence
+from avatar.models.tracked_surface import Track
+from smplxpp.cloth import Garment, GarmentConfig, cut_garment
+from smplxpp.cloth.calibrate import Calibration, CalibrationConfig, Followed, calibrate
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+from smplxpp.core.validation import require_known
+from smplxpp.raster import rasterize_mesh
+from smplxpp.template.template import BODY_PART, Template
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClothConfig:
+    """Which clothes are simulated, and how.
+
+    Attributes:
+        parts: names of the parts; None: those whose followed surface leaves skinning, and whose simulation brings the
+            person's outline in training views nearer to the masks. Named parts are simulated without that test.
+        garment: how they are cut.
+        calibration: how they are fitted.
+        seed: nothing is drawn; there for the stage.
+        iterations: steps that a bar of progress shows for the stage.
+    """
+
+    parts: tuple[str, ...] | None = None
+    garment: GarmentConfig = field(default_factory=GarmentConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    seed: int = 0
+    iterations: int = 1
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Distance of the person's outline from the masks of training views: 1 - IoU, a mean.
+
+    Attributes:
+        skinned: with the part moved by skinning alone.
+        simulated: with the part simulated.
+        views: number of views.
+    """
+
+    skinned: float
+    simulated: float
+    views: int
+
+    @property
+    def better(self) -> bool:
+        """Whether the simulation is nearer."""
+        return self.simulated < self.skinned
+
+
+@dataclass
+class LooseClothes:
+    """What was found of the loose clothes of a template.
+
+    Attributes:
+        garments: parts to simulate, cut and fitted.
+        calibrations: how well each part that was looked at could be fitted.
+        outlines: outlines of the parts that leave skinning, by name.
+        notes: sentences on what could not be done.
+    """
+
+    garments: list[Garment] = field(default_factory=list)
+    calibrations: list[Calibration] = field(default_factory=list)
+    outlines: dict[str, Outlines] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def find_garments(
+    sequence: AvatarSequence,
+    reference: BodyParams | None,
+    config: ClothConfig,
+    track: Track | None,
+    *,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> LooseClothes:
+    """Cut the clothes of a template, fit them to the followed surface, and keep those that simulation improves.
+
+    Args:
+        sequence: the training frames.
+        reference: parameters of the pose in which the template's surface is the scan's; None: not known.
+        config: which parts are looked at, and how.
+        track: the surface that was followed through the training frames; None: only named parts are cut, with the
+            default material.
+        report: called before each part with the numbers of parts, done and all.
+
+    Raises:
+        InputError: the name of a part that the template does not have.
+    """
+    template, out = sequence.rig.template, LooseClothes()
+    if config.parts is not None:
+        require_known("loose parts", config.parts, loose_names(template))
+    wanted = _wanted(template, config)
+    fps = sequence.capture.fps
+    why = why_none(template, config, pose_known=reference is not None, followed=track is not None, fps=fps)
+    if why is not None or reference is None:
+        return LooseClothes(notes=[] if why is None else [why])
+    for k, part in enumerate(wanted):
+        report(k, len(wanted))
+        # A part that cannot be cut (too small, nothing carries it) is left to skinning and the field.
+        try:
+            garment = cut_garment(template, part, reference, config.garment)
+        except InputError as error:
+            out.notes.append(str(error))
+            log.warning("loose clothes: %s", error)
+            continue
+        if track is not None and fps is not None:
+            # Drag and the depth of the pinned edge are those with which the simulation comes nearest to the track.
+            followed = followed_particles(sequence, track, garment, fps)
+            garment, calibration = calibrate(template, garment, followed, config=config.calibration)
+            out.calibrations.append(calibration)
+            if calibration.moves:
+                out.outlines[part] = measure_outlines(sequence, garment, fps)
+            # The masks decide: a part that follows its joints, or that a simulation moves away from them, stays.
+            if config.parts is None and not (calibration.moves and out.outlines[part].better):
+                continue
+        out.garments.append(garment)
+    return out
+
+
+def why_none(
+    template: Template, config: ClothConfig, *, pose_known: bool, followed: bool, fps: float | None
+) -> str | None:
+    """Return why no part of the clothes can be simulated, as far as known before a training; None: parts may be.
+
+    Args:
+        template: the clothed body.
+        config: which parts are looked at.
+        pose_known: whether the pose of the scan, in which the template is the scanned surface, is known.
+        followed: whether the surface is, or will be, followed through the training frames.
+        fps: frames a second of the capture.
+    """
+    if not _wanted(template, config):
+        return None
+    if not pose_known:
+        return "the run does not say in which pose its template was scanned: nothing is simulated"
+    if config.parts is None and not followed:
+        return "nothing was followed through the frames: no part is simulated unless it is named"
+    if followed and fps is None:
+        return "the capture does not say how many frames a second it has: nothing is simulated"
+    return None
+
+
+def loose_names(template: Template) -> list[str]:
+    """Return the names of the parts that are not the body."""
+    return [name for name in template.part_names if name != BODY_PART]
+
+
+def _wanted(template: Template, config: ClothConfig) -> list[str]:
+    """Return the parts to look at: those named, or all clothes."""
+    if config.parts is not None:
+        return list(config.parts)
+    return [label.name for label in CLOTH_LABELS if label.name in template.part_names]
+
+
+def measure_outlines(
+    sequence: AvatarSequence, garment: Garment, fps: float, *, frames: int = 16, cameras: int = 4
+) -> Outlines:
+    """Compare the outlines with a part skinned and simulated with the masks of training views.
+
+    Args:
+        sequence: the training frames.
+        garment: the part.
+        fps: frames a second.
+        frames, cameras: at most how many frames, and cameras of each; more cost seconds and change little.
+    """
+    rig, capture = sequence.rig, sequence.capture
+    clothed = with_simulated(sequence, [garment])
+    wrong: dict[bool, list[float]] = {False: [], True: []}
+    for turn, frame in enumerate(spread(sequence.train_frames, frames)):
+        for simulated, motion in ((False, sequence.motion(frame)), (True, clothed.as_new_motion(frame))):
+            mesh = TriangleMesh(rig.pose(motion).double().cpu().numpy(), rig.template.faces)
+            for camera in sequence.cameras(frame, turn, cameras, 0):
+                image = capture.mask(camera, frame)
+                if image is None:
+                    continue
+                mask, drawn = image > 127, rasterize_mesh(mesh, capture.cameras[camera]).mask
+                wrong[simulated].append(1.0 - float((mask & drawn).sum() / max((mask | drawn).sum(), 1)))
+    return Outlines(float(np.mean(wrong[False])), float(np.mean(wrong[True])), len(wrong[True]))
+
+
+def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment, fps: float) -> Followed:
+    """Return where the followed surface has a garment's particles in the training frames; gaps are NaN."""
+    frames = np.arange(min(track.row), max(track.row) + 1)
+    rig, poses, world = sequence.rig, [], np.full((len(frames), len(garment.particles), 3), np.nan)
+    confidence = np.ones(world.shape[:2])
+    last = None
+    for k, frame in enumerate(frames.tolist()):
+        params = sequence.capture.params(frame)
+        if frame in track.row and params is not None:
+            world[k] = rig.places(sequence.motion(frame), track.displacements(frame))[garment.particles]
+            confidence[k] = track.confidence(frame).cpu().numpy()[garment.particles]
+        last = params if params is not None else last
+        assert last is not None  # the first frame is a training frame, which has parameters
+        poses.append(last.without_shape())
+    return Followed(BodyParams.concatenate(poses), fps, world, confidence)
+
+
+def with_simulated(sequence: AvatarSequence, garments: Sequence[Garment]) -> AvatarSequence:
+    """Return the sequence with garments simulated in poses that are new or count as new; itself without any."""
+    fps, capture = sequence.capture.fps, sequence.capture
+    if not garments or fps is None:
+        return sequence
+    return sequence.with_cloth(
+        ClothMotions(sequence.rig.template, garments, params=capture.params, frames=capture.frames, fps=fps)
+    )

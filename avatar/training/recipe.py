@@ -1,0 +1,229 @@
+"""What a training does: the options of `avatar.train`, and the configurations of all steps that follow from them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from typing import Any, Literal
+
+from avatar.losses.reconstruction import ReconstructionWeights
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.training.engine.photometric_task import PhotometricConfig
+from avatar.training.loose_clothes import ClothConfig
+from avatar.training.presets import TrainingPreset, training_preset, with_iterations, with_local_shapes
+from avatar.training.refinement.config import RefineConfig
+from smplxpp.core.errors import InputError
+from smplxpp.core.validation import require_choice
+
+log = logging.getLogger(__name__)
+STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
+"""The steps of a training in the order in which they run."""
+_TRAININGS = ("teacher", "bake", "compensate")
+"""Fields of a preset whose losses have a perceptual and a normal term."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Options of a training beside its preset; `smplxpp train` has each of them under the same name.
+
+    Attributes:
+        template_frame: frame of the capture that the template was built from, whose parameters pose it as the scan;
+            None: not known, then no clothes are simulated.
+        refine_cameras: correct the poses of the training cameras together with those of the person.
+        max_minutes: stop after as many minutes of work; the same call continues.
+        iterations_share: share of the preset's iterations, of all steps.
+        iterations: iterations by step ("fit", "teacher", "bake", "compensate"), in the place of the preset's.
+        batch: poses in a step of optimisation, None for the preset's.
+        gaussians: number of Gaussians, None for the preset's.
+        blend_shapes: "full" as published; "local": 256 parts with coefficients of their own and 16 columns; "pruned":
+            full, and the compact file keeps those that move and colour most.
+        max_megabytes: size of the compact file with pruned blend shapes.
+        teacher: whether the student is baked from a teacher; False: from the photographs alone.
+        loose_parts: names of parts to simulate, in the place of those that the training finds.
+        perceptual: metric of the perceptual term: "lpips", "st-lpips", "none", or "auto" for the installed one where
+            the preset has the term.
+        hold_out: cameras to keep from training; empty: those that the capture's splits hold out.
+        seed: seed of all random draws.
+        device: "auto", "cpu" or "cuda".
+        force: train again what stands.
+        tensorboard: log for TensorBoard too.
+
+    Raises:
+        InputError: a number out of range, an unknown word, or options that exclude each other.
+    """
+
+    template_frame: int | None = 0
+    refine_cameras: bool = False
+    max_minutes: float = math.inf
+    iterations_share: float = 1.0
+    iterations: Mapping[str, int] = field(default_factory=dict)
+    batch: int | None = None
+    gaussians: int | None = None
+    blend_shapes: Literal["full", "local", "pruned"] = "full"
+    max_megabytes: float = 20.0
+    teacher: bool = True
+    loose_parts: tuple[str, ...] = ()
+    perceptual: Literal["auto", "lpips", "st-lpips", "none"] = "auto"
+    hold_out: tuple[str, ...] = ()
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    force: bool = False
+    tensorboard: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value, least in (
+            ("gaussians", self.gaussians, 1),
+            ("batch", self.batch, 1),
+            ("seed", self.seed, 0),
+            ("max-megabytes", self.max_megabytes, 0),
+            *((f"{step}-iterations", value, 1) for step, value in self.iterations.items()),
+        ):
+            if value is not None and not value >= least:
+                raise InputError(f"option {name}", expected=f"a number, at least {least}", received=f"{value:g}")
+        if not 0.0 < self.iterations_share < math.inf:
+            raise InputError(
+                "option iterations-share", expected="a number above 0", received=f"{self.iterations_share:g}"
+            )
+        if not self.max_minutes > 0:
+            raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
+        for step in self.iterations:
+            require_choice("iterations of a step", step, ("fit", *_TRAININGS))
+
+    def recipe(self, preset: str | TrainingPreset = "cpu", *, cloth: Literal["auto", "none"] = "auto") -> Recipe:
+        """Return the configurations of all steps; whether poses are refined is decided when the capture is known.
+
+        Args:
+            preset: name of a preset, or a preset of your own.
+            cloth: "auto": clothes that leave skinning and that a simulation improves are simulated; "none": no clothes.
+
+        Raises:
+            InputError: an unknown preset.
+            MissingExtraError: a perceptual metric that is named and not installed.
+        """
+        chosen = training_preset(preset) if isinstance(preset, str) else preset
+        chosen = self._changed(chosen.with_seed(self.seed).shortened(self.iterations_share))
+        if self.batch is not None:
+            chosen = with_batch(chosen, self.batch)
+        if self.perceptual in ("lpips", "st-lpips"):
+            chosen = with_perceptual(chosen)
+        return Recipe(
+            preset=chosen,
+            teacher=self.teacher,
+            perceptual=choose_perceptual(self.perceptual, chosen),
+            blend_shapes=self.blend_shapes,
+            max_megabytes=self.max_megabytes,
+            cloth=None if cloth == "none" else ClothConfig(parts=self.loose_parts or None),
+        )
+
+    def refinement(self, *, wanted: bool) -> RefineConfig | None:
+        """Return how poses are refined; None where they are not wanted.
+
+        Raises:
+            InputError: cameras are to be corrected without poses.
+        """
+        if self.refine_cameras and not wanted:
+            raise InputError(
+                "option refine-cameras",
+                expected="poses that are refined too",
+                received="parameters that stand as they are",
+                remedy="add --refine-poses on",
+            )
+        return RefineConfig(seed=self.seed, cameras=self.refine_cameras) if wanted else None
+
+    def _changed(self, preset: TrainingPreset) -> TrainingPreset:
+        """Return the preset with other iterations and another number of Gaussians."""
+        changed: dict[str, Any] = {}
+        for step, count in self.iterations.items():
+            change = with_iterations if step in ("teacher", "bake") else replace
+            changed[step] = change(getattr(preset, step), iterations=count)
+        if self.gaussians is not None:
+            fit = changed.get("fit", preset.fit)
+            changed["fit"] = replace(fit, sampling=replace(fit.sampling, count=self.gaussians))
+        return replace(preset, **changed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Configurations of all steps of a training.
+
+    Attributes:
+        preset: configurations of fit, teacher, bake and compensation.
+        refine: how poses are refined first; None: they are not.
+        teacher: bake from a teacher; False: from the photographs alone.
+        perceptual: metric of the perceptual term: "lpips", "st-lpips" or "none".
+        blend_shapes: see `TrainConfig`.
+        max_megabytes: size of the compact file of a pruned student.
+        cloth: which clothes are simulated in new motion; None: none.
+    """
+
+    preset: TrainingPreset
+    refine: RefineConfig | None = None
+    teacher: bool = True
+    perceptual: str = "none"
+    blend_shapes: str = "full"
+    max_megabytes: float = 20.0
+    cloth: ClothConfig | None = field(default_factory=ClothConfig)
+
+    @property
+    def shapes(self) -> BlendShapeConfig:
+        """The blend shapes of the student."""
+        shapes = self.preset.blend_shapes
+        return with_local_shapes(shapes) if self.blend_shapes == "local" else shapes
+
+    @property
+    def max_bytes(self) -> float | None:
+        """Bound of the compact file, bytes; None where it has all blend shapes."""
+        return 1e6 * self.max_megabytes if self.blend_shapes == "pruned" else None
+
+    @property
+    def follows(self) -> bool:
+        """Whether a teacher follows the surface through the frames."""
+        return self.teacher and self.preset.teacher.track is not None
+
+
+def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
+    """Return the preset with the paper's weight of the perceptual term where it has none."""
+    weight = ReconstructionWeights().perceptual
+    return _each(
+        preset,
+        lambda config: {"weights": replace(config.weights, perceptual=config.weights.perceptual or weight)},
+    )
+
+
+def with_batch(preset: TrainingPreset, items: int | None = None, *, least: int = 1) -> TrainingPreset:
+    """Return the preset with `items` poses in a step of every training (None: its own), and at least `least`."""
+    return _each(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
+
+
+def _each(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:
+    """Return the preset with changes of the three trainings."""
+    trainings = {name: getattr(preset, name) for name in _TRAININGS}
+    return replace(preset, **{name: replace(config, **changes(config)) for name, config in trainings.items()})
+
+
+def choose_perceptual(name: str, preset: TrainingPreset) -> str:
+    """Return the name of the perceptual metric; for "auto" the installed one, or "none" where no loss has the term.
+
+    Raises:
+        MissingExtraError: a metric that is named and not installed.
+    """
+    if name != "auto":
+        # Load the metric now: a missing package is an error before hours of training.
+        if name != "none":
+            from avatar.losses.perceptual import load_lpips, load_st_lpips
+
+            (load_lpips if name == "lpips" else load_st_lpips)()
+        return name
+    if not any(getattr(preset, one).weights.perceptual for one in _TRAININGS):
+        return "none"
+    for package, metric in (("lpips", "lpips"), ("stlpips_pytorch", "st-lpips")):
+        if find_spec(package) is not None:
+            return metric
+    log.warning(
+        "neither lpips nor stlpips-pytorch is installed: training without the perceptual term "
+        "(pip install lpips torchvision, or pip install --no-deps stlpips-pytorch)"
+    )
+    return "none"

@@ -1,0 +1,50 @@
+"""Files of a trained student: whole, and compact as players read it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from avatar.data.sequence import AvatarSequence
+from avatar.models.model_file import load_avatar, save_avatar
+from avatar.models.student import Student
+from avatar.training.engine.photometric_task import TaskContext
+from avatar.training.student.compensate import CompensateConfig, CompensateTask
+from avatar.training.student.prune import pruned_to
+
+
+def write_student(
+    whole: Path,
+    compact: Path,
+    student: Student,
+    sequence: AvatarSequence,
+    config: CompensateConfig,
+    *,
+    max_bytes: float | None,
+    context: TaskContext,
+) -> dict[str, Any]:
+    """Write a student whole, and compact for players, and measure the compact one as it is read back.
+
+    Args:
+        whole, compact: the files.
+        student: with blend shapes.
+        sequence: the frames and views that it is measured on.
+        config: of its training.
+        max_bytes: bound of the compact file, which leaves out blend shapes to keep it; None: it has all.
+        context: of its training.
+
+    Returns:
+        "bytes" of the files by name; "compact": the share of the blend shapes that it keeps, and its figures.
+    """
+    small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
+    bytes_of = {whole.name: save_avatar(whole, student), compact.name: save_avatar(compact, small, compact=True)}
+    # As a player has it: half precision, and without what was pruned.
+    stored = load_avatar(compact, sequence.rig)
+    assert isinstance(stored, Student)
+    quiet = replace(context, preview=lambda images: None)
+    # Measured alone: what holds neighbours in training is not made.
+    task = CompensateTask(sequence, stored, replace(config, coherence=0.0), quiet)
+    figures = task.evaluate(config.iterations)
+    measured = {kind: figures[kind] for kind in ("novel_view", "novel_pose") if kind in figures}
+    return {"bytes": bytes_of, "compact": {"kept_blend_shapes": keep, **measured}}
