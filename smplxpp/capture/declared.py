@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Self
 
 from smplxpp.capture.capture import Capture
-from smplxpp.capture.params import FrameParams, ParamFiles, StackedParams
 from smplxpp.capture.protocols import (
     EXACT,
     TRACKED,
@@ -19,6 +18,7 @@ from smplxpp.capture.protocols import (
 )
 from smplxpp.capture.readers import simple
 from smplxpp.capture.recording import ParamSource
+from smplxpp.capture.sources import FrameParams, ParamFiles, StackedParams
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import lies_in, same_place
 

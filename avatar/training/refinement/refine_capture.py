@@ -15,8 +15,8 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
 from avatar.training.scene import TrainScene, with_cameras
 from smplxpp.capture import Capture, read_cameras
-from smplxpp.capture.params import find_params
-from smplxpp.capture.writers.cameras import write_plain_cameras_json
+from smplxpp.capture.sources import find_params
+from smplxpp.capture.writers.metadata import write_plain_cameras_json
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
