@@ -257,7 +257,7 @@ def pretended_cuda() -> Iterator[None]:
         swapped = torch.__future__.get_swap_module_params_on_conversion()
         stack.callback(torch.__future__.set_swap_module_params_on_conversion, swapped)
         torch.__future__.set_swap_module_params_on_conversion(True)
-        stack.enter_context(mock.patch("avatar.render.gsplat_backend.rasterize_gsplat", _rasterize))
+        stack.enter_context(mock.patch("avatar.rendering.gsplat_backend.rasterize_gsplat", _rasterize))
         stack.enter_context(_Asked())
         stack.enter_context(_Placed())
         yield
@@ -265,7 +265,7 @@ def pretended_cuda() -> Iterator[None]:
 
 def _rasterize(*tensors: Any) -> Any:
     """Draw with the CPU's backend, with gradients."""
-    from avatar.render.cpu import rasterize_cpu
+    from avatar.rendering.cpu import rasterize_cpu
 
     assert all(isinstance(one, PretendedTensor) for one in tensors if isinstance(one, Tensor))
     image, alpha, meta = rasterize_cpu(*(one.cpu() if isinstance(one, Tensor) else one for one in tensors))

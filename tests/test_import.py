@@ -35,7 +35,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"formats"},
         {"rig"},
         {"data"},
-        {"render"},
+        {"rendering"},
         {"losses"},
         {"metrics", "models"},
         {"export"},
@@ -90,7 +90,7 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def room(module: str) -> str:
-    """Return the room of a module: `render` of `avatar.render.cpu`, "" of the package itself."""
+    """Return the room of a module: `render` of `avatar.rendering.cpu`, "" of the package itself."""
     return ".".join(module.split(".")[1:2])
 
 
@@ -281,7 +281,7 @@ def test_files_are_opened_by_their_doors():
 READS: dict[str, set[str]] = {
     "read_bytes": {"smplxpp/core/files/paths.py", "pipelines/stages/build_config.py"},
     "read_text": {  # the system's, and our own sources
-        *("smplxpp/native/__init__.py", "avatar/render/list_limit.py"),
+        *("smplxpp/native/__init__.py", "avatar/rendering/list_limit.py"),
         *("pipelines/report/builder.py", "pipelines/runs/code.py"),
     },
     "open": {

@@ -4,7 +4,7 @@ The kind of MeshAvatar (Chen et al. 2024): an animatable mesh with a texture tha
 the mesh from a signed distance field, has physical materials, and is drawn by nvdiffrast; here the mesh is the
 template, the texture is plain colour, and a texel is one flat opaque splat fixed to its triangle, so that all rows
 share one rasteriser. Splats overlap their neighbours by a little more than half: the surface is closed, its silhouette
-smooth, and gradients reach the mesh through silhouettes too, which a z-buffer's (`avatar.render.mesh_maps`) do not.
+smooth, and gradients reach the mesh through silhouettes too, which a z-buffer's (`avatar.rendering.mesh_maps`) do not.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from avatar.metrics.view_quality import (
     view_quality,
 )
 from avatar.models.student import Student
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
 from avatar.rig.rig import Motion, Rig
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress

@@ -15,7 +15,7 @@ from avatar.losses.ssim import ssim
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
-    from avatar.render.avatar_view import Rendering
+    from avatar.rendering.avatar_view import Rendering
 
 
 @dataclass(frozen=True, kw_only=True)

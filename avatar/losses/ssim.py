@@ -19,7 +19,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from avatar.losses.checks import check_images, mean, total_weight
-from avatar.render.memory import pooled_empty
+from avatar.rendering.memory import pooled_empty
 from smplxpp.core.errors import InputError
 from smplxpp.native import address, check_size, native_library, thread_count
 

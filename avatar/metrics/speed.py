@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from avatar.data.views import View
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, at_rest
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError

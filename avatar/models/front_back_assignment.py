@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.models.networks.map_sampling import MapSampler
-from avatar.render.map_frame import MapFrame
-from avatar.render.mesh_maps import front_back_maps
+from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import front_back_maps
 from avatar.rig.rig import Rig
 
 

@@ -19,8 +19,8 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
 from avatar.models.tracked_surface import Track
-from avatar.render.map_frame import MapFrame
-from avatar.render.mesh_maps import front_back_maps, vertex_normals
+from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import front_back_maps, vertex_normals
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion, Rig
 

@@ -1,4 +1,4 @@
-"""Splats to a picture through the native library, without torch: the forward pass of `avatar.render.cpu`."""
+"""Splats to a picture through the native library, without torch: the forward pass of `avatar.rendering.cpu`."""
 
 from __future__ import annotations
 

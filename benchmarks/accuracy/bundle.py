@@ -27,7 +27,7 @@ from avatar.losses.psnr import psnr_from_mse
 from avatar.metrics.view_quality import view_quality
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.runtime import AvatarPlayer
 from benchmarks.support.results import store_results
 from smplxpp.capture import open_capture

@@ -33,7 +33,7 @@ from avatar.gaussians.bound_file import load_bound
 from avatar.metrics.surface_quality import mean_surface, surface_quality
 from avatar.metrics.view_quality import view_quality
 from avatar.models.tracked_surface import Track, TrackedAvatar
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.training.engine.session import Session
 from avatar.training.presets import training_preset
 from avatar.training.tracking.config import TrackConfig

@@ -74,7 +74,8 @@ def mapping(job: Job, note: Note) -> None:
     """Our calls of gsplat draw what the float64 reference draws: the tests of the CUDA backend."""
     results = job.work / "mapping.xml"
     tests = [
-        str(ROOT / "tests" / "render" / f"{name}.py") for name in ("test_gsplat_backend", "test_rasterize_invariance")
+        str(ROOT / "tests" / "rendering" / f"{name}.py")
+        for name in ("test_gsplat_backend", "test_rasterize_invariance")
     ]
     chosen = tests[:1] if job.toy else tests
     tool = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", f"--junitxml={results}"]

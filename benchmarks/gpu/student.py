@@ -22,7 +22,7 @@ from avatar.gaussians.frames import MIN_EDGE, TriangleFrames
 from avatar.gaussians.quaternions import quat_from_matrix
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.student import Student
-from avatar.render import rasterize
+from avatar.rendering import rasterize
 from avatar.rig.rig import Motion
 from smplxpp.core.camera import Camera
 

@@ -39,7 +39,7 @@ from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
 from avatar.losses.psnr import psnr_from_mse
-from avatar.render import rasterize
+from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from avatar.losses.ssim import ssim, ssim_reference
-from avatar.render.barycentrics import barycentrics_reference, interpolate_reference
-from avatar.render.mesh_maps import mesh_maps
+from avatar.rendering.barycentrics import barycentrics_reference, interpolate_reference
+from avatar.rendering.mesh_maps import mesh_maps
 from benchmarks.support.results import store_results
 from smplxpp.body import load_body
 from smplxpp.core.camera import Camera

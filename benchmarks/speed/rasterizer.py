@@ -21,10 +21,10 @@ import torch
 import tyro
 
 from avatar.gaussians.quaternions import matrix_from_quat
-from avatar.render import rasterize
-from avatar.render.native import STAGES, CameraCall, Workspace
-from avatar.render.reference import rasterize_reference
-from avatar.render.settings import RasterSettings
+from avatar.rendering import rasterize
+from avatar.rendering.native import STAGES, CameraCall, Workspace
+from avatar.rendering.reference import rasterize_reference
+from avatar.rendering.settings import RasterSettings
 from benchmarks.peers.rasterizer_peers import (
     BenchmarkScene,
     EarlierLibrary,

@@ -32,7 +32,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer

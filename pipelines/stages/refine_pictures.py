@@ -10,7 +10,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.data.views import read_view
 from avatar.metrics.view_quality import eight_bit
 from avatar.models.student import Student, StudentConfig
-from avatar.render.avatar_view import render_view
+from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import at_rest
 from avatar.training.refinement.refine import Refinement
 from pipelines.figures.comparison import write_tiles

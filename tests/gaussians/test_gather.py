@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avatar.gaussians.gather import gather_rows
-from avatar.render.mesh_maps import vertex_normals
+from avatar.rendering.mesh_maps import vertex_normals
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import torch
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.losses.ssim import ssim
-from avatar.render.avatar_view import Rendering
+from avatar.rendering.avatar_view import Rendering
 from smplxpp.core.errors import InputError
 
 

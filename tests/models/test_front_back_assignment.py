@@ -12,8 +12,8 @@ import trimesh
 
 from avatar.models.front_back_assignment import FrontBackAssignment, assign_front_back
 from avatar.models.teacher_avatar import map_frame
-from avatar.render.map_frame import MapFrame
-from avatar.render.mesh_maps import vertex_normals
+from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import vertex_normals
 from avatar.rig.rig import Rig
 from tests.dolls.dancing import template
 

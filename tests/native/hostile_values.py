@@ -16,8 +16,8 @@ import torch
 
 from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
 from avatar.losses.ssim import ssim, ssim_map
-from avatar.render import rasterize
-from avatar.render.mesh_maps import mesh_maps
+from avatar.rendering import rasterize
+from avatar.rendering.mesh_maps import mesh_maps
 from smplxpp.capture.distortion import RationalDistortion, undistort
 from smplxpp.core import GeometryWarning
 from smplxpp.core.camera import Camera

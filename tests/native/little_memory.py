@@ -18,8 +18,8 @@ import torch
 
 from avatar.gaussians import native_kernels
 from avatar.losses.ssim import ssim
-from avatar.render import rasterize
-from avatar.render.mesh_maps import mesh_maps
+from avatar.rendering import rasterize
+from avatar.rendering.mesh_maps import mesh_maps
 from smplxpp.capture.distortion import RationalDistortion, undistort
 from smplxpp.core.camera import Camera
 from smplxpp.raster import rasterize_triangles

@@ -85,7 +85,7 @@ def test_a_status_is_an_exception():
 
 
 def test_face_ids_beyond_the_faces_are_refused():
-    from avatar.render.native_maps import InterpolateFunction
+    from avatar.rendering.native_maps import InterpolateFunction
 
     values, weights, faces = torch.rand(3, 2), torch.rand(2, 2, 3), torch.tensor([[0, 1, 2]], dtype=torch.int32)
     for ids, corners in ((1, faces), (2**30, faces), (0, faces + 1)):
@@ -112,7 +112,7 @@ WORK = """
 import os, signal, sys
 import torch
 from avatar.losses.ssim import ssim
-from tests.render.scenes import gradients, random_scene
+from tests.rendering.scenes import gradients, random_scene
 
 def work():
     x = torch.linspace(0, 1, 3 * 300 * 300).view(300, 300, 3).requires_grad_()

@@ -32,7 +32,8 @@ def quick(seed: int = 0, cameras: bool = False) -> RefineConfig:
 
 @pytest.fixture(autouse=True)
 def few_gaussians(monkeypatch):
-    monkeypatch.setattr("avatar.training.refinement.config.RefineConfig", quick)
+    for module in ("avatar.training.recipe", "avatar.training.refinement.config"):
+        monkeypatch.setattr(f"{module}.RefineConfig", quick)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render.api import rasterize
+from avatar.rendering.api import rasterize
 from avatar.runtime import AvatarPlayer
 from smplxpp.cloth import ClothDriver, ClothShape
 from smplxpp.core.errors import InputError

@@ -20,7 +20,7 @@ from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.render.avatar_view import Rendering, render_view
+from avatar.rendering.avatar_view import Rendering, render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar
 from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup

@@ -12,7 +12,7 @@ from torch import Tensor
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians, WorldGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
-from avatar.render.api import rasterize
+from avatar.rendering.api import rasterize
 from avatar.training.refinement.config import RefineConfig
 
 EPS2D = 0.1

@@ -16,8 +16,8 @@ from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels, ve
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.render.avatar_view import Rendering
-from avatar.render.mesh_maps import mesh_maps
+from avatar.rendering.avatar_view import Rendering
+from avatar.rendering.mesh_maps import mesh_maps
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Motion
 from avatar.training.engine.device import fixed_seed

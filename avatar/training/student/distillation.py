@@ -16,8 +16,8 @@ from avatar.data.views import View
 from avatar.losses.deformation import semantic_labels
 from avatar.losses.reconstruction import Target
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.render.avatar_view import render_view
-from avatar.render.mesh_maps import MeshMapsTensor, front_back_maps
+from avatar.rendering.avatar_view import render_view
+from avatar.rendering.mesh_maps import MeshMapsTensor, front_back_maps
 from avatar.rig.posed import PosedAvatar
 
 SEEN = 0.5

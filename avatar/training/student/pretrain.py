@@ -16,7 +16,7 @@ from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.render.mesh_maps import vertex_normals
+from avatar.rendering.mesh_maps import vertex_normals
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
 

@@ -21,7 +21,7 @@ def source(frames, **options) -> DistillationTargets:
 
 
 def test_targets_show_what_the_teacher_renders(frames):
-    from avatar.render.avatar_view import render_view
+    from avatar.rendering.avatar_view import render_view
 
     own, views = source(frames), [frames.view(name, 1) for name in ("Ring0", "Ring2")]
     targets = own.of_views(1, views)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.gaussians.quaternions import matrix_from_quat
-from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
+from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
 
 BLOCK = 16
 """Side in pixels of the square blocks that are blended at once."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.render.api import rasterize
+from avatar.rendering.api import rasterize
 
 if TYPE_CHECKING:
     from avatar.data.views import View

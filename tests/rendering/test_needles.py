@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render import cpu
-from avatar.render.native import Workspace
+from avatar.rendering import cpu
+from avatar.rendering.native import Workspace
 from smplxpp import native
-from tests.render.scenes import Scene, away_from_thresholds, draw, gradients, look_at
+from tests.rendering.scenes import Scene, away_from_thresholds, draw, gradients, look_at
 
 GRADIENT_TOLERANCE = 5e-5
 """Largest error of a gradient, as a share of its largest entry; before double precision it came to 5e-1."""

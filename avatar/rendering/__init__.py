@@ -1,6 +1,6 @@
 """Differentiable rasterisation: one signature, the backend chosen by the tensors' device."""
 
-from avatar.render.api import rasterize
-from avatar.render.settings import RasterMeta, RasterSettings
+from avatar.rendering.api import rasterize
+from avatar.rendering.settings import RasterMeta, RasterSettings
 
 __all__ = ["RasterMeta", "RasterSettings", "rasterize"]

@@ -20,15 +20,15 @@ from torch import Tensor
 
 from avatar.gaussians.gather import gather_rows
 from avatar.gaussians.native_kernels import is_native
-from avatar.render.barycentrics import barycentrics_reference, interpolate_reference
-from avatar.render.native_maps import BarycentricFunction, InterpolateFunction
+from avatar.rendering.barycentrics import barycentrics_reference, interpolate_reference
+from avatar.rendering.native_maps import BarycentricFunction, InterpolateFunction
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.native import thread_count
 from smplxpp.raster import MeshMaps, rasterize_triangles
 
 if TYPE_CHECKING:
-    from avatar.render.map_frame import MapFrame
+    from avatar.rendering.map_frame import MapFrame
 
 
 @dataclass(frozen=True)

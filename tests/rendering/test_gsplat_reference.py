@@ -25,13 +25,13 @@ from avatar.export.posed import posed_splats
 from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.spherical_harmonics import C0, coefficient_count, sh_basis, view_colors
-from avatar.render.gsplat_backend import SUPPORTED
-from avatar.render.map_frame import MapFrame
-from avatar.render.reference import _project, rasterize_reference
-from avatar.render.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
+from avatar.rendering.gsplat_backend import SUPPORTED
+from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.reference import _project, rasterize_reference
+from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from smplxpp.core.camera import Camera
 from tests.gaussians.bound_scenes import random_bound, sphere
-from tests.render.scenes import Scene, draw, random_scene
+from tests.rendering.scenes import Scene, draw, random_scene
 
 pytestmark = pytest.mark.slow
 

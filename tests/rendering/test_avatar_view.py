@@ -8,8 +8,8 @@ import torch
 from avatar.data.sequence import camera_centers_of
 from avatar.data.views import View
 from avatar.models.student import Student, StudentConfig
-from avatar.render.api import rasterize
-from avatar.render.avatar_view import render_view
+from avatar.rendering.api import rasterize
+from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Rig
 from tests.dolls.dancing import HEIGHT, WIDTH, cameras, dance, gaussians, template, varied

@@ -8,11 +8,11 @@ import threading
 import pytest
 import torch
 
-from avatar.render import memory, native, rasterize
-from avatar.render.cpu import rasterize_cpu
-from avatar.render.settings import RasterSettings
+from avatar.rendering import memory, native, rasterize
+from avatar.rendering.cpu import rasterize_cpu
+from avatar.rendering.settings import RasterSettings
 from smplxpp.core.errors import InputError
-from tests.render.scenes import Scene, random_scene
+from tests.rendering.scenes import Scene, random_scene
 
 NAMES = ("means", "quats", "scales", "opacities", "features", "viewmats", "Ks", "background")
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.render.settings import RasterSettings
+from avatar.rendering.settings import RasterSettings
 from smplxpp.core.errors import InputError
 from smplxpp.native import MOST_SIDE
 

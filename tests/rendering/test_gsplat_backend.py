@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render import RasterSettings, rasterize
-from avatar.render.gsplat_backend import rasterize_gsplat
-from avatar.render.reference import rasterize_reference
+from avatar.rendering import RasterSettings, rasterize
+from avatar.rendering.gsplat_backend import rasterize_gsplat
+from avatar.rendering.reference import rasterize_reference
 from smplxpp.core.errors import InputError, MissingExtraError
-from tests.render.scenes import Scene, random_scene
+from tests.rendering.scenes import Scene, random_scene
 
 NAMES = ("means", "quats", "scales", "opacities", "features", "viewmats", "Ks", "background")
 
@@ -131,8 +131,8 @@ def test_cpu_tensors_do_not_reach_gsplat():
 
 def test_importing_the_renderer_imports_no_backend():
     code = (
-        "import sys, avatar.render, avatar.render.gsplat_backend;"
-        "print([m for m in sys.modules if m.startswith(('gsplat', 'avatar.render.cpu'))])"
+        "import sys, avatar.rendering, avatar.rendering.gsplat_backend;"
+        "print([m for m in sys.modules if m.startswith(('gsplat', 'avatar.rendering.cpu'))])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True)
     assert done.stdout.strip() == "[]"

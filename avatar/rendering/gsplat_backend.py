@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.render.reference import camera_depths
-from avatar.render.settings import RasterMeta, RasterSettings
+from avatar.rendering.reference import camera_depths
+from avatar.rendering.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError, MissingExtraError
 
 SUPPORTED = "1.5."

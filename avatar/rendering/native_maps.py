@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.render.barycentrics import ray_from_pixel
-from avatar.render.memory import pooled_empty
+from avatar.rendering.barycentrics import ray_from_pixel
+from avatar.rendering.memory import pooled_empty
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.native import address, native_library, thread_count

@@ -9,8 +9,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from avatar.render.list_limit import list_bytes, too_many_entries
-from avatar.render.settings import RasterSettings
+from avatar.rendering.list_limit import list_bytes, too_many_entries
+from avatar.rendering.settings import RasterSettings
 from smplxpp.native import OverLimitError, address, native_library, thread_count
 
 STAGES = ("project", "sort", "bin", "blend", "unblend", "chain")

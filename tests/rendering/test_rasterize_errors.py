@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar.render import rasterize
+from avatar.rendering import rasterize
 from smplxpp.core.errors import InputError
-from tests.render.scenes import Scene, facing_scene, random_scene
+from tests.rendering.scenes import Scene, facing_scene, random_scene
 
 TENSORS = ("means", "quats", "scales", "opacities", "features", "viewmats", "Ks", "background")
 

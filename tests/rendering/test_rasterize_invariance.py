@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from avatar.render import rasterize
-from tests.render.backends import ALL_BACKENDS, FAST_BACKENDS, GRADIENT_TOLERANCE, IMAGE_TOLERANCE
-from tests.render.scenes import LEAVES, Scene, draw, gradients, random_scene
+from avatar.rendering import rasterize
+from tests.rendering.backends import ALL_BACKENDS, FAST_BACKENDS, GRADIENT_TOLERANCE, IMAGE_TOLERANCE
+from tests.rendering.scenes import LEAVES, Scene, draw, gradients, random_scene
 
 REARRANGED = 10
 """Two ways of computing the same image may each be this many times off the tolerance of one: inputs are rounded too."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.render import list_limit, rasterize
+from avatar.rendering import list_limit, rasterize
 from smplxpp.core.errors import InputError
 
 

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.render.reference import camera_depths, rasterize_reference
-from avatar.render.settings import RasterMeta, RasterSettings
-from avatar.render.validation import check_layout, check_values, checked_settings
+from avatar.rendering.reference import camera_depths, rasterize_reference
+from avatar.rendering.settings import RasterMeta, RasterSettings
+from avatar.rendering.validation import check_layout, check_values, checked_settings
 from smplxpp.core.errors import InputError
 
 BACKENDS = ("cpu", "gsplat", "reference")
@@ -136,10 +136,10 @@ def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[...
             remedy="detach it, or name backend='reference'",
         )
     if chosen == "gsplat":
-        from avatar.render.gsplat_backend import rasterize_gsplat
+        from avatar.rendering.gsplat_backend import rasterize_gsplat
 
         return rasterize_gsplat
-    from avatar.render.cpu import rasterize_cpu
+    from avatar.rendering.cpu import rasterize_cpu
 
     return rasterize_cpu
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render.reference import BLOCK, rasterize_reference
-from avatar.render.settings import RasterSettings
-from tests.render.scalar_rasterizer import alphas_of, depths_of, project, rasterize_scalar
-from tests.render.scenes import Scene, draw, random_scene
+from avatar.rendering.reference import BLOCK, rasterize_reference
+from avatar.rendering.settings import RasterSettings
+from tests.rendering.scalar_rasterizer import alphas_of, depths_of, project, rasterize_scalar
+from tests.rendering.scenes import Scene, draw, random_scene
 
 
 def arguments(scene: Scene) -> tuple:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from tests.render.scenes import Scene
+    from tests.rendering.scenes import Scene
 
 
 def depths_of(scene: Scene, camera: int) -> np.ndarray:

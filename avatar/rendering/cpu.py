@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.render.memory import pooled_empty
-from avatar.render.native import CameraCall, Workspace
-from avatar.render.settings import RasterMeta, RasterSettings
+from avatar.rendering.memory import pooled_empty
+from avatar.rendering.native import CameraCall, Workspace
+from avatar.rendering.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
 
 MAX_COUNT = 2**31 - 1

@@ -5,9 +5,9 @@ import pytest
 import torch
 import trimesh
 
-from avatar.render.barycentrics import barycentrics_reference
-from avatar.render.map_frame import MapFrame
-from avatar.render.mesh_maps import front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
+from avatar.rendering.barycentrics import barycentrics_reference
+from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.render import RasterMeta, rasterize
-from tests.render.scalar_rasterizer import alphas_of, depths_of
+from avatar.rendering import RasterMeta, rasterize
+from tests.rendering.scalar_rasterizer import alphas_of, depths_of
 
 LEAVES = ("means", "quats", "scales", "opacities", "features", "background", "viewmats")
 """What the fast backends give gradients to."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render import rasterize
-from tests.render.backends import ALL_BACKENDS, IMAGE_TOLERANCE
-from tests.render.scenes import Scene, draw, facing_scene, random_scene
+from avatar.rendering import rasterize
+from tests.rendering.backends import ALL_BACKENDS, IMAGE_TOLERANCE
+from tests.rendering.scenes import Scene, draw, facing_scene, random_scene
 
 FOCAL = 20.0
 BLUR = 0.3

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.render import cpu, rasterize
-from avatar.render.native import Workspace
+from avatar.rendering import cpu, rasterize
+from avatar.rendering.native import Workspace
 from smplxpp import native
-from tests.render.scenes import Scene, draw, facing_scene, gradients, random_scene
+from tests.rendering.scenes import Scene, draw, facing_scene, gradients, random_scene
 
 IMAGE_TOLERANCE = {"avx512": 1e-6, "avx2": 1e-6, "generic": 2e-6}
 """Largest error of values of order 1; without fused multiply-add every product is rounded once more."""
