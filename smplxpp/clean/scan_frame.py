@@ -80,9 +80,9 @@ def _surface(vertices: np.ndarray, faces: np.ndarray) -> SurfacePoints:
     if not len(kept) or not TriangleMesh(safe, kept).face_areas.sum() > 0:
         raise InputError("scan", expected="a surface with faces that have an area", received="none")
     mesh = TriangleMesh(safe, kept)
-    surface = SurfacePoints.of(mesh, _SCAN_POINTS)
+    surface = SurfacePoints.sample(mesh, _SCAN_POINTS)
     outwards = np.einsum("nx,nx->", surface.normals, surface.points - surface.points.mean(axis=0)) >= 0
-    return surface if outwards else SurfacePoints.made(surface.points, -surface.normals, surface.face)
+    return surface if outwards else SurfacePoints.from_arrays(surface.points, -surface.normals, surface.face)
 
 
 def _units(height: float) -> str:
@@ -107,7 +107,7 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
         scale = np.ptp(body_points[:, 1]) / max(high - low, 1e-12)
         placed = points * scale
         placed[:, 1] += body_points[:, 1].min() - placed[:, 1].min()
-        there = SurfacePoints.made(placed, normals)
+        there = SurfacePoints.from_arrays(placed, normals)
         for k in range(_DIRECTIONS):
             turn = matrix_from_rotvec(np.array([0.0, 2.0 * np.pi * k / _DIRECTIONS, 0.0]))
             best = min(best, truncated_distance(body_points @ turn.T, body_normals @ turn.T, there))
@@ -123,7 +123,7 @@ def _bodies() -> _Bodies:
     )
     out = []
     for vertices in body.forward(params).vertices:
-        drawn = SurfacePoints.of(body.mesh(vertices), _BODY_POINTS)
+        drawn = SurfacePoints.sample(body.mesh(vertices), _BODY_POINTS)
         middle = drawn.points.mean(axis=0) * np.array([1.0, 0.0, 1.0])
         out.append((drawn.points - middle, drawn.normals))
     return out

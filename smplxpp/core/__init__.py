@@ -1,4 +1,4 @@
-"""Data types in which the stages meet."""
+"""Data types that the stages exchange, and the errors that they raise."""
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError, ProgressCallback

@@ -1,4 +1,4 @@
-"""Pinhole and orthographic cameras in OpenCV's convention: x right, y down, z forward, pixel centres at +0.5."""
+"""Define pinhole and orthographic cameras in OpenCV's axes (x right, y down, z forward), pixel centres at +0.5."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from smplxpp.core.errors import InputError
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera without distortion.
+    """A pinhole or orthographic camera without lens distortion.
 
     Attributes:
         K: (3, 3) intrinsics in pixels. For an orthographic camera the focal lengths are pixels a metre.
         cam_from_world: (4, 4) rigid transform, `x_cam = R x_world + t`.
-        width, height: image size in pixels.
+        width: of the image in pixels.
+        height: of the image in pixels.
         orthographic: parallel projection instead of a pinhole.
         name: for messages and files.
     """
@@ -47,17 +48,17 @@ class Camera:
 
     @property
     def position(self) -> Float64[np.ndarray, " 3"]:
-        """The centre of projection in the world (meaningless for an orthographic camera)."""
+        """Centre of projection in world coordinates; meaningless for an orthographic camera."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @property
     def forward(self) -> Float64[np.ndarray, " 3"]:
-        """The unit viewing direction in the world."""
+        """Unit viewing direction in world coordinates."""
         return self.cam_from_world[2, :3]
 
     def screen_from_world(self, points: Num[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
-        """Project world points: x, y in pixels, depth in metres, interpolation weight (1/z, or 1)."""
-        # Coordinates as rows: every step then runs along memory.
+        """Project world points to x, y in pixels, depth in metres and interpolation weight (1/z, orthographic 1)."""
+        # One row per coordinate, so that every operation reads contiguous memory.
         cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]
         screen = np.empty((4, cam.shape[1]))
         screen[2] = cam[2]
@@ -67,17 +68,17 @@ class Camera:
         return screen.T
 
     def cropped(self, box: tuple[float, float, float, float], *, size: tuple[int, int] | None = None) -> Camera:
-        """The camera of a rectangle of the image, resampled where a size is given.
+        """Return the camera of a rectangle of the image, resampled where a size is given.
 
         With pixel centres at +0.5 the image spans [0, width] x [0, height], and a point at x is at
         `(x - x0) * width / (x1 - x0)` afterwards: principal point and focal lengths follow.
 
         Args:
-            box: x0, y0, x1, y1 in pixels; it may reach beyond the image.
+            box: x0, y0, x1, y1 in pixels; it may extend past the image.
             size: width and height of the result; None keeps the resolution, and the box must be of whole pixels.
 
         Raises:
-            InputError: an empty box, or one of a part of a pixel without a size.
+            InputError: an empty box, or fractional pixels without a size.
         """
         x0, y0, x1, y1 = box
         if not (x0 < x1 and y0 < y1) or (size is None and not all(float(edge).is_integer() for edge in box)):
@@ -92,26 +93,27 @@ class Camera:
         return replace(self, K=window_from_full @ self.K, width=width, height=height)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of the whole image at another resolution."""
+        """Return the camera of the whole image at another resolution."""
         return self.cropped((0, 0, self.width, self.height), size=(width, height))
 
     @staticmethod
     def look_at(
         *, eye: np.ndarray, target: np.ndarray, fov_y_deg: float, width: int, height: int, up: tuple = (0.0, 1.0, 0.0)
     ) -> Camera:
-        """Pinhole camera at `eye` looking at `target` (world, metres), vertical field of view in degrees."""
+        """Return a pinhole camera at `eye` looking at `target` (world, metres) with a vertical angle of view in degrees."""
         f = 0.5 * height / np.tan(np.radians(fov_y_deg) / 2)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
         return Camera(K, _look_at_pose(np.asarray(eye, float), np.asarray(target, float), up), width, height)
 
     @staticmethod
     def orthographic_view(*, center: np.ndarray, direction: np.ndarray, half_extent: float, size: int) -> Camera:
-        """Square parallel view of the ball about `center` with radius `half_extent`, seen along `-direction`.
+        """Return a square parallel view of the ball about `center` with radius `half_extent`, seen along `-direction`.
 
         `direction` points from the centre to the camera.
         """
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
         eye = np.asarray(center, float) + direction * 2.0 * half_extent
+        # A view along the vertical takes +z as its upper edge, because +y has no direction in the image.
         up = (0.0, 1.0, 0.0) if abs(direction[1]) < 0.99 else (0.0, 0.0, 1.0)
         scale = size / (2.0 * half_extent)
         K = np.array([[scale, 0, size / 2], [0, scale, size / 2], [0, 0, 1.0]])

@@ -14,10 +14,10 @@ def ignore_progress(step: str, share: float) -> None:
 
 
 class InputError(ValueError):
-    """Input that cannot be used. Raised before work starts; nothing has been written.
+    """Input that cannot be used; raised before work starts and before anything is written.
 
     Args:
-        subject: what is wrong, in the user's words ("scan vertices", "file scan.ply").
+        subject: what was given, in the user's words ("scan vertices", "file scan.ply").
         expected: what would have been accepted.
         received: what was found instead.
         remedy: what the user can do about it (optional).
@@ -30,17 +30,17 @@ class InputError(ValueError):
 
 
 class GeometryWarning(UserWarning):
-    """A stated repair or a doubtful quantity: the result is usable, the user should look."""
+    """A repair that was made or a questionable quantity: the result is usable, but should be looked at."""
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is not installed.
+    """An optional dependency that is not installed, or does not start.
 
     Args:
-        package: its name.
-        extra: of smplxpp that brings it.
+        package: name of the dependency.
+        extra: extra of smplxpp that installs it.
         purpose: what needs it.
-        apt: packages of the system that it needs on Debian and Ubuntu; named where it is installed but does not start.
+        apt: system packages that it needs on Debian and Ubuntu, for a package that is installed but does not start.
     """
 
     def __init__(self, package: str, *, extra: str, purpose: str, apt: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Keypoints2D: what a detector saw in the images of one camera, by name."""
+"""Hold the keypoints that a detector found in the images of one camera, by name."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from smplxpp.core.errors import InputError
 class Keypoints2D:
     """Keypoints of one camera in F frames; pixels of the undistorted image, centres at +0.5.
 
-    Names are of one vocabulary whatever the detector's own. A name of the body's joints (`smplxpp.body.layout`) means
-    that joint's centre. What detectors mark otherwise has a name of its own: `coco_left_hip` and the like for the body
-    points as COCO's annotators set them, `nose`, `left_ear`, `left_heel`, `left_big_toe`, `left_small_toe`,
+    All detectors share one vocabulary. The name of a body joint (`smplxpp.body.layout`) means the centre of that joint.
+    Other landmarks have names of their own: `coco_left_hip` and similar for body points as COCO's annotators place
+    them, `nose`, `left_ear`, `left_heel`, `left_big_toe`, `left_small_toe`,
     `left_index_tip` (and the other fingers), `face_17` to `face_67` for dlib's points of brows, nose, eyes and mouth.
 
     Attributes:
-        names: of K points, each once.
+        names: of the K points, all different.
         frames: numbers of the frames, ascending.
         points: pixels; meaningless where the confidence is 0.
-        confidence: from 0 (not there) to 1.
+        confidence: 0 (not seen) to 1.
 
     Raises:
-        InputError: shapes that do not fit, names or frames given twice, confidences that are none, points that are not
-            finite although they count.
+        InputError: shapes that do not match, duplicate names or frames, confidences outside [0, 1], or points that are
+            not finite although their confidence is above 0.
     """
 
     names: tuple[str, ...]
@@ -62,7 +62,7 @@ class Keypoints2D:
         object.__setattr__(self, "confidence", confidence)
 
     def select(self, names: Sequence[str], frames: Sequence[int]) -> Keypoints2D:
-        """The same with these names and frames in this order; what is not there has confidence 0."""
+        """Return the keypoints with these names and frames, in this order; missing ones have confidence 0."""
         columns, rows = {n: k for k, n in enumerate(self.names)}, {int(f): k for k, f in enumerate(self.frames)}
         points, confidence = np.zeros((len(frames), len(names), 2)), np.zeros((len(frames), len(names)))
         to_row = [k for k, frame in enumerate(frames) if frame in rows]

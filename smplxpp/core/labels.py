@@ -1,4 +1,4 @@
-"""The semantic labels of a clothed person: 4D-Dress's classes, with our names and colours."""
+"""Define the semantic labels of a clothed person: the classes of 4D-Dress, with names and colours."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxtyping import Integer, UInt8
 
 @dataclass(frozen=True)
 class Label:
-    """A semantic class.
+    """A semantic class of the surface of a clothed person.
 
     Attributes:
-        id: 4D-Dress's number.
-        name: ours.
-        display_rgb: 4D-Dress's colour, for pictures.
-        semantic_rgb: the colour that the trainer sees (TaoAvatar: hair yellow, clothes red).
-        face_budget: faces kept by default when a part of this label is simplified (TaoAvatar).
+        id: number of the class in 4D-Dress.
+        name: name of the class in this project.
+        display_rgb: colour in pictures, that of 4D-Dress.
+        semantic_rgb: colour in the label maps that a training reads (TaoAvatar: hair yellow, clothes red).
+        face_budget: number of faces that simplification keeps of a part with this label (TaoAvatar).
     """
 
     id: int
@@ -36,19 +36,20 @@ OUTER = Label(5, "outer", (0, 128, 255), (255, 0, 0), 20_000)
 
 LABELS: tuple[Label, ...] = (SKIN, HAIR, SHOE, UPPER, LOWER, OUTER)
 BACKGROUND = -1
+"""Label id of pixels and faces that show no part of the person."""
 CLOTH_LABELS: tuple[Label, ...] = (UPPER, LOWER, OUTER)
 LAYER_ORDER: tuple[int, ...] = (SHOE.id, LOWER.id, UPPER.id, OUTER.id, HAIR.id)
-"""From the skin outwards: a shirt hangs over trousers, trousers over shoes, hair over everything."""
+"""Label ids from the innermost to the outermost layer: shoes, trousers, shirt, coat, hair."""
 LABEL_BY_NAME: dict[str, Label] = {label.name: label for label in LABELS}
 
 
 def display_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
-    """The display colours of label ids; background black."""
+    """Return the display colours of label ids; the background is black."""
     table = np.array([label.display_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]
 
 
 def semantic_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:
-    """The semantic colours of label ids; background black."""
+    """Return the semantic colours of label ids; the background is black."""
     table = np.array([label.semantic_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     return table[np.asarray(label_ids)]

@@ -1,8 +1,8 @@
-"""Light from all around as what a matt surface takes of it: nine harmonics of the irradiance, and colours under it.
+"""Compute diffuse irradiance from an environment by nine spherical harmonics, relight colours, and make panoramas.
 
 Ramamoorthi and Hanrahan, An efficient representation for irradiance environment maps (SIGGRAPH 2001). TaoAvatar shades
-its pictures so: "we use the raw rendered image as the base color and apply shading with new environment light based on
-the rendered normal map". What the captured light has done is divided out where it is known.
+its pictures in the same manner: "we use the raw rendered image as the base color and apply shading with new
+environment light based on the rendered normal map". The irradiance of the capture is divided out where it is known.
 """
 
 from __future__ import annotations
@@ -16,18 +16,16 @@ from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_positive
 
-# Of the cosine lobe over pi, by degree: 1, 2/3, 1/4, and what odd degrees above have: nothing.
+# Harmonics of the clamped cosine over pi, repeated for the orders of degrees 0, 1 and 2; higher degrees are dropped.
 _LOBE = np.repeat([1.0, 2.0 / 3.0, 0.25], [1, 3, 5])
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_DARKEST = 0.02  # of a captured light: colours there would be noise
 
 
 @dataclass(frozen=True, eq=False)
 class Irradiance:
-    """Light that a matt surface takes, over pi: a white one in it has this radiance.
+    """Irradiance of a diffuse surface over pi, which is the radiance of a white surface in this light.
 
     Attributes:
-        coefficients: of the light's own radiance, real harmonics up to degree 2, by colour.
+        coefficients: real harmonics up to degree 2 of the light's radiance, a column for each of R, G and B.
     """
 
     coefficients: Float64[np.ndarray, "9 3"]
@@ -40,41 +38,42 @@ class Irradiance:
 
     @staticmethod
     def uniform(radiance: float = 1.0) -> Irradiance:
-        """White light, the same from everywhere: what a capture is taken to have had where nobody knows better."""
+        """Return white light of equal radiance in all directions, the assumption for captures of unknown light."""
         coefficients = np.zeros((9, 3))
         coefficients[0] = radiance * np.sqrt(4.0 * np.pi)
         return Irradiance(coefficients)
 
     @staticmethod
     def of_environment(picture: Float[np.ndarray, "H W 3"], *, turn: float = 0.0) -> Irradiance:
-        """Take the harmonics of a panorama, an equirectangular picture in linear light, its first row straight above.
+        """Project a panorama, an equirectangular picture in linear light whose first row is the zenith, onto harmonics.
 
         The middle column is +X and columns go on to +Z, as in glTF's viewers.
 
         Args:
-            turn: degrees about +Y by which the light is turned.
+            turn: rotation of the light about +Y, degrees.
 
         Raises:
             InputError: negative light, NaN or infinity, or no light at all.
         """
         if not np.isfinite(picture).all() or picture.min(initial=0.0) < 0.0 or not picture.any():
-            raise InputError("panorama", expected="finite light, not negative, some of it", received="others")
+            raise InputError("panorama", expected="finite light, not negative, not all zero", received="others")
         height, width = picture.shape[:2]
+        # Solid angle of a pixel: the difference of cos(polar angle) at the row's edges times its width in radians.
         edges = np.cos(np.linspace(0.0, np.pi, height + 1))
         solid = (edges[:-1] - edges[1:]) * (2.0 * np.pi / width)
         total = np.zeros((9, 3))
-        for row in range(height):  # not all at once: panoramas are large
+        for row in range(height):  # row by row, because panoramas are large
             of_row = harmonics(panorama_directions(height, width, turn=turn, rows=slice(row, row + 1))[0])
             total += solid[row] * of_row.T @ picture[row].astype(np.float64)
         return Irradiance(total)
 
     @property
     def mean(self) -> float:
-        """Luminance of the light, the mean over all directions."""
-        return float(_LUMINANCE @ self.coefficients[0] / np.sqrt(4.0 * np.pi))
+        """Mean luminance of the light over all directions (Rec. 709 weights)."""
+        return float(np.array([0.2126, 0.7152, 0.0722]) @ self.coefficients[0] / np.sqrt(4.0 * np.pi))
 
     def exposed(self, factor: float | None = None) -> Irradiance:
-        """Return the light times a factor; None: as bright, in the mean, as white light of radiance 1."""
+        """Return the light times a factor; None scales it to the mean luminance of white light of radiance 1."""
         if factor is None:
             factor = 1.0 / max(self.mean, 1e-12)
         require_positive("exposure", factor)
@@ -97,7 +96,7 @@ def harmonics(directions: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 
 def panorama_directions(
     height: int, width: int, *, turn: float = 0.0, rows: slice = slice(None)
 ) -> Float64[np.ndarray, "H W 3"]:
-    """Return where the middles of an equirectangular picture's pixels lie: unit vectors, +Y up."""
+    """Return the unit direction of each pixel centre of an equirectangular picture, +Y up."""
     polar = ((np.arange(height) + 0.5) * np.pi / height)[rows]
     around = ((np.arange(width) + 0.5) / width - 0.5) * 2.0 * np.pi - np.radians(turn)
     level = np.sin(polar)[:, None]
@@ -107,35 +106,42 @@ def panorama_directions(
 
 @dataclass(frozen=True, eq=False)
 class Relighting:
-    """One light in another's place.
+    """Replacement of the light of a capture by another light.
 
     Attributes:
-        light: new. captured: in which the colours were photographed.
+        light: new light.
+        captured: light of the photographs.
     """
 
     light: Irradiance
     captured: Irradiance
 
     def factor(self, normals: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3"]:
-        """Return by what linear colours of surfaces change; 1 where there is no normal."""
+        """Return the factor of linear colours of surfaces with these normals; 1 where a normal is zero."""
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         unit = normals / np.maximum(length, 1e-9)
-        change = self.light.at(unit) / np.maximum(self.captured.at(unit), _DARKEST)
+        # Floor of the captured irradiance: darker surfaces hold more noise than colour.
+        darkest = 0.02
+        change = self.light.at(unit) / np.maximum(self.captured.at(unit), darkest)
         return np.where(length > 1e-6, change, 1.0)
 
     def colors(
         self, srgb: Float[np.ndarray, "*N 3"], normals: Float[np.ndarray, "*N 3"]
     ) -> Float64[np.ndarray, "*N 3"]:
-        """Return sRGB colours in [0, 1] under the new light; beyond white is cut off."""
+        """Return sRGB colours in [0, 1] under the new light, clipped at white."""
         linear = linear_from_srgb(np.clip(srgb, 0.0, 1.0)) * self.factor(normals)
         return srgb_from_linear(np.minimum(linear, 1.0))
 
 
 STUDIO = "two lamps"
+"""Name of the panorama with two studio lamps in `panoramas()`."""
 
 
 def panoramas(height: int = 64) -> dict[str, Float64[np.ndarray, "H W 3"]]:
-    """Return linear light by name, twice as wide as high: a low sun, a wood, two lamps of a studio."""
+    """Return synthetic panoramas in linear light by name, twice as wide as high: low sun, wood, two studio lamps.
+
+    They serve as lights where none is given, and as known truth in measurements of relighting.
+    """
     towards = panorama_directions(height, 2 * height)
 
     def lamp(place: tuple[float, float, float], color: tuple[float, float, float], sharp: float) -> np.ndarray:

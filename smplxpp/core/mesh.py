@@ -1,4 +1,4 @@
-"""TriangleMesh: the geometry that every stage takes and returns."""
+"""Define TriangleMesh, the geometry that every stage takes and returns."""
 
 from __future__ import annotations
 
@@ -98,34 +98,34 @@ class TriangleMesh:
 
     @cached_property
     def triangles(self) -> Float64[np.ndarray, "M 3 3"]:
-        """The positions of each face's corners."""
+        """Positions of the corners of each face."""
         return self.vertices[self.faces]
 
     @cached_property
     def face_centers(self) -> Float64[np.ndarray, "M 3"]:
-        """The means of the corners."""
+        """Mean of the three corners of each face."""
         t = self.triangles
         return (t[:, 0] + t[:, 1] + t[:, 2]) / 3.0
 
     @cached_property
     def face_cross(self) -> Float64[np.ndarray, "M 3"]:
-        """The faces' normals, of length twice the area."""
+        """Face normals, of length twice the face's area."""
         t = self.triangles
         return np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
 
     @cached_property
     def face_areas(self) -> Float64[np.ndarray, " M"]:
-        """The faces' areas, square metres."""
+        """Area of each face, square metres."""
         return 0.5 * row_lengths(self.face_cross)
 
     @cached_property
     def face_normals(self) -> Float64[np.ndarray, "M 3"]:
-        """The faces' unit normals; zero for a face without area."""
+        """Unit normal of each face; zero for a face without area."""
         return normalize_rows(self.face_cross)
 
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "N 3"]:
-        """The unit normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
+        """Unit vertex normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
         t, normals = self.triangles, self.face_normals
         out = np.zeros_like(self.vertices)
         for k in range(3):
@@ -138,7 +138,7 @@ class TriangleMesh:
 
     @cached_property
     def referenced(self) -> Int64[np.ndarray, " n"]:
-        """The vertices that a face uses, in increasing order."""
+        """Indices of vertices that a face uses, in increasing order."""
         return _occurring(self.faces, self.vertex_count)
 
     @cached_property
@@ -151,12 +151,12 @@ class TriangleMesh:
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "E 2"]:
-        """The undirected edges, each once, lower index first, sorted."""
+        """Undirected edges, each once, lower index first, sorted."""
         return self.edges_with_counts[0]
 
     @cached_property
     def edges_with_counts(self) -> tuple[Int64[np.ndarray, "E 2"], Int64[np.ndarray, " E"]]:
-        """The undirected edges, and the number of faces at each."""
+        """Undirected edges, and the number of faces at each."""
         f = self.faces
         directed = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
         key = directed[:, 0] * max(self.vertex_count, 1) + directed[:, 1]
@@ -166,25 +166,25 @@ class TriangleMesh:
 
     @cached_property
     def border_edges(self) -> Int64[np.ndarray, "B 2"]:
-        """The edges with one face."""
+        """Edges on the border, which have exactly one face."""
         edges, counts = self.edges_with_counts
         return edges[counts == 1]
 
     @cached_property
     def face_pairs(self) -> Int64[np.ndarray, "P 2"]:
-        """The pairs of faces at an edge that has exactly two."""
+        """Pairs of faces that share an edge with exactly two faces."""
         order, first, count = edge_groups(self.faces)
         start = first[count == 2]
         return np.stack([order[start], order[start + 1]], axis=1) // 3
 
     def with_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> TriangleMesh:
-        """The same faces on other positions."""
+        """Return a mesh with the same faces and other vertex positions."""
         return replace(self, vertices=vertices)
 
     def submesh(
         self, face_mask: Bool[np.ndarray, " M"] | Integer[np.ndarray, " m"]
     ) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
-        """Faces selected by a mask or index array, unreferenced vertices dropped.
+        """Return the faces that a mask or index array selects, without unreferenced vertices.
 
         Returns the mesh and (n,) the index in this mesh of each of its vertices, in increasing order.
         """
@@ -241,25 +241,25 @@ def as_mesh(mesh: MeshLike, *, subject: str = "mesh") -> TriangleMesh:
 
 
 def _occurring(indices: np.ndarray, count: int) -> np.ndarray:
-    """The values among integers in [0, count), in increasing order."""
+    """Return the distinct values among integers in [0, count), in increasing order."""
     mask = np.zeros(count, dtype=bool)
     mask[indices.ravel()] = True
     return np.flatnonzero(mask)
 
 
 def row_lengths(x: Float[np.ndarray, "N D"]) -> Float[np.ndarray, " N"]:
-    """The lengths of the rows; several times as fast as `np.linalg.norm` where D is small."""
+    """Return the Euclidean length of each row; several times as fast as `np.linalg.norm` where D is small."""
     return np.sqrt(np.einsum("ij,ij->i", x, x))
 
 
 def normalize_rows(x: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
-    """Unit rows of (N, D); rows without length stay zero."""
+    """Scale each row of (N, D) to unit length; zero rows stay zero."""
     length = row_lengths(x)[:, None]
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 
 
 def concatenate_meshes(meshes: list[TriangleMesh]) -> TriangleMesh:
-    """All meshes as one, in order, nothing merged."""
+    """Concatenate meshes into one, in order, without merging vertices."""
     offsets = np.cumsum([0] + [m.vertex_count for m in meshes])
     return TriangleMesh(
         np.concatenate([m.vertices for m in meshes]),

@@ -1,4 +1,4 @@
-"""BodyParams: SMPL-X-family parameters of T frames."""
+"""Define BodyParams, the parameters of the SMPL-X family for T frames."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
 # Every array of BodyParams, in the order of its fields.
 ARRAY_NAMES: tuple[str, ...] = (*(name for name, _ in POSE_BLOCKS), "betas", "expression", "transl")
 DEFAULT_FPS = 30.0
-"""Frames per second of a motion or capture that states none: the rate of most cameras and of animation programs, and
-what glTF, BVH and USD players show smoothly. Files that state a rate keep theirs."""
+"""Frames per second of a motion or capture that states no rate: the common rate of cameras and animation programs, and
+the one that all exports had before there was one default. Files that state a rate keep theirs."""
 # Upper bound of the absolute value of radians, metres and coefficients. No valid file is near it, and squares of much
 # larger numbers overflow in float32.
 _LARGEST = 1e6
@@ -39,14 +39,19 @@ class BodyParams:
     Attributes:
         global_orient: (T, 3), about the root joint.
         body_pose: (T, 63).
-        jaw_pose, leye_pose, reye_pose: (T, 3).
-        left_hand_pose, right_hand_pose: (T, 45) axis-angle, or (T, P) PCA coefficients with P < 45.
-        betas: (T, B) shape. expression: (T, E). transl: (T, 3), added last.
-        v_shape: (1, V, 3) for all frames or (T, V, 3): metres added to the vertices of the shaped template, before its
-            joints are taken and it is posed: shape that no betas express (TalkBody4D). None: nothing is added.
-        fps: frames a second where the source says so.
-        flat_hand_mean: the hands are complete as they stand; a body model does not add its mean hand to them
-            (AMASS, AvatarReX). False: the mean hand of the model is added, after the PCA, as SMPL-X does by default.
+        jaw_pose: (T, 3).
+        leye_pose: (T, 3).
+        reye_pose: (T, 3).
+        left_hand_pose: (T, 45) axis-angle, or (T, P) PCA coefficients with P < 45.
+        right_hand_pose: as `left_hand_pose`.
+        betas: (T, B) shape coefficients.
+        expression: (T, E) expression coefficients.
+        transl: (T, 3), added after posing.
+        fps: frames per second where the source states them.
+        flat_hand_mean: whether hand poses are complete, so that the body model adds no mean hand (AMASS, AvatarReX).
+            False: the model's mean hand is added after the PCA, as SMPL-X does by default.
+        v_shape: (1, V, 3) for all frames or (T, V, 3): metres added to the shaped template before joints are regressed
+            and the body is posed, for shape that betas do not express (TalkBody4D). None: nothing is added.
 
     Raises:
         InputError: wrong widths, unequal numbers of frames (one frame stands for all), NaN or infinity.
@@ -69,6 +74,7 @@ class BodyParams:
     def __post_init__(self) -> None:
         width = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}
         frames = np.atleast_2d(np.asarray(self.global_orient)).shape[0]
+        # Every array: convert, check its width, repeat a single row for all frames, check its range, make it read-only.
         for name in ARRAY_NAMES:
             value = _numbers(name, getattr(self, name))
             expected = width.get(name)
@@ -89,7 +95,7 @@ class BodyParams:
             if bad.any():
                 raise InputError(
                     f"parameter {name}",
-                    expected=f"finite values, none beyond {_LARGEST:g}",
+                    expected=f"finite values up to {_LARGEST:g}",
                     received=f"others or NaN in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}",
                 )
             value.setflags(write=False)
@@ -107,7 +113,7 @@ class BodyParams:
 
     @property
     def full_pose(self) -> Float64[np.ndarray, "T 55 3"]:
-        """The axis-angle vectors of all joints in SMPL-X order.
+        """Axis-angle vectors of all joints in SMPL-X order.
 
         Raises:
             InputError: hands given as PCA coefficients, which only a body model can expand.
@@ -128,18 +134,18 @@ class BodyParams:
         return self.select([index % len(self)])
 
     def select(self, indices: slice | Sequence[int] | np.ndarray) -> BodyParams:
-        """The frames named by indices, a mask or a slice."""
+        """Return the frames that indices, a mask or a slice select."""
         offsets = self.v_shape if self.v_shape is None or len(self.v_shape) == 1 else self.v_shape[indices]
         return self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES}, offsets)
 
     def without_shape(self) -> BodyParams:
-        """The poses alone, for a body that has the person's shape already: no betas, nothing added to the vertices."""
+        """Return the poses without betas and `v_shape`, for a body that already has the person's shape."""
         return replace(self, betas=np.zeros((len(self), 0)), v_shape=None)
 
     def offsets_by_row(self, frames: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
-        """`v_shape`, where there is any, for a file whose row is the frame's number: NaN where there is no frame.
+        """Return `v_shape` (if any) for a file whose row index is the frame number, NaN in rows without a frame.
 
-        One row stands for all frames where it does here.
+        A single row that stands for all frames stays a single row.
         """
         if self.v_shape is None or len(self.v_shape) == 1:
             return {} if self.v_shape is None else {"v_shape": self.v_shape}
@@ -149,10 +155,10 @@ class BodyParams:
 
     @staticmethod
     def concatenate(parts: Sequence[BodyParams]) -> BodyParams:
-        """Frames of several BodyParams in order; widths, `fps`, `flat_hand_mean` and having `v_shape` must agree.
+        """Concatenate frames of several BodyParams; widths, `fps`, `flat_hand_mean` and having `v_shape` must agree.
 
         Raises:
-            InputError: nothing to join, or parts that do not fit.
+            InputError: no parts, or parts that disagree.
         """
         if not parts:
             raise InputError("parameters to join", expected="at least one part", received="none")
@@ -175,7 +181,7 @@ class BodyParams:
         expressions: int = 10,
         v_shape: Float[np.ndarray, "S V 3"] | None = None,
     ) -> BodyParams:
-        """The zero pose (T-pose) of one frame; `betas` as values (B,) or as their number."""
+        """Return one frame in the zero pose (T-pose); `betas` as values (B,) or as their number."""
         values = np.zeros(betas) if isinstance(betas, int) else np.asarray(betas)
         arrays = _zero_pose() | {"betas": values, "expression": np.zeros(expressions), "transl": np.zeros(3)}
         return _from_arrays(arrays if v_shape is None else arrays | {"v_shape": v_shape})
@@ -190,7 +196,7 @@ class BodyParams:
         fps: float | None = None,
         flat_hand_mean: bool = False,
     ) -> BodyParams:
-        """Parameters of an axis-angle pose in SMPL-X joint order; one row of the others stands for all frames."""
+        """Make parameters from axis-angle poses in SMPL-X joint order; one row of the others stands for all frames."""
         flat = np.asarray(full_pose, dtype=np.float64).reshape(len(full_pose), -1)
         split = np.cumsum([3 * joints for _, joints in POSE_BLOCKS])[:-1]
         blocks = dict(zip([name for name, _ in POSE_BLOCKS], np.split(flat, split, axis=1), strict=True))
@@ -198,7 +204,7 @@ class BodyParams:
         return _from_arrays(blocks | others, fps=fps, flat_hand_mean=flat_hand_mean)
 
     def as_dict(self) -> dict[str, np.ndarray]:
-        """Arrays by name, with `fps` and `v_shape` where there are any and `flat_hand_mean` where true."""
+        """Return the arrays by name, with `fps` and `v_shape` if present and `flat_hand_mean` if true."""
         out: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAY_NAMES}
         if self.fps is not None:
             out["fps"] = np.asarray(np.float64(self.fps))
@@ -261,7 +267,7 @@ def _zero_pose() -> dict[str, np.ndarray]:
 
 
 def _numbers(name: str, value: object) -> np.ndarray:
-    """A (T, width) float64 copy."""
+    """Return a (T, width) float64 copy of an array or a row."""
     try:
         return np.array(np.atleast_2d(np.asarray(value)), dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -269,7 +275,7 @@ def _numbers(name: str, value: object) -> np.ndarray:
 
 
 def _vertex_offsets(value: object, frames: int) -> np.ndarray:
-    """A read-only (1, V, 3) or (frames, V, 3) float64 copy."""
+    """Return a read-only float64 copy of shape (1, V, 3) or (frames, V, 3)."""
     subject = "parameter v_shape"
     try:
         offsets = np.array(value, dtype=np.float64)
@@ -281,13 +287,13 @@ def _vertex_offsets(value: object, frames: int) -> np.ndarray:
             subject, expected=f"shape (V, 3), (1, V, 3) or ({frames}, V, 3)", received=f"shape {offsets.shape}"
         )
     if not (np.abs(offsets) <= _LARGEST).all():
-        raise InputError(subject, expected=f"finite values, none beyond {_LARGEST:g}", received="others or NaN")
+        raise InputError(subject, expected=f"finite values up to {_LARGEST:g}", received="others or NaN")
     offsets.setflags(write=False)
     return offsets
 
 
 def _joined_offsets(parts: Sequence[BodyParams]) -> np.ndarray | None:
-    """What parts add to the vertices: once if it is the same in all, else a row a frame."""
+    """Concatenate `v_shape` of parts: a single row if it is the same in all, else a row for each frame."""
     given = [part.v_shape for part in parts if part.v_shape is not None]
     shapes = {None if part.v_shape is None else part.v_shape.shape[1] for part in parts}
     if len(shapes) > 1:

@@ -1,4 +1,4 @@
-"""Rotations as axis-angle vectors and as matrices, on numpy arrays and torch tensors alike."""
+"""Convert rotations between axis-angle vectors and matrices, for numpy arrays and torch tensors."""
 
 from __future__ import annotations
 
@@ -11,19 +11,16 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
 Array: TypeAlias = Any
-"""A numpy array or a torch tensor; what takes one gives the same kind back."""
-
-# Below this squared angle the series of sin(x)/x is exact to float64's last bit (next term: angle^6 / 5040 < 2e-16).
-_SMALL_SQUARED_ANGLE = 1e-4
+"""A numpy array or a torch tensor; functions return the kind that they receive."""
 
 
 def array_namespace(array: Array) -> ModuleType:
-    """numpy, or torch when `array` is a torch tensor. Never imports torch by itself."""
+    """Return the module torch for a torch tensor, else numpy, without importing torch."""
     return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
 
 
 def matrix_from_rotvec(rotvec: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
-    """Rotation matrices of axis-angle vectors (Rodrigues), smooth and differentiable at zero.
+    """Return the rotation matrices of axis-angle vectors (Rodrigues), differentiable at zero.
 
     `R = I + a K + b K^2` with K the cross-product matrix of the vector, `a = sin(t) / t` and
     `b = (1 - cos t) / t^2 = (sin(t/2) / (t/2))^2 / 2`, the latter form without cancellation.
@@ -49,7 +46,7 @@ def matrix_from_rotvec(rotvec: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]
 
 
 def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarray, "*N 3"]:
-    """Axis-angle vectors of rotation matrices, accurate near 0 and near pi (through quaternions).
+    """Return the axis-angle vectors of rotation matrices, accurate near 0 and pi (through quaternions).
 
     Args:
         matrix: rotation matrices.
@@ -62,14 +59,15 @@ def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarra
 
 
 def rotation_between(source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation R, applied as `source @ R`, that takes centred points closest to others (Kabsch 1976)."""
+    """Return the rotation R that minimises |source R - target|^2 for centred points (Kabsch 1976)."""
     left, _, right = np.linalg.svd(np.asarray(source, np.float64).T @ target)
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     return left @ turn @ right
 
 
 def _sinc(xp: ModuleType, squared: Array) -> Array:
-    """sin(t) / t as a function of t^2; both branches stay finite, so that gradients are clean at zero."""
-    small = squared < _SMALL_SQUARED_ANGLE
+    """Return sin(t) / t as a function of t^2; both branches stay finite, so that gradients are defined at zero."""
+    # Below this squared angle the series is exact to float64's last bit (next term: t^6 / 5040 < 2e-16).
+    small = squared < 1e-4
     angle = xp.sqrt(xp.where(small, xp.ones_like(squared), squared))
     return xp.where(small, 1.0 - squared / 6.0 * (1.0 - squared / 20.0), xp.sin(angle) / angle)

@@ -1,4 +1,4 @@
-"""Signed distance to a triangle mesh, closed or open, with the direction that leads out."""
+"""Compute signed distances to a triangle mesh, closed or open, and their gradients."""
 
 from __future__ import annotations
 
@@ -11,26 +11,18 @@ from jaxtyping import Bool, Float, Float64, Int64
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
 
-# A closest point whose barycentric coordinate is below this lies on the opposite edge.
-_ON_EDGE = 1e-9
-# libigl's fast winding number works in float32: this share of the mesh's size is safely beyond its noise.
-_WINDING_RESOLUTION = 1e-6
-# A face with the solid again this share of the mesh's size before it (2 mm on a body) lies within it, or in a slit (a
-# closed mouth, an eyelid's fold) that is no way out.
-_BURIED_PROBE = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class SignedDistance:
-    """The place of N points with respect to a surface.
+    """Signed distances of N points to a surface, with closest points and normals.
 
     Attributes:
-        distance: (N,) metres, negative inside.
+        distance: (N,) metres, negative inside the solid.
         closest: (N, 3) closest point on the surface.
         gradient: (N, 3) unit direction in which `distance` grows; the pseudonormal for a point on the surface.
         normal: (N, 3) unit pseudonormal of the surface at `closest`.
-        face: (N,) the face that holds `closest`.
-        on_border: (N,) bool, `closest` lies on an edge with one face, where an open surface has no sides.
+        face: (N,) index of the face that holds `closest`.
+        on_border: (N,) whether `closest` lies on a border edge, where an open surface has no sides.
     """
 
     distance: Float64[np.ndarray, " N"]
@@ -42,22 +34,22 @@ class SignedDistance:
 
 
 class SignedDistanceField:
-    """Signed distance queries against one surface; the search trees are built once.
+    """Answers signed distance queries against one surface, with search trees that are built once.
 
-    A solid (`solid=True`: a body) is the union of what its surfaces enclose: inside is where the generalised winding
-    number is above 1/2 (Jacobson et al. 2013; fast evaluation of Barill et al. 2018). Small holes, limbs that
-    overlap, eyes and teeth within the head do not disturb it. Faces that lie within the solid, or in slits narrower
-    than a thousandth of its size, are left out, so that the gradient leads out of the union.
+    A solid (`solid=True`: a body) is the union of the regions that its surfaces enclose. A point is inside where the
+    generalised winding number is above 1/2 (Jacobson et al. 2013; fast evaluation of Barill et al. 2018), which
+    tolerates small holes, overlapping limbs, and eyes and teeth within the head. Faces that lie within the solid, or in
+    slits narrower than a thousandth of its size, are left out, so that the gradient leads out of the union.
 
     An open surface (`solid=False`: a garment) has a front and a back: the sign is that of (p - c) . n with c the
     closest point and n its pseudonormal: the face's normal, the sum of both normals on an edge, the angle-weighted
-    normal at a vertex (Baerentzen and Aanaes, IEEE TVCG 2005). It says nothing where `on_border`.
+    normal at a vertex (Baerentzen and Aanaes, IEEE TVCG 2005). It is meaningless where `on_border`.
 
     Zero-area faces are left out.
 
     Args:
         mesh: the surface; N vertices, M faces, outward.
-        solid: which of the two.
+        solid: whether the surface bounds a solid.
 
     Raises:
         InputError: no face with an area; a solid that is wound inside out.
@@ -68,7 +60,8 @@ class SignedDistanceField:
         if not len(kept):
             raise InputError("signed distance", expected="a mesh with faces that have an area", received="none")
         self._winding: igl.FastWindingNumberBVH | None = None
-        self._resolution = _WINDING_RESOLUTION * mesh.bbox_diagonal
+        # libigl's fast winding number works in float32; closer to the surface than this its sign is noise.
+        self._resolution = 1e-6 * mesh.bbox_diagonal
         if solid:
             kept = kept[self._outer_faces(TriangleMesh(mesh.vertices, mesh.faces[kept]))]
         self._kept, self._mesh = kept, TriangleMesh(mesh.vertices, mesh.faces[kept])
@@ -86,8 +79,10 @@ class SignedDistanceField:
             )
         self._winding = igl.FastWindingNumberBVH()
         self._winding.init(mesh.vertices, mesh.faces)
-        before = mesh.face_centers + _BURIED_PROBE * mesh.bbox_diagonal * mesh.face_normals
-        outer = np.flatnonzero(~self._inside(before))
+        # A face is buried if the point a thousandth of the mesh's size (2 mm on a body) in front of it is inside: the
+        # face lies within the solid or in a slit, such as a closed mouth or the fold of an eyelid.
+        in_front = mesh.face_centers + 1e-3 * mesh.bbox_diagonal * mesh.face_normals
+        outer = np.flatnonzero(~self._inside(in_front))
         assert len(outer), "a solid with a positive volume has an outside"
         return outer
 
@@ -110,7 +105,7 @@ class SignedDistanceField:
         self._vertex_border[edges[self._edge_border]] = True
 
     def query(self, points: Float[np.ndarray, "N 3"]) -> SignedDistance:
-        """Signed distance of (N, 3) points, metres."""
+        """Return the signed distances of (N, 3) points, metres."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise InputError("query points", expected="finite (N, 3)", received=f"shape {points.shape} or NaN")
@@ -136,7 +131,8 @@ class SignedDistanceField:
         mesh = self._mesh
         normal = mesh.face_normals[face]
         on_border = np.zeros(len(face), dtype=bool)
-        zero = bary < _ON_EDGE
+        # A barycentric coordinate of 0, up to rounding, places the point on the opposite edge; two, on a vertex.
+        zero = bary < 1e-9
         on_edge, on_vertex = zero.sum(axis=1) == 1, zero.sum(axis=1) >= 2
         edge = self._face_edges[face, np.argmax(zero, axis=1)][on_edge]
         normal[on_edge], on_border[on_edge] = self._edge_normals[edge], self._edge_border[edge]
@@ -148,7 +144,7 @@ class SignedDistanceField:
 def barycentric_coordinates(
     points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "N 3 3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """The barycentric coordinates of points in the planes of triangles with an area; rows sum to 1."""
+    """Return the barycentric coordinates of points in the planes of triangles with an area; rows sum to 1."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = points - triangles[:, 0]
     normal = np.cross(a, b)

@@ -1,4 +1,4 @@
-"""SkinWeights: what skin-weight transfer returns and skinning takes."""
+"""Define SkinWeights, which the transfer of skin weights returns and skinning takes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from smplxpp.core.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class SkinWeights:
-    """Sparse skinning weights of N vertices over J joints, with where they came from.
+    """Sparse skinning weights of N vertices over J joints, with their provenance.
 
     Attributes:
         joint_indices: (N, K) int32.
@@ -42,7 +42,7 @@ class SkinWeights:
         return f"SkinWeights({len(self):,} vertices over {self.joint_count} joints, at most {slots} a vertex)"
 
     def dense(self) -> Float64[np.ndarray, "N J"]:
-        """The weights of every joint; every row sums to 1."""
+        """Return the weights of all joints; every row sums to 1."""
         out = np.zeros((len(self), self.joint_count))
         np.add.at(out, (np.arange(len(self))[:, None], self.joint_indices), self.joint_weights)
         return out
@@ -63,8 +63,8 @@ class SkinWeights:
         clipped = np.clip(weights, 0.0, None)
         used = int((clipped > 0).sum(axis=1).max(initial=1))
         k = max(1, min(used, max_influences or joint_count))
-        # Stable order: larger weight first, then lower joint index.
-        # Joints that no vertex follows need not be sorted; some may fill slots of weight 0.
+        # Stable order: larger weight first, then lower joint index. Joints without any weight are not sorted, unless
+        # they have to fill slots of weight 0.
         joints = np.flatnonzero(clipped.any(axis=0)) if n else np.arange(joint_count)
         joints = joints if len(joints) >= k else np.arange(joint_count)
         order = joints[np.argsort(-clipped[:, joints], axis=1, kind="stable")[:, :k]]

@@ -1,4 +1,4 @@
-"""Closed meshes as manifold3d's solids, whose unions and intersections are closed again, and back."""
+"""Convert closed meshes to manifold3d's solids, for robust boolean operations, and back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from smplxpp.core.topology import border_loops
 
 
 def solid_of_mesh(mesh: TriangleMesh, *, subject: str = "solid") -> manifold3d.Manifold:
-    """A closed, consistently wound mesh as a solid; it may have several pieces and cut itself.
+    """Convert a closed, consistently wound mesh to a solid; it may have several pieces and intersect itself.
 
     Raises:
         InputError: an open mesh, edges with more than two faces, or none.
@@ -30,13 +30,13 @@ def solid_of_mesh(mesh: TriangleMesh, *, subject: str = "solid") -> manifold3d.M
 
 
 def mesh_of_solid(solid: manifold3d.Manifold) -> TriangleMesh:
-    """The surface of a solid."""
+    """Return the surface mesh of a solid."""
     found = solid.to_mesh64()
     return TriangleMesh(np.asarray(found.vert_properties)[:, :3], np.asarray(found.tri_verts).astype(np.int64))
 
 
 def closed_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """A manifold mesh with each border closed by a fan about its middle; new vertices and faces come last."""
+    """Close each border of a manifold mesh by a fan about its centroid; new vertices and faces come last."""
     vertices, faces = [mesh.vertices], [mesh.faces]
     for k, loop in enumerate(border_loops(mesh.faces)):
         vertices.append(mesh.vertices[loop].mean(axis=0)[None])

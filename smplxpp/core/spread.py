@@ -1,4 +1,4 @@
-"""A few of many, evenly: the one place where frames, views and names are picked."""
+"""Pick an evenly spaced subset of a sequence of frames, views or names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connectivity of triangle soups: paired half-edges, components, border loops, manifold corners.
+"""Compute the connectivity of triangle soups: paired half-edges, components, border loops, manifold corners.
 
 A half-edge `h = 3 f + k` runs from corner k of face f to the next corner.
 """
@@ -12,14 +12,14 @@ from scipy.sparse.csgraph import connected_components
 
 
 def half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "H 2"]:
-    """The start and end vertex of every half-edge, H = 3 M."""
+    """Return the start and end vertex of every half-edge, H = 3 M."""
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
 def edge_groups(
     faces: Int[np.ndarray, "M 3"],
 ) -> tuple[Int[np.ndarray, " H"], Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """Half-edges gathered by undirected edge.
+    """Group the half-edges by their undirected edge.
 
     Returns (3M,) half-edges sorted by edge (then by index), and for each of the E edges the start of its run and the
     run's length.
@@ -33,14 +33,14 @@ def edge_groups(
 
 
 def paired_half_edges(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "P 2"]:
-    """The two half-edges of every edge that has exactly two faces, lower index first."""
+    """Return the two half-edges of every edge with exactly two faces, lower index first."""
     order, first, count = edge_groups(faces)
     start = first[count == 2]
     return np.stack([order[start], order[start + 1]], axis=1)
 
 
 def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"], Int[np.ndarray, "P 2"]]:
-    """The pairs of faces that share an edge, each pair once an edge, and that edge's vertices.
+    """Return the pairs of faces that share an edge, once per edge, and the vertices of that edge.
 
     At an edge with more than two faces, faces that follow each other in index order are paired.
     """
@@ -53,7 +53,7 @@ def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"
 
 
 def component_labels(pairs: Int[np.ndarray, "P 2"], count: int) -> Int[np.ndarray, " count"]:
-    """The component of every node of the graph with edges `pairs`, numbered by lowest node."""
+    """Return the connected component of every node of the graph with edges `pairs`, numbered by lowest node."""
     graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels = connected_components(graph, directed=False)[1]
     first = np.full(int(labels.max(initial=-1)) + 1, count)
@@ -64,7 +64,7 @@ def component_labels(pairs: Int[np.ndarray, "P 2"], count: int) -> Int[np.ndarra
 
 
 def face_components(faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
-    """The edge-connected component of every face."""
+    """Return the edge-connected component of every face."""
     return component_labels(face_adjacency(faces)[0], len(faces))
 
 
@@ -77,6 +77,7 @@ def manifold_corners(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "M 
     Returns (M, 3) new faces and (n,) the old vertex of every new one; the first fan of a vertex keeps its place among
     the referenced vertices (in their order), further fans follow at the end.
     """
+    # Join corners across edges with exactly two faces of opposite direction; a fan is a component of joined corners.
     pairs = paired_half_edges(faces)
     ends = half_edges(faces)
     pairs = pairs[ends[pairs[:, 0], 0] == ends[pairs[:, 1], 1]]
@@ -84,6 +85,7 @@ def manifold_corners(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "M 
     a, b = pairs[:, 0], pairs[:, 1]
     links = np.concatenate([np.stack([a, following[b]], 1), np.stack([following[a], b], 1)])
     fan = component_labels(links, 3 * len(faces))
+    # Number the fans: the first of each vertex in the order of the vertices, further ones after all of these.
     _, first_corner = np.unique(fan, return_index=True)
     vertex_of_fan = faces.ravel()[first_corner]
     order = np.lexsort((first_corner, vertex_of_fan))
@@ -96,7 +98,7 @@ def manifold_corners(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "M 
 
 
 def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
-    """The vertices of every border loop of a manifold surface, in the direction of its faces, from its lowest index.
+    """Return the vertices of every border loop of a manifold surface, along its faces, from its lowest index.
 
     Loops come in order of their lowest vertex.
     """
@@ -107,7 +109,7 @@ def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
     nodes = np.sort(start)
     following = np.searchsorted(nodes, end[np.argsort(start, kind="stable")])
     loop = component_labels(np.stack([np.arange(len(nodes)), following], 1), len(nodes))
-    # Steps to the loop's lowest vertex by pointer doubling.
+    # Count the steps from each vertex to the lowest one of its loop by pointer doubling, then sort by them.
     _, head = np.unique(loop, return_index=True)
     jump, steps = following.copy(), np.ones(len(nodes), np.int64)
     jump[head], steps[head] = head, 0

@@ -1,4 +1,4 @@
-"""Checks of numbers and choices that a user gives: one wording for all."""
+"""Check numbers and choices that a user gives, with one wording of errors for all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def require_between(subject: str, value: float, least: float, most: float) -> No
 
 
 def require_positive(subject: str, value: float, *, finite: bool = True) -> None:
-    """Raise `InputError` unless `value > 0`; infinity passes where it is said to."""
+    """Raise `InputError` unless `value > 0`; infinity passes with `finite=False`."""
     if not value > 0 or (finite and not math.isfinite(value)):
         raise InputError(subject, expected="a number above 0", received=f"{value:g}")
 

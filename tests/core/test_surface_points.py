@@ -14,7 +14,7 @@ def _square(y: float) -> TriangleMesh:
 
 
 def test_points_lie_on_their_faces_evenly_and_look_as_they_do():
-    drawn = SurfacePoints.of(_square(0.3), 4000)
+    drawn = SurfacePoints.sample(_square(0.3), 4000)
     assert np.allclose(drawn.points[:, 1], 0.3)
     assert np.allclose(drawn.normals, [0, 1, 0])
     counts, _, _ = np.histogram2d(drawn.points[:, 0], drawn.points[:, 2], bins=4, range=[[0, 1], [0, 1]])
@@ -23,18 +23,18 @@ def test_points_lie_on_their_faces_evenly_and_look_as_they_do():
 
 
 def test_the_same_seed_gives_the_same_points():
-    one, other = (SurfacePoints.of(_square(0.0), 50, seed=3) for _ in range(2))
+    one, other = (SurfacePoints.sample(_square(0.0), 50, seed=3) for _ in range(2))
     assert np.array_equal(one.points, other.points)
-    assert not np.array_equal(one.points, SurfacePoints.of(_square(0.0), 50, seed=4).points)
+    assert not np.array_equal(one.points, SurfacePoints.sample(_square(0.0), 50, seed=4).points)
 
 
 def test_two_planes_are_as_far_from_each_other_as_they_are_and_no_farther_than_far():
-    below = SurfacePoints.of(_square(0.0), 4000)
+    below = SurfacePoints.sample(_square(0.0), 4000)
     for height, expected in ((0.1, 0.1), (9.0, 0.25)):
-        above = SurfacePoints.of(_square(height), 4000, seed=1)
+        above = SurfacePoints.sample(_square(height), 4000, seed=1)
         assert abs(truncated_distance(above.points, above.normals, below) - expected) < 0.01
 
 
 def test_a_surface_that_faces_away_is_not_near():
-    below = SurfacePoints.of(_square(0.0), 500)
+    below = SurfacePoints.sample(_square(0.0), 500)
     assert truncated_distance(below.points, -below.normals, below) > 0.2

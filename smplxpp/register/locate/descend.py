@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.core.surface_points import SurfacePoints, position_normal_features
 from smplxpp.register.kinematics import BodyState, Kinematics, Posture
 from smplxpp.register.locate.proxy import BodyProxy
 from smplxpp.register.normal_equations import Columns, NormalEquations
@@ -64,7 +64,7 @@ class DrawnTogether:
         points = motion.points
         _, normals = self.proxy.posed(kinematics, posture)
         jacobian = equations.columns.jacobian(motion)
-        there = joined(points, normals)
+        there = position_normal_features(points, normals)
         surface = self.surface
         _, to_surface = surface.tree.query(there)
         _, to_body = cKDTree(there).query(surface.tree.data)

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
-from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.core.surface_points import SurfacePoints, position_normal_features
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.locate.cover import SKIN_COVER, Expected
 from smplxpp.register.locate.drape import NO_CELL, Drape
@@ -125,7 +125,7 @@ class Dressed:
         """The body's bare points to the surface, along the surface's normal."""
         motion = kinematics.motion(self.bare.points, posture)
         _, normals = self.bare.posed(kinematics, posture)
-        _, nearest = self.surface.tree.query(joined(motion.points, normals))
+        _, nearest = self.surface.tree.query(position_normal_features(motion.points, normals))
         apart, normal = motion.points - self.surface.points[nearest], self.surface.normals[nearest]
         residual = np.einsum("nx,nx->n", apart, normal)
         facing = np.einsum("nx,nx->n", normals, normal) > _FACING

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.core.surface_points import SurfacePoints, position_normal_features
 from smplxpp.register.anatomy import Anatomy
 from smplxpp.register.config import RegisterConfig
 from smplxpp.register.kinematics import BodyState, Kinematics
@@ -82,7 +82,7 @@ def _about(
     near = np.linalg.norm(surface.points - posture.joints[wrist], axis=1) < _ABOUT
     elbow = kinematics.parents[wrist]
     other = proxy.select(~kinematics.hangs_on[proxy.limb, elbow])
-    explained, _ = cKDTree(joined(*other.posed(kinematics, posture))).query(surface.tree.data)
+    explained, _ = cKDTree(position_normal_features(*other.posed(kinematics, posture))).query(surface.tree.data)
     rows = np.flatnonzero(near & (explained > _EXPLAINED))
     return surface.select(rows[:: max(1, len(rows) // _POINTS)]) if len(rows) >= _LEAST else None
 

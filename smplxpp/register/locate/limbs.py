@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.core.surface_points import FAR, SurfacePoints, truncated_distance
+from smplxpp.core.surface_points import TRUNCATION_M, SurfacePoints, truncated_distance
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
 
@@ -51,7 +51,7 @@ def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
 
 
 def state_distance(
-    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, *, far: float = FAR
+    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, *, far: float = TRUNCATION_M
 ) -> float:
     """How far body and surface are from each other, metres; what is beyond `far` counts as so far."""
     return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, far=far)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smplxpp.core.surface_points import SurfacePoints, joined
+from smplxpp.core.surface_points import SurfacePoints, position_normal_features
 from smplxpp.register.kinematics import Kinematics, Posture
 from smplxpp.register.locate.dressed import OuterBody
 from smplxpp.register.locate.proxy import BodyProxy, Region
@@ -62,7 +62,7 @@ def misfit(
     each[found.facing < 0.0] = _CAP
     points, normals = proxy.posed(kinematics, posture)
     shown = np.isin(proxy.region, (*_BARE, Region.FOOT))
-    _, nearest = surface.tree.query(joined(points, normals))
+    _, nearest = surface.tree.query(position_normal_features(points, normals))
     apart = points - surface.points[nearest]
     along = np.einsum("nx,nx->n", apart, surface.normals[nearest])
     distance = np.linalg.norm(apart, axis=1)
