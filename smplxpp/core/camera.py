@@ -100,7 +100,7 @@ class Camera:
     def look_at(
         *, eye: np.ndarray, target: np.ndarray, fov_y_deg: float, width: int, height: int, up: tuple = (0.0, 1.0, 0.0)
     ) -> Camera:
-        """Return a pinhole camera at `eye` looking at `target` (world, metres) with a vertical angle of view in degrees."""
+        """Return a pinhole camera at `eye` looking at `target` (world, metres); vertical angle of view in degrees."""
         f = 0.5 * height / np.tan(np.radians(fov_y_deg) / 2)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
         return Camera(K, _look_at_pose(np.asarray(eye, float), np.asarray(target, float), up), width, height)

@@ -1,1 +1,1 @@
-"""The doors: how files are opened, with bounds on what they may ask for, and how they are written."""
+"""Open files within bounds on size and content, and write them atomically; one module for each format."""

@@ -1,7 +1,7 @@
-"""The one door for arrays: npy and npz files whose sizes and types are checked before anything is allocated.
+"""Read and write npy and npz files; sizes and types are checked before memory is allocated.
 
-Files are written without the time they were written at: the same arrays give the same bytes. Arrays of objects are read
-by `smplxpp.core.files.safe_pickle` alone.
+Files hold no time stamp, so that equal arrays give equal bytes. Arrays of objects are read by
+`smplxpp.core.files.safe_pickle` alone.
 """
 
 from __future__ import annotations
@@ -25,17 +25,10 @@ from smplxpp.core.files.atomic import atomic_path
 from smplxpp.core.files.paths import regular_file
 
 ObjectReader = Callable[[BinaryIO, str], Any]
-"""Reads the pickle of an array of objects from a stream; the second argument names it in messages."""
+"""Reads the pickle of an object array from a stream; the second argument names the array in messages."""
 
-_MAGIC = b"\x93NUMPY"
-_LONGEST_HEADER, _MOST_DIMENSIONS, _MOST_ENTRIES = 1 << 16, 32, 10_000
-# Characters of a text in an array; names of joints have twenty.
-_LONGEST_TEXT = 4096
-# What an archive may unpack to: this much in any case, more if that is not much more than the file has.
-_FREELY_UNPACKED, _MOST_UNPACKING = 1 << 29, 200
-_PIECE = 1 << 20
 _SUFFIX = ".npy"
-# Everything that a damaged archive makes the standard library raise.
+# The exceptions that the standard library raises on damaged archives.
 DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
@@ -55,7 +48,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, packing:
     Args:
         path: of the file.
         arrays: by name.
-        packing: how they are compressed, a constant of `zipfile`; deflate is the quickest of its levels.
+        packing: compression, a constant of `zipfile`; deflate is used at its fastest level.
 
     Raises:
         ValueError: an array of objects.
@@ -65,7 +58,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, packing:
         for name, array in arrays.items():
             stream = io.BytesIO()
             np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
-            # An entry made from its name alone has the date 1980-01-01.
+            # A ZipInfo made from a name alone has the constant date 1980-01-01.
             archive.writestr(zipfile.ZipInfo(f"{name}{_SUFFIX}"), stream.getbuffer(), packing, compresslevel=level)
 
 
@@ -81,23 +74,23 @@ def read_arrays(
 
     Args:
         path: of the file.
-        subject: what the file is, for messages.
-        remedy: what a user can do about a damaged one.
-        keys: read these only (those that exist); None reads all.
-        objects: reads arrays of objects; None refuses them.
+        subject: what the file is called in messages.
+        remedy: advice in messages about a damaged file.
+        keys: names to read, as far as they exist; None: all.
+        objects: reader of object arrays; None refuses them.
 
     Raises:
-        InputError: missing or damaged file, no npz, an array of another type, or one that says to be larger than its
-            file can hold.
+        InputError: missing or damaged file, no npz, an array of another type, or an array that claims to be larger than
+            its file can hold.
     """
     path = regular_file(path, subject=subject, remedy=remedy)
-    wanted = None if keys is None else set(keys)
+    wanted, max_entries = None if keys is None else set(keys), 10_000
     out: dict[str, np.ndarray] = {}
-    with _errors_said(f"{subject} {path}", "an npz of plain arrays", remedy):
+    with _as_input_error(f"{subject} {path}", "an npz of plain arrays", remedy):
         with zipfile.ZipFile(path) as archive:
             entries = [entry for entry in archive.infolist() if entry.filename.endswith(_SUFFIX)]
             names = [entry.filename.removesuffix(_SUFFIX) for entry in entries]
-            if len(set(names)) != len(names) or len(names) > _MOST_ENTRIES:
+            if len(set(names)) != len(names) or len(names) > max_entries:
                 raise ValueError(f"{len(names)} arrays of {len(set(names))} names")
             chosen = [(n, e) for n, e in zip(names, entries, strict=True) if wanted is None or n in wanted]
             _check_unpacking(sum(entry.file_size for _, entry in chosen), path.stat().st_size)
@@ -112,13 +105,13 @@ def read_arrays(
 
 
 def array_names(path: str | Path, *, subject: str = "file", remedy: str = "") -> list[str]:
-    """The names of an npz file's arrays, without reading them.
+    """Return the names of the arrays in an npz file, without reading the arrays.
 
     Raises:
         InputError: missing or damaged file, or no npz.
     """
     path = regular_file(path, subject=subject, remedy=remedy)
-    with _errors_said(f"{subject} {path}", "an npz of plain arrays", remedy), zipfile.ZipFile(path) as archive:
+    with _as_input_error(f"{subject} {path}", "an npz of plain arrays", remedy), zipfile.ZipFile(path) as archive:
         return [name.removesuffix(_SUFFIX) for name in archive.namelist() if name.endswith(_SUFFIX)]
 
 
@@ -126,19 +119,19 @@ def read_array(path: str | Path, *, subject: str = "file", remedy: str = "") -> 
     """Read the array of an npy file.
 
     Raises:
-        InputError: missing or damaged file, no npy, an array of another type than numbers and texts, or one that says
-            to be larger than its file.
+        InputError: missing or damaged file, no npy, an array of another type than numbers and texts, or an array
+            that claims to be larger than its file.
     """
     path = regular_file(path, subject=subject, remedy=remedy)
-    with _errors_said(f"{subject} {path}", "an npy array", remedy), open(path, "rb") as stream:
+    with _as_input_error(f"{subject} {path}", "an npy array", remedy), open(path, "rb") as stream:
         return _read(stream, path.stat().st_size, f"{subject} {path}", remedy, None)
 
 
 def check_dtype(text: str) -> np.dtype:
-    """The type that numpy spells so: numbers, bools and texts.
+    """Return the numpy type of a type string of numbers, bools or texts.
 
     Raises:
-        ValueError: any other: objects are pointers, a structure may hide some.
+        ValueError: any other type, because objects are stored as pointers, and structures may contain objects.
     """
     match = re.fullmatch(r"([<>|=]?)([biufcSU])(\d{1,5})|(\?)", text)
     if match is None:
@@ -147,26 +140,28 @@ def check_dtype(text: str) -> np.dtype:
         dtype = np.dtype(text)
     except TypeError:  # a number of three bytes
         raise ValueError(f"arrays of type {text!r}") from None
+    # Characters of a text in an array; names of joints have twenty.
+    longest_text = 4096
     characters = dtype.itemsize // (4 if dtype.kind == "U" else 1)
-    if not dtype.itemsize or (dtype.kind in "SU" and characters > _LONGEST_TEXT):
+    if not dtype.itemsize or (dtype.kind in "SU" and characters > longest_text):
         raise ValueError(f"texts of {characters} characters")
     return dtype
 
 
 def check_shape(shape: tuple[int, ...]) -> int:
-    """The number of an array's elements.
+    """Return the number of elements of an array.
 
     Raises:
-        ValueError: negative or absurd lengths.
+        ValueError: more than 32 dimensions (the limit of numpy 1), or negative or absurd lengths.
     """
-    if len(shape) > _MOST_DIMENSIONS or not all(0 <= n < 1 << 48 for n in shape):
+    if len(shape) > 32 or not all(0 <= n < 1 << 48 for n in shape):
         raise ValueError(f"{len(shape)} dimensions of up to {max(shape, default=0):.3g}")
     return math.prod(shape)
 
 
 @contextmanager
-def _errors_said(subject: str, expected: str, remedy: str) -> Iterator[None]:
-    """Turn what the standard library raises into an InputError."""
+def _as_input_error(subject: str, expected: str, remedy: str) -> Iterator[None]:
+    """Convert exceptions of the standard library into an InputError."""
     try:
         yield
     except InputError:
@@ -179,13 +174,15 @@ def _errors_said(subject: str, expected: str, remedy: str) -> Iterator[None]:
 
 
 def _check_unpacking(unpacked: int, packed: int) -> None:
-    if unpacked > max(_FREELY_UNPACKED, _MOST_UNPACKING * packed):
+    """Refuse archives that expand to much more than their size."""
+    # Half a GiB is always allowed; above that, a compression ratio over 200 marks a decompression bomb.
+    if unpacked > max(1 << 29, 200 * packed):
         raise ValueError(f"{packed} bytes that unpack to {unpacked}")
 
 
 def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectReader | None) -> Any:
-    """An array in npy format from a stream of so many bytes."""
-    with _errors_said(subject, "plain arrays of numbers or texts", remedy):
+    """Read an array in npy format from a stream of `size` bytes."""
+    with _as_input_error(subject, "plain arrays of numbers or texts", remedy):
         descr, fortran_order, shape, start = _header(stream)
         count = check_shape(shape)
         if descr in ("|O", "O"):
@@ -195,24 +192,25 @@ def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectRead
         dtype = check_dtype(descr)
         if count * dtype.itemsize != size - start:
             raise ValueError(f"{size - start} bytes for {dtype} of shape {shape}")
-        data = np.empty(count * dtype.itemsize, dtype=np.uint8)
-        for at in range(0, len(data), _PIECE):
-            piece = stream.read(min(_PIECE, len(data) - at))
-            data[at : at + _PIECE] = np.frombuffer(piece, dtype=np.uint8)
-        if stream.read(1):  # an archive's entry is checked at its end
+        # In chunks of a MiB, because one read of a compressed entry would hold its bytes twice.
+        chunk, data = 1 << 20, np.empty(count * dtype.itemsize, dtype=np.uint8)
+        for at in range(0, len(data), chunk):
+            piece = stream.read(min(chunk, len(data) - at))
+            data[at : at + chunk] = np.frombuffer(piece, dtype=np.uint8)
+        if stream.read(1):  # reading to the end also verifies the checksum of an archive's entry
             raise ValueError("more than the array")
         array = data.view(dtype).reshape(shape, order="F" if fortran_order else "C")
         return array.astype(dtype.newbyteorder("="), copy=False)
 
 
 def _header(stream: Any) -> tuple[str, bool, tuple[int, ...], int]:
-    """Type, order, shape and where the numbers begin; read as text, never evaluated."""
+    """Return type string, Fortran order, shape and the place of the first number; the text is never evaluated."""
     start = stream.read(8)
-    if start[:6] != _MAGIC or len(start) != 8 or start[6] not in (1, 2, 3):
+    if start[:6] != b"\x93NUMPY" or len(start) != 8 or start[6] not in (1, 2, 3):
         raise ValueError("no npy header")
     width = 2 if start[6] == 1 else 4
     length = int.from_bytes(stream.read(width), "little")
-    text = stream.read(length).decode("latin1") if length <= _LONGEST_HEADER else ""
+    text = stream.read(length).decode("latin1") if length <= 1 << 16 else ""
     descr = re.findall(r"""['"]descr['"]\s*:\s*['"]([^'"]{1,16})['"]\s*[,}]""", text)
     order = re.findall(r"""['"]fortran_order['"]\s*:\s*(True|False)\s*[,}]""", text)
     shape = re.findall(r"""['"]shape['"]\s*:\s*\(([\d\sL,]{0,600})\)\s*[,}]""", text)

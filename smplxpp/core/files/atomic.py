@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Write files and folders atomically: the complete result appears, or nothing."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""What the system answers to writing alone."""
+# Errors that only writing raises: no space, quota, file too large, read-only file system.
+_WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside `path`, moved onto it when the block ends without an error.
+    """Yield a temporary file beside `path`, and move it onto `path` when the block ends without an error.
 
-    The temporary name keeps the suffix, so that writers that look at it work. An error of the system names `path`.
+    The temporary name keeps the suffix, for writers that choose a format by it. System errors name `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -26,7 +26,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
-    # mkstemp makes files private; give the result the permissions any new file would have.
+    # mkstemp makes private files; give the result the permissions of any new file.
     mask = os.umask(0)
     os.umask(mask)
     temporary.chmod(0o666 & ~mask)
@@ -39,21 +39,21 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def atomic_write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all."""
+    """Write `data` to `path` atomically, replacing what is there."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write UTF-8 `text` to `path`, whole or not at all."""
+    """Write `text` in UTF-8 to `path` atomically, replacing what is there."""
     atomic_write_bytes(path, text.encode())
 
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder beside `path` that replaces it when the block ends without an error.
+    """Yield a temporary folder beside `path`, and replace `path` by it when the block ends without an error.
 
-    An error of the system names what it is about in `path`.
+    System errors name the file as it would be called inside `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,6 +65,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     try:
         with _named(temporary, path):
             yield temporary
+            # A folder cannot be renamed onto a full one: move the old one aside, then delete it.
             if path.exists():
                 old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
                 os.replace(path, old / path.name)
@@ -78,16 +79,16 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _named(temporary: Path | None, path: Path) -> Iterator[None]:
-    """Let errors of the system name `path`: not what is temporary, nor nothing, as a full disk's.
+    """Make system errors name `path`, where they name the temporary file or, as on a full disk, no file.
 
     Args:
-        temporary: what stands for `path` meanwhile; None: what the block makes.
+        temporary: file or folder that stands for `path` during the block; None: the block creates it.
     """
     try:
         yield
     except OSError as error:
         name = error.filename
-        if temporary is None or (name is None and error.errno in _REFUSED):
+        if temporary is None or (name is None and error.errno in _WRITE_ERRORS):
             error.filename = str(path)
         elif isinstance(name, str | os.PathLike) and Path(name).is_relative_to(temporary):
             error.filename = str(path / Path(name).relative_to(temporary))

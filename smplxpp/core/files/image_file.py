@@ -1,4 +1,4 @@
-"""The one door for image files: photographs, masks, maps, textures."""
+"""Open image files (photographs, masks, maps, textures) in safe formats and bounded sizes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from smplxpp.core.files.paths import regular_file
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# Formats of pixels alone: Pillow also knows ones that start other programs (PostScript).
+# Raster formats only: Pillow also opens formats that start other programs (PostScript).
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF")
-# Twice what Pillow warns of; the largest cameras have 150 million.
-_MOST_PIXELS = 178_956_970
 
 
 def open_image(path: str | Path, *, subject: str = "image file", remedy: str = "") -> Image:
-    """An image, decoded; `info["raw_mode"]` says how the file stores its pixels.
+    """Open and decode an image; `info["raw_mode"]` tells how the file stores its pixels.
 
     Raises:
         InputError: missing, no regular file, no whole image of a known format, or too many pixels.
@@ -28,12 +26,12 @@ def open_image(path: str | Path, *, subject: str = "image file", remedy: str = "
 
 
 def decode_image(data: bytes, *, subject: str, remedy: str = "") -> Image:
-    """An image in a file's bytes, decoded, as pictures inside of other files are; raises what `open_image` raises."""
+    """Decode an image from bytes, such as one embedded in another file; raises what `open_image` raises."""
     return _open(io.BytesIO(data), subject, remedy, decode=True)
 
 
 def image_size(path: str | Path, *, subject: str = "image file", remedy: str = "") -> tuple[int, int]:
-    """Width and height of an image, from the file's header.
+    """Return width and height of an image, from the file's header.
 
     Raises:
         InputError: missing, no regular file, no image of a known format, or too many pixels.
@@ -42,17 +40,19 @@ def image_size(path: str | Path, *, subject: str = "image file", remedy: str = "
 
 
 def image_mode(path: str | Path, *, subject: str = "image file", remedy: str = "") -> str:
-    """Pillow's name of the channels (such as RGBA), from the file's header; raises what `image_size` raises."""
+    """Return Pillow's mode of an image (such as RGBA), from the file's header; raises what `image_size` raises."""
     return _open(regular_file(path, subject=subject, remedy=remedy), subject, remedy, decode=False).mode
 
 
 def _open(source: Path | io.BytesIO, subject: str, remedy: str, *, decode: bool) -> Image:
     import PIL.Image
 
+    # Twice the number that Pillow warns of; the largest cameras have 150 million pixels.
+    max_pixels = 178_956_970
     try:
         with PIL.Image.open(source, formats=_FORMATS) as image:
-            if image.width * image.height > _MOST_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} pixels, more than {_MOST_PIXELS}")
+            if image.width * image.height > max_pixels:
+                raise ValueError(f"{image.width} x {image.height} pixels, more than {max_pixels}")
             image.info["raw_mode"] = str(image.tile[0][3]) if image.tile else ""
             if decode:
                 image.load()

@@ -17,42 +17,42 @@ from jaxtyping import Float64
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
 
-# Keypoints of a long film in one file have some hundred megabytes; nothing that we read nests deeper than ten levels.
-_MOST_BYTES, _MOST_LEVELS = 1 << 30, 64
-_MOST_DIGITS = 19  # with its sign
-# Escapes that can stand for no character of a file's name: NUL, and halves of a surrogate pair.
-_DOUBTFUL_ESCAPE = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])")
+# Nesting depth: the formats that are read have at most ten levels.
+_MAX_LEVELS = 64
+# Escapes of characters that no file name can have: NUL, and halves of a surrogate pair.
+_UNUSABLE_ESCAPE = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])")
 
 
 def read_json(path: str | Path, *, subject: str = "file", remedy: str = "") -> Any:
-    """The content of a JSON file.
+    """Read the content of a JSON file of at most one GiB.
 
     Raises:
         InputError: missing, no regular file, too large, or what `parse_json` refuses.
     """
-    data = read_bytes(path, subject=subject, most=_MOST_BYTES, remedy=remedy)
+    # Keypoints of a long film in one file have some hundred megabytes.
+    data = read_bytes(path, subject=subject, most=1 << 30, remedy=remedy)
     return parse_json(data, subject=f"{subject} {path}", remedy=remedy)
 
 
 def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
-    """The value of a JSON text.
+    """Parse a JSON text into dictionaries, lists, texts and numbers.
 
     Raises:
         InputError: broken JSON, more than 64 levels, integers of more than 18 digits, or texts with a NUL or half a
-            character in them, which no file can be called by.
+            surrogate pair, which no file name can have.
     """
     try:
         value = json.loads(data, parse_int=_integer)
     except RecursionError:
         raise InputError(
-            subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy
+            subject, expected=f"JSON of at most {_MAX_LEVELS} levels", received="more", remedy=remedy
         ) from None
     except ValueError as error:  # broken JSON, broken UTF-8, and long integers
         raise InputError(subject, expected="JSON", received=str(error)[:200], remedy=remedy) from None
-    if _levels(value) > _MOST_LEVELS:
-        raise InputError(subject, expected=f"JSON of at most {_MOST_LEVELS} levels", received="more", remedy=remedy)
+    if _levels(value) > _MAX_LEVELS:
+        raise InputError(subject, expected=f"JSON of at most {_MAX_LEVELS} levels", received="more", remedy=remedy)
     raw = data if isinstance(data, bytes) else data.encode(errors="surrogatepass")
-    if (_DOUBTFUL_ESCAPE.search(raw) or b"\0" in raw) and not _all_text_usable(value):
+    if (_UNUSABLE_ESCAPE.search(raw) or b"\0" in raw) and not _all_text_usable(value):
         raise InputError(
             subject, expected="text of whole characters", received="a NUL or half a character", remedy=remedy
         )
@@ -60,22 +60,22 @@ def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
 
 
 def as_object(value: Any, *, subject: str) -> dict[str, Any]:
-    """The value, if it is a JSON object."""
+    """Return the value if it is a JSON object."""
     return _of_type(value, dict, "an object {...}", subject)
 
 
 def as_list(value: Any, *, subject: str) -> list[Any]:
-    """The value, if it is a JSON list."""
+    """Return the value if it is a JSON list."""
     return _of_type(value, list, "a list [...]", subject)
 
 
 def as_text(value: Any, *, subject: str) -> str:
-    """The value, if it is a text."""
+    """Return the value if it is a text."""
     return _of_type(value, str, "a text", subject)
 
 
 def as_number(value: Any, *, subject: str, least: float = -math.inf, most: float = math.inf) -> float:
-    """The value as a float, if it is a finite number within bounds; true and false are no numbers.
+    """Return the value as a float if it is a finite number within bounds; true and false are no numbers.
 
     Raises:
         InputError: anything else.
@@ -91,7 +91,7 @@ def as_number(value: Any, *, subject: str, least: float = -math.inf, most: float
 
 
 def as_integer(value: Any, *, subject: str, least: int = -(2**53), most: int = 2**53) -> int:
-    """The value as an int, if it is a whole number within bounds; 3.0 is one.
+    """Return the value as an int if it is a whole number within bounds, such as 3.0.
 
     Raises:
         InputError: anything else.
@@ -106,12 +106,12 @@ def as_integer(value: Any, *, subject: str, least: int = -(2**53), most: int = 2
 def as_numbers(
     value: Any, shape: tuple[int | None, ...] | None = None, *, subject: str, finite: bool = True
 ) -> Float64[np.ndarray, "*n"]:
-    """Nested lists of numbers, or an array of them, as float64.
+    """Convert nested lists of numbers, or an array, to float64.
 
     Args:
-        value: the lists.
-        shape: that it must have, None for any length; without one any shape passes.
-        subject: what it is, for messages.
+        value: lists or array.
+        shape: required shape, None for any length of an axis; without it any shape passes.
+        subject: what the value is called in messages.
         finite: refuse NaN and infinity.
 
     Raises:
@@ -133,7 +133,7 @@ def as_numbers(
 
 
 def shown(value: Any) -> str:
-    """A value in a message: its kind, and its beginning where it is short enough to help."""
+    """Describe a value in a message: its kind, or its beginning where that is short."""
     if isinstance(value, dict | list):
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
     if isinstance(value, int) and value.bit_length() > 200:
@@ -148,16 +148,16 @@ def _of_type(value: Any, kind: type, expected: str, subject: str) -> Any:
 
 
 def _integer(digits: str) -> int:
-    """An integer of 64 bits: arrays of longer ones would hold objects, and nothing that we read has any."""
-    if len(digits) > _MOST_DIGITS:
+    """Parse an integer of 64 bits; arrays of longer ones would hold objects."""
+    if len(digits) > 19:  # digits of 2^63 with a sign
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
 
 
 def _levels(value: Any) -> int:
-    """How many containers lie in each other, up to one more than allowed."""
+    """Return the nesting depth of containers, at most one more than allowed."""
     layer = [value] if isinstance(value, dict | list) else []
-    for level in range(_MOST_LEVELS + 1):
+    for level in range(_MAX_LEVELS + 1):
         if not layer:
             return level
         layer = [
@@ -166,10 +166,11 @@ def _levels(value: Any) -> int:
             for child in (container.values() if isinstance(container, dict) else container)
             if isinstance(child, dict | list)
         ]
-    return _MOST_LEVELS + 1
+    return _MAX_LEVELS + 1
 
 
 def _all_text_usable(value: Any) -> bool:
+    """Tell whether no text in a value has a NUL or half a surrogate pair."""
     pending = [value]
     while pending:
         item = pending.pop()
@@ -183,7 +184,7 @@ def _all_text_usable(value: Any) -> bool:
 
 
 def _number_array(value: Any) -> np.ndarray | None:
-    """Nested lists as float64; None where they hold anything but numbers: numpy would read "1" and true as numbers."""
+    """Convert nested lists to float64; None if they hold anything but numbers (numpy would accept "1" and true)."""
     pending = [value]
     while pending:
         item = pending.pop()
@@ -195,12 +196,12 @@ def _number_array(value: Any) -> np.ndarray | None:
             return None
     try:
         return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):  # unequal lengths, integers beyond a float
+    except (TypeError, ValueError, OverflowError):  # unequal lengths, integers too large for a float
         return None
 
 
 def jsonable(value: Any) -> Any:
-    """Configs, paths and numpy values as JSON values; non-finite numbers as null."""
+    """Convert configs, paths and numpy values to JSON values; non-finite numbers become null."""
     if is_dataclass(value) and not isinstance(value, type):
         return jsonable(asdict(value))
     if isinstance(value, Mapping):

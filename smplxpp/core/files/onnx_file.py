@@ -1,4 +1,4 @@
-"""ONNX models: opened by onnxruntime on the CPU, run, and told in words where they cannot be."""
+"""Open and run ONNX models with onnxruntime on the CPU, with errors in plain words."""
 
 from __future__ import annotations
 
@@ -11,20 +11,23 @@ import numpy as np
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.paths import read_bytes, regular_file
 
-_SHOWN = 400
-
 
 class OnnxModel:
-    """A user's model.
+    """An ONNX model of the user, opened for the CPU.
 
     Args:
-        shown: values inside the model that it gives too, behind its own outputs.
+        path: file of the model.
+        kind: what the model is called in messages, such as "matting model".
+        extra: extra of smplxpp that installs onnxruntime.
+        threads: number of threads of the computation.
+        shown: names of inner values that `run` returns after the outputs.
 
     Attributes:
-        path: its file.
-        subject: what errors call it.
-        inputs, outputs: onnxruntime's, with `name`, `type` and `shape`.
-        metadata: what the model says of itself, by name.
+        path: file of the model.
+        subject: name of the model in messages.
+        inputs: onnxruntime's descriptions of the inputs, with `name`, `type` and `shape`.
+        outputs: the same of the outputs.
+        metadata: custom metadata of the model, by name.
 
     Raises:
         MissingExtraError: onnxruntime is not installed.
@@ -41,30 +44,30 @@ class OnnxModel:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         try:
-            model = _showing(read_bytes(self.path, subject=kind), shown) if shown else str(self.path)
+            model = _with_outputs(read_bytes(self.path, subject=kind), shown) if shown else str(self.path)
             self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
-            raise InputError(self.subject, expected="an ONNX model", received=f"{error}"[:_SHOWN]) from None
+            raise InputError(self.subject, expected="an ONNX model", received=f"{error}"[:400]) from None
         self.inputs, self.outputs = self._session.get_inputs(), self._session.get_outputs()
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def run(self, values: Mapping[str, np.ndarray]) -> list[Any]:
-        """What the model gives, in the order of `outputs`.
+        """Run the model on named inputs; returns its outputs in the order of `outputs`.
 
         Raises:
-            InputError: it cannot compute these values.
+            InputError: the model cannot compute with these values.
         """
         try:
             return self._session.run(None, dict(values))
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for whatever a model cannot do
-            raise InputError(self.subject, expected="a model that runs", received=f"{error}"[:_SHOWN]) from None
+            raise InputError(self.subject, expected="a model that runs", received=f"{error}"[:400]) from None
 
 
-def _showing(model: bytes, names: Sequence[str]) -> bytes:
-    """Return a model with more outputs.
+def _with_outputs(model: bytes, names: Sequence[str]) -> bytes:
+    """Return the bytes of a model with more outputs.
 
-    Two messages of protocol buffers behind each other are one, whose lists are joined: a model (field 7: its graph) of
-    a graph of outputs (field 12) of names (field 1) adds them, without a reader of ONNX.
+    Concatenated protocol buffer messages merge, and their lists are joined. So appending a model (field 7: graph) whose
+    graph has outputs (field 12) with names (field 1) adds these outputs without a parser of ONNX.
     """
 
     def field(number: int, content: bytes) -> bytes:

@@ -16,24 +16,19 @@ from smplxpp.core.files.array_file import DAMAGED
 from smplxpp.core.files.atomic import atomic_path
 from smplxpp.core.files.paths import regular_file
 
-# Zips carry a time; the oldest that they can.
+# The oldest time that a zip entry can carry, so that equal content gives equal bytes.
 _TIME = (1980, 1, 1, 0, 0, 0)
-_MOST_PIECES, _MOST_BYTES = 64, 512 << 20
-# Deflate makes a thousand of one; what our tensors unpack to is a few times their size.
-_FREELY_UNPACKED, _MOST_UNPACKING = 4 << 20, 100
-_PIECE = 1 << 20
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,60}\.[a-z]{1,16}")
-_ENCRYPTED = 1
 
 
 def write_package(path: str | Path, pieces: Mapping[str, bytes]) -> dict[str, int]:
-    """Write pieces by name, compressed, whole or not at all; the same pieces give the same bytes.
+    """Write named pieces as a compressed zip, atomically; equal pieces give equal bytes.
 
     Returns:
-        Bytes that each piece takes in the file.
+        Compressed bytes of each piece.
 
     Raises:
-        ValueError: a name that is no plain one in lower case with a suffix.
+        ValueError: a name that is not plain lower case with a suffix.
     """
     for name in pieces:
         if not _NAME.fullmatch(name):
@@ -48,11 +43,13 @@ def read_package(path: str | Path, *, subject: str, expected: str, remedy: str =
     """Return the pieces of a package by name.
 
     Args:
-        subject: what the file is, for messages. expected: what it should be. remedy: what a user can do.
+        subject: what the file is called in messages.
+        expected: what it should be, in messages.
+        remedy: advice in messages.
 
     Raises:
-        InputError: missing or damaged file, no zip; names that are paths, or twice there; pieces that are encrypted, or
-            would unpack to more than half a GiB or to a hundred times the file.
+        InputError: missing or damaged file, no zip; names that are paths or duplicates; pieces that are encrypted, or
+            would unpack to more than half a GiB or a hundred times the file.
     """
     path = regular_file(path, subject=subject, remedy=remedy)
     about = f"{subject} {path}"
@@ -74,26 +71,31 @@ def read_package(path: str | Path, *, subject: str, expected: str, remedy: str =
 
 
 def _check(entries: list[zipfile.ZipInfo], packed: int, subject: str, remedy: str) -> None:
+    """Refuse odd names, too many pieces, encryption, and decompression bombs, before anything is unpacked."""
+    max_pieces = 64
     names = [entry.filename for entry in entries]
     odd = [name for name in names if not _NAME.fullmatch(name)]
     if odd:
         raise InputError(
             subject, expected="pieces with plain names", received=f"a piece {odd[0][:80]!r}", remedy=remedy
         )
-    if len(set(names)) != len(names) or len(names) > _MOST_PIECES:
+    if len(set(names)) != len(names) or len(names) > max_pieces:
         raise InputError(
             subject,
-            expected=f"at most {_MOST_PIECES} pieces, each once",
+            expected=f"at most {max_pieces} pieces, each once",
             received=f"{len(names)} of {len(set(names))} names",
             remedy=remedy,
         )
     for entry in entries:
-        if entry.flag_bits & _ENCRYPTED or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        # Bit 0 of the flags marks an encrypted entry.
+        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise InputError(
                 f"{subject}: {entry.filename}", expected="a piece stored or deflated", received="another", remedy=remedy
             )
     unpacked = sum(entry.file_size for entry in entries)
-    most = min(_MOST_BYTES, max(_FREELY_UNPACKED, _MOST_UNPACKING * packed))
+    # Deflate reaches a ratio of a thousand; tensors of real packages unpack to a few times their size. Four MiB are
+    # always allowed, half a GiB never exceeded.
+    most = min(512 << 20, max(4 << 20, 100 * packed))
     if unpacked > most:
         raise InputError(
             subject,
@@ -104,19 +106,19 @@ def _check(entries: list[zipfile.ZipInfo], packed: int, subject: str, remedy: st
 
 
 def _unpacked(package: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """The bytes of an entry; never more than it says to have, whatever it unpacks to."""
+    """Return the bytes of an entry, reading no more than the size that it states."""
     parts, left = [], entry.file_size
     with package.open(entry) as stream:
-        while left > 0 and (piece := stream.read(min(_PIECE, left))):
+        while left > 0 and (piece := stream.read(min(1 << 20, left))):
             parts.append(piece)
             left -= len(piece)
         if left or stream.read(1):
-            raise zipfile.BadZipFile(f"{entry.filename}: not the {entry.file_size} bytes that it says")
+            raise zipfile.BadZipFile(f"{entry.filename}: not the {entry.file_size} bytes that it states")
     return b"".join(parts)
 
 
 def zip_bytes(files: Mapping[str, str]) -> bytes:
-    """A compressed zip of texts by their names, in their order."""
+    """Return a compressed zip of texts by name, in their order."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as package:
         for name, text in files.items():
@@ -127,6 +129,6 @@ def zip_bytes(files: Mapping[str, str]) -> bytes:
 
 
 def zip_member(data: bytes, name: str) -> str:
-    """A text of a zip that `zip_bytes` made; nothing bounds what it unfolds to, so it is not for files of others."""
+    """Return a text of a zip that `zip_bytes` made; its size is not bounded, so that it is unsafe for foreign files."""
     with zipfile.ZipFile(io.BytesIO(data)) as package:
         return package.read(name).decode()

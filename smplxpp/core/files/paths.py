@@ -1,4 +1,4 @@
-"""Paths that come from users and from files: checked before anything is opened."""
+"""Check paths and names that come from users and files before anything is opened."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from pathlib import Path
 
 from smplxpp.core.errors import InputError
 
-_LONGEST_NAME = 200
-# Bytes of a file's or folder's name: what file systems take.
-_LONGEST_PART = 255
+# Characters of a name in a path that the library makes, and of a foreign path in a message.
+_MAX_NAME = 200
 
 
 def regular_file(path: str | Path, *, subject: str = "file", remedy: str = "") -> Path:
-    """The path, if a regular file (or a link to one) is there: a pipe or a device would be read without an end.
+    """Return the path if a regular file (or a link to one) is there; pipes and devices never end.
 
     Raises:
-        InputError: nothing there, a folder, a pipe, a socket or a device, or no path at all.
+        InputError: no file, a folder, a pipe, a socket or a device, or an impossible path.
     """
     path = Path(path)
     try:
@@ -27,7 +26,7 @@ def regular_file(path: str | Path, *, subject: str = "file", remedy: str = "") -
     except (OSError, ValueError) as error:  # ValueError: a NUL or half a character in the name
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(
-            f"{subject} {str(path)[:_LONGEST_NAME]!r}", expected="a readable file", received=f"{reason}", remedy=remedy
+            f"{subject} {str(path)[:_MAX_NAME]!r}", expected="a readable file", received=f"{reason}", remedy=remedy
         ) from None
     if not stat.S_ISREG(mode):
         received = "a folder" if stat.S_ISDIR(mode) else "a pipe, a socket or a device"
@@ -36,7 +35,7 @@ def regular_file(path: str | Path, *, subject: str = "file", remedy: str = "") -
 
 
 def read_bytes(path: str | Path, *, subject: str = "file", most: int = 1 << 33, remedy: str = "") -> bytes:
-    """The bytes of a regular file of at most `most` bytes.
+    """Return the bytes of a regular file of at most `most` bytes.
 
     Raises:
         InputError: missing, no regular file, unreadable or larger.
@@ -54,7 +53,7 @@ def read_bytes(path: str | Path, *, subject: str = "file", most: int = 1 << 33, 
 
 
 def read_text(path: str | Path, *, subject: str = "file", most: int = 1 << 30, remedy: str = "") -> str:
-    """The text of a regular file of at most `most` bytes, UTF-8 with or without a byte order mark.
+    """Return the text of a regular file of at most `most` bytes, UTF-8 with or without a byte order mark.
 
     Raises:
         InputError: what `read_bytes` refuses, and bytes that are no text.
@@ -67,39 +66,40 @@ def read_text(path: str | Path, *, subject: str = "file", most: int = 1 << 30, r
 
 
 def path_inside(root: str | Path, name: str, *, base: str | Path | None = None, subject: str = "file name") -> Path:
-    """The file that a file of `root` names, relative to `base` (a folder of `root`; None: `root` itself).
+    """Return the path that a file inside `root` names, relative to `base` (a folder of `root`; None: `root` itself).
 
-    The name alone is judged, with either kind of slash: links that a user has laid in the folder may lead elsewhere.
+    The name alone is checked, with either kind of slash; links that the user put in the folder may lead elsewhere.
 
     Raises:
-        InputError: an absolute name, one that leaves `root`, or one that no file can have.
+        InputError: an absolute name, a name that leaves `root`, or an impossible name.
     """
     text = name.replace("\\", "/")
     joined = Path(os.path.normpath(Path(root if base is None else base) / text))
     inside = joined.is_relative_to(os.path.normpath(root))
-    too_long = any(len(part.encode(errors="replace")) > _LONGEST_PART for part in joined.parts)
+    # File systems take 255 bytes for the name of a file or folder.
+    too_long = any(len(part.encode(errors="replace")) > 255 for part in joined.parts)
     if not text or "\0" in text or text.startswith("/") or text[1:3] == ":/" or not inside or too_long:
         raise InputError(
             subject,
             expected=f"a path inside of {root}",
-            received=repr(name[:_LONGEST_NAME]),
+            received=repr(name[:_MAX_NAME]),
             remedy="copy or link the file into the folder and name it from there",
         )
     return joined
 
 
 def check_name(name: str, *, subject: str) -> str:
-    """The name, if it can be part of a file's name: names of cameras and people become names of files.
+    """Return the name if it can be part of a file name, as names of cameras and people are.
 
     Raises:
-        InputError: empty, too long, with a slash, or with characters that are not printed.
+        InputError: an empty or too long name, or one with a slash or unprintable characters.
     """
-    usable = name.isprintable() and name.strip() and len(name) <= _LONGEST_NAME and not set(name) & {"/", "\\"}
+    usable = name.isprintable() and name.strip() and len(name) <= _MAX_NAME and not set(name) & {"/", "\\"}
     if not usable or name in (".", ".."):
         raise InputError(
             subject,
-            expected=f"a name of 1 to {_LONGEST_NAME} printable characters without slashes",
-            received=repr(name[:_LONGEST_NAME]),
+            expected=f"a name of 1 to {_MAX_NAME} printable characters without slashes",
+            received=repr(name[:_MAX_NAME]),
         )
     return name
 

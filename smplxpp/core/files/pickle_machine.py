@@ -1,7 +1,7 @@
-"""Runs the opcodes of a pickle with a vocabulary of its own: arrays, plain containers, records.
+"""Run the opcodes of a pickle with a restricted vocabulary: arrays, plain containers, records.
 
-The names in a pickle never become Python objects. They become `Name`s, and what is called is looked up in the table of
-`smplxpp.core.files.pickle_values`. Containers are only changed by what can stand in a file's data.
+Names in a pickle never become Python objects. They become `Name` tokens, and calls are looked up in the table of
+`smplxpp.core.files.pickle_values`. Containers are changed only by opcodes that occur in data files.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from smplxpp.core.files.pickle_values import (
     is_recorded,
 )
 
-# What a file may unfold to, all references followed, beyond so many times its size.
-_FREELY_UNFOLDED, _MOST_UNFOLDING = 1 << 26, 16
 _REFUSED_OPCODES = (
     pickle.EXT1,
     pickle.EXT2,
@@ -44,14 +42,14 @@ _REFUSED_OPCODES = (
 
 
 class PickleMachine(pickle._Unpickler):
-    """Reads one pickle; `load` returns its value.
+    """Reads one pickle without executing it; `load` returns its value.
 
     Raises (from `load`):
-        RefusedName: a name outside of the table.
+        RefusedName: a name that is not in the table.
         pickle.UnpicklingError and other standard errors: a broken file.
     """
 
-    # What the parent, which is private in the standard library's types, keeps.
+    # State of the parent class, which the standard library's type stubs omit.
     stack: list[Any]
     append: Callable[[Any], None]
     pop_mark: Callable[[], list[Any]]
@@ -60,16 +58,17 @@ class PickleMachine(pickle._Unpickler):
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
         self.memo = Memo()
-        self._budget = Budget(_FREELY_UNFOLDED + _MOST_UNFOLDING * len(data))
+        # Bytes that the value may take with all references followed: 64 MiB, and 16 times the file.
+        self._budget = Budget((1 << 26) + 16 * len(data))
 
     def load(self) -> Any:
-        """The pickle's value."""
+        """Run the opcodes and return the value of the pickle."""
         value = super().load()
         check_unfolding([value], self._budget.most)
         return value
 
     def find_class(self, module: str, name: str) -> Any:
-        """A token for a name: it is never imported."""
+        """Return a token for a name, which is never imported."""
         token = Name(module, name)
         if token not in KNOWN_NAMES and not is_recorded(token):
             raise RefusedName(str(token))
@@ -85,7 +84,7 @@ class PickleMachine(pickle._Unpickler):
             raise RefusedName(str(token))
         return builder(self._budget, *arguments)
 
-    # Opcodes that call something, or change what lies on the stack.
+    # Opcodes that call builders, or change containers on the stack.
 
     def load_reduce(self) -> None:
         arguments = self.stack.pop()
@@ -98,7 +97,7 @@ class PickleMachine(pickle._Unpickler):
         self.load_reduce()
 
     def _instantiate(self, token: Any, arguments: list[Any]) -> None:
-        """INST and OBJ of old protocols."""
+        """Run the opcodes INST and OBJ of old protocols."""
         self.append(self._call(token, tuple(arguments)))
 
     def load_build(self) -> None:
@@ -146,7 +145,7 @@ class PickleMachine(pickle._Unpickler):
         items = self.pop_mark()
         self.append(frozenset(map(as_key, items)))
 
-    # The parent's methods by opcode, without those that reach outside: extensions, persistent objects, buffers.
+    # The parent's methods by opcode, without extensions, persistent objects and buffers, which refer to other data.
     dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
         code: method for code, method in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED_OPCODES
     } | {
@@ -162,9 +161,6 @@ class PickleMachine(pickle._Unpickler):
         pickle.ADDITEMS[0]: load_additems,
         pickle.FROZENSET[0]: load_frozenset,
     }
-
-
-_MOST_LEVELS = 200
 
 
 def _children(value: Any) -> Iterator[Any]:
@@ -184,11 +180,14 @@ def _own_size(value: Any) -> int:
 
 
 def check_unfolding(value: Any, budget: int) -> None:
-    """Refuse what is small in the file and huge to whoever walks it: lists of lists that are all the same list.
+    """Refuse values that are small in the file and huge with all references followed, such as nested equal lists.
+
+    A depth-first walk with an explicit stack adds up sizes; a container that was walked before counts with its size.
 
     Raises:
         pickle.UnpicklingError: too deep, too large with every reference counted, or a container within itself.
     """
+    max_levels = 200
     sizes: dict[int, int] = {}
     begun = {id(value)}
     path = [(value, _children(value), _own_size(value))]
@@ -207,14 +206,14 @@ def check_unfolding(value: Any, budget: int) -> None:
             broken("an array without content, or within itself")
         elif isinstance(child, dict | list | tuple | InertObject) or _own_size(child) > 8 or _holds_objects(child):
             if id(child) in begun and id(child) not in sizes:
-                if isinstance(child, InertObject):  # records may refer to each other: nobody follows them blindly
+                if isinstance(child, InertObject):  # records may refer to each other
                     continue
                 broken("a container within itself")
             begun.add(id(child))
             path.append((child, _children(child), _own_size(child)))
         else:
             path[-1] = (node, children, size + 8)
-        if len(path) > _MOST_LEVELS or (path and path[-1][2] > budget):
+        if len(path) > max_levels or (path and path[-1][2] > budget):
             broken("values that unfold to many times the file's size")
 
 

@@ -1,7 +1,7 @@
-"""What a pickle may hold: names as tokens, arrays, records, and the builders of each.
+"""Define the values that a pickle may hold (name tokens, arrays, records) and their builders.
 
 Builders check types, shapes and sizes before they allocate. numpy's own `__setstate__` is not among them: given an
-array of objects and raw bytes it takes these for pointers.
+object array and raw bytes, it interprets the bytes as pointers.
 """
 
 from __future__ import annotations
@@ -15,18 +15,16 @@ import numpy as np
 
 from smplxpp.core.files.array_file import check_dtype, check_shape
 
-# Integers hash to themselves up to here; beyond, a file could choose keys that all hash alike.
-_LARGEST_KEY = 1 << 60
 _OBJECT_KINDS = ("O", "O4", "O8")
 
 
 class RefusedName(Exception):
-    """A pickle names something that is not among arrays and plain containers."""
+    """A name in a pickle that is neither an array type nor a plain container."""
 
 
 @dataclass
 class InertObject:
-    """Stands for an object of a package that is not loaded: its class name, arguments and state, no behaviour."""
+    """Record of an object of a package that is not loaded: its class name, arguments and state, without behaviour."""
 
     origin: str
     arguments: tuple[Any, ...] = ()
@@ -35,7 +33,7 @@ class InertObject:
 
 @dataclass(frozen=True)
 class Name:
-    """A name in a pickle, never imported."""
+    """Module and name of an object in a pickle, never imported."""
 
     module: str
     name: str
@@ -46,32 +44,32 @@ class Name:
 
 @dataclass
 class Dtype:
-    """A type of elements: how numpy spells its kind and size, and the byte order that comes after it."""
+    """An element type: numpy's type string of kind and size, and the byte order that is set later."""
 
     kind: str
     order: str = ""
 
     def resolved(self) -> np.dtype:
-        """The type for numpy; ValueError for other than numbers and texts."""
+        """Return the numpy type; raises ValueError for other types than numbers and texts."""
         return check_dtype(self.order + self.kind)
 
 
 @dataclass
 class Unbuilt:
-    """An array whose content has not come yet; `value` once it has."""
+    """An array that is created before its content is set; `value` holds it afterwards."""
 
     value: np.ndarray | None = None
 
 
 @dataclass
 class Budget:
-    """How many bytes a file's arrays may take, and have taken."""
+    """Number of bytes that the arrays of a file may take, and have taken."""
 
     most: int
     taken: int = 0
 
     def spend(self, amount: int) -> None:
-        """Count bytes that are about to be allocated.
+        """Count bytes before they are allocated.
 
         Raises:
             pickle.UnpicklingError: more than the file can reasonably hold.
@@ -82,7 +80,7 @@ class Budget:
 
 
 class Memo(dict[int, Any]):
-    """What a pickle refers to again: an array was stored before its content came."""
+    """Values that a pickle refers to again, with arrays resolved that were stored before their content."""
 
     def __getitem__(self, index: int) -> Any:
         value = super().__getitem__(index)
@@ -95,22 +93,23 @@ _OBJECT = {Name("builtins", "object"), Name("__builtin__", "object")}
 
 
 def broken(what: str) -> NoReturn:
-    """Raise what the standard library's unpickler raises."""
+    """Raise the exception of the standard library's unpickler."""
     raise pickle.UnpicklingError(what)
 
 
 def exactly(value: Any, kind: type) -> Any:
-    """The value, if it is of this type and no other."""
+    """Return the value if it has exactly this type, without subclasses."""
     if type(value) is not kind:
         broken(f"a {kind.__name__} where there is {type(value).__name__}")
     return value
 
 
 def as_key(value: Any) -> Any:
-    """A key of a dictionary or a set whose hash the file cannot choose."""
+    """Return a key of a dictionary or a set whose hash the file cannot choose."""
     if isinstance(value, np.integer):
         value = int(value)
-    if isinstance(value, str | bytes | None) or (isinstance(value, int) and abs(value) < _LARGEST_KEY):
+    # Integers up to 2^60 hash to themselves; with larger ones a file could make all hashes collide.
+    if isinstance(value, str | bytes | None) or (isinstance(value, int) and abs(value) < 1 << 60):
         return value
     broken(f"a key of type {type(value).__name__}")
 
@@ -122,7 +121,7 @@ def is_recorded(token: Name) -> bool:
 
 
 def _bytes(value: Any) -> bytes:
-    """Raw content: Python 2 wrote it as a text."""
+    """Return raw content as bytes; Python 2 wrote it as a text."""
     if isinstance(value, str):
         return value.encode("latin1")
     if not isinstance(value, bytes | bytearray):
@@ -131,13 +130,14 @@ def _bytes(value: Any) -> bytes:
 
 
 def _array(budget: Budget, shape: Any, dtype: Any, order: str, content: Any) -> np.ndarray:
+    """Build an array after checking shape, type and size; objects come as a list, numbers as bytes."""
     if isinstance(shape, int):
         shape = (shape,)
     if not (isinstance(shape, tuple) and all(type(n) is int for n in shape) and isinstance(dtype, Dtype)):
         broken("an array without shape and type")
     count = check_shape(shape)
     if dtype.kind in _OBJECT_KINDS:
-        # Objects come as a list of them; as bytes they would be pointers.
+        # As bytes, objects would be pointers.
         values = exactly(content, list)
         if len(values) != count:
             broken(f"{len(values)} objects for shape {shape}")
@@ -155,7 +155,7 @@ def _array(budget: Budget, shape: Any, dtype: Any, order: str, content: Any) -> 
 
 
 def array_of_state(budget: Budget, state: Any) -> np.ndarray:
-    """The array of (version, shape, dtype, is it Fortran's order, content); the oldest files have no version."""
+    """Build an array from (version, shape, dtype, Fortran order, content); the oldest files have no version."""
     if not isinstance(state, tuple) or len(state) not in (4, 5):
         broken("an array without content")
     shape, dtype, fortran_order, content = state[-4:]
@@ -187,14 +187,14 @@ def _dtype(budget: Budget, kind: Any, align: Any = False, copy: Any = True) -> D
 
 
 def _old_object(budget: Budget, cls: Any, base: Any, state: Any) -> InertObject:
-    """copyreg's helper of old protocols, for the inert records alone."""
+    """Build a record for copyreg's helper of old protocols."""
     if not (isinstance(cls, Name) and is_recorded(cls)) or base not in _OBJECT:
         broken("an object of an unexpected class")
     return InertObject(str(cls))
 
 
 def _encoded(budget: Budget, text: Any, encoding: Any = "latin1") -> bytes:
-    """How protocol 2 writes bytes."""
+    """Decode bytes that protocol 2 wrote as a text."""
     if exactly(encoding, str) not in ("latin1", "latin-1"):
         broken("bytes in another encoding")
     return exactly(text, str).encode("latin1")
@@ -208,7 +208,7 @@ def _listed(budget: Budget, items: Any = ()) -> list[Any]:
 
 
 def _mapping(budget: Budget, items: Any = ()) -> dict[Any, Any]:
-    """A dictionary of pairs; a defaultdict's factory is dropped."""
+    """Build a dictionary from pairs, without the factory of a defaultdict."""
     pairs = [] if isinstance(items, Name) else _listed(budget, items)
     return {as_key(key): value for key, value in (_listed(budget, pair) for pair in pairs)}
 

@@ -1,8 +1,8 @@
-"""The one door for pickles: other people's files and object arrays, read without executing anything they contain.
+"""Read pickles and object arrays of other programs without executing anything in them.
 
-A pickle is a program: its opcodes name Python objects and call them. `pickle_machine` runs the opcodes and knows arrays
-and plain containers alone. Objects of chumpy and scipy.sparse, which old body model files hold, become inert records of
-their state; `dense_array` reads the numbers out of them. Any other name is refused before anything is called.
+A pickle is a program whose opcodes name Python objects and call them. `pickle_machine` runs the opcodes with arrays and
+plain containers only. Objects of chumpy and scipy.sparse, which old body model files hold, become inert records of
+their state, from which `dense_array` takes the numbers. Any other name is refused before anything is called.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from smplxpp.core.files.paths import regular_file
 from smplxpp.core.files.pickle_machine import PickleMachine
 from smplxpp.core.files.pickle_values import InertObject, RefusedName
 
-# Errors that a truncated or foreign file raises inside the machine.
+# Exceptions that a truncated or foreign file raises in the pickle machine.
 _BROKEN = (
     pickle.UnpicklingError,
     struct.error,
@@ -38,19 +38,16 @@ _BROKEN = (
     RecursionError,
     AssertionError,
 )
-_MOST_BYTES, _PIECE = 1 << 32, 1 << 20
-# Elements of a sparse matrix that is made dense: a regressor of joints has half a million.
-_MOST_DENSE = 100_000_000
 
 
 def safe_load(path: str | Path) -> Any:
-    """The content of a pickle file (any protocol, Python 2's included), executing nothing from it.
+    """Read a pickle file of any protocol (also Python 2's) without executing anything in it.
 
     Strings of Python 2 are read as latin-1. Objects of chumpy and scipy.sparse become `InertObject`.
 
     Raises:
-        InputError: no such file, a broken pickle, one that names anything but arrays and containers, or one that
-            unfolds to much more than its size.
+        InputError: no such file, a broken pickle, a name that is neither array nor container, or values that expand to
+            much more than the file's size.
     """
     path = regular_file(path)
     try:
@@ -61,11 +58,11 @@ def safe_load(path: str | Path) -> Any:
 
 
 def safe_npz(path: str | Path, *, keys: Iterable[str] | None = None) -> dict[str, Any]:
-    """The arrays of an npz file by name, object arrays through `safe_load`'s machine.
+    """Read the arrays of an npz file by name, object arrays in the manner of `safe_load`.
 
     Args:
-        path: the file.
-        keys: read these only (those that exist); None reads all.
+        path: of the file.
+        keys: names to read, as far as they exist; None: all.
 
     Raises:
         InputError: what `read_arrays` refuses, or an object array that names something refused.
@@ -74,7 +71,7 @@ def safe_npz(path: str | Path, *, keys: Iterable[str] | None = None) -> dict[str
 
 
 def dense_array(value: Any, *, subject: str) -> np.ndarray:
-    """The numbers of an array, a pickled sparse matrix, or a pickled chumpy object, as a dense array.
+    """Return the numbers of an array, a pickled sparse matrix or a pickled chumpy object as a dense array.
 
     Raises:
         InputError: an object whose numbers cannot be read without running its code.
@@ -95,7 +92,7 @@ def _dense(value: Any, subject: str) -> np.ndarray:
             return _dense_sparse(value, subject)
         if value.origin.startswith("chumpy") and "x" in state:
             return _dense(state["x"], subject)
-        # chumpy's Select: flat indices into another object.
+        # chumpy's Select holds flat indices into another object.
         if value.origin.startswith("chumpy") and {"a", "idxs"} <= state.keys():
             taken = _dense(state["a"], subject).ravel()[np.asarray(state["idxs"])]
             return taken.reshape(state.get("preferred_shape", taken.shape))
@@ -117,8 +114,10 @@ def _dense_sparse(value: InertObject, subject: str) -> np.ndarray:
         raise InputError(subject, expected="a csc or csr matrix", received=value.origin)
     state = value.state
     shape = tuple(int(n) for n in state["_shape"])
-    if len(shape) != 2 or min(shape) < 0 or math.prod(shape) > _MOST_DENSE:
-        raise InputError(subject, expected=f"a matrix of at most {_MOST_DENSE} elements", received=f"shape {shape}")
+    # A joint regressor has half a million elements.
+    max_dense = 100_000_000
+    if len(shape) != 2 or min(shape) < 0 or math.prod(shape) > max_dense:
+        raise InputError(subject, expected=f"a matrix of at most {max_dense} elements", received=f"shape {shape}")
     try:
         matrix = build((state["data"], state["indices"], state["indptr"]), shape=shape)
         matrix.check_format(full_check=True)
@@ -128,12 +127,13 @@ def _dense_sparse(value: InertObject, subject: str) -> np.ndarray:
 
 
 def _load(stream: BinaryIO, subject: str) -> Any:
-    # Whole: the machine must not ask a stream for the lengths that a file claims.
+    # Read completely, so that the machine never asks a stream for lengths that a file claims.
+    max_bytes, chunk = 1 << 32, 1 << 20
     pieces: list[bytes] = []
-    while piece := stream.read(_PIECE):
+    while piece := stream.read(chunk):
         pieces.append(piece)
-        if len(pieces) * _PIECE > _MOST_BYTES:
-            raise InputError(subject, expected=f"a pickle of at most {_MOST_BYTES} bytes", received="more")
+        if len(pieces) * chunk > max_bytes:
+            raise InputError(subject, expected=f"a pickle of at most {max_bytes} bytes", received="more")
     data = b"".join(pieces)
     try:
         return PickleMachine(data).load()

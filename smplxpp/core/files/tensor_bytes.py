@@ -1,7 +1,7 @@
-"""Tensors in the layout of safetensors, to bytes and back, with numpy alone: players need no other library.
+"""Pack tensors into the bytes of a safetensors file and unpack them, with numpy only.
 
-A JSON object (name: dtype, shape, first and last byte) behind its length, then the numbers. `safetensors` reads what is
-written here, and a browser as well: a typed array a tensor.
+The layout is the length of a JSON object, the object (name: dtype, shape, first and last byte), then the numbers.
+`safetensors` reads these files, and a browser maps each tensor to a typed array.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, parse_json, shown
 
-_LONGEST_HEADER, _MOST_DIMENSIONS, _ALIGNED = 1 << 20, 8, 8
 _METADATA = "__metadata__"
 _DTYPES = {
     **{"F64": "<f8", "F32": "<f4", "F16": "<f2"},
@@ -27,13 +26,13 @@ _NAMES = {np.dtype(text): name for name, text in _DTYPES.items()}
 
 
 def pack_tensors(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any] | None = None) -> bytes:
-    """Return tensors as the bytes of a safetensors file; the same tensors give the same bytes.
+    """Return tensors as the bytes of a safetensors file; equal tensors give equal bytes.
 
-    Wide numbers come first, so that each tensor begins where its numbers may be looked at in place.
+    Wider types come first, so that every tensor is aligned to its type and can be viewed in place.
 
     Args:
-        tensors: numbers and bools by name.
-        about: what else is to be said, as JSON; None: nothing.
+        tensors: arrays of numbers and bools by name.
+        about: JSON object for the metadata; None: no metadata.
 
     Raises:
         ValueError: an array of another type.
@@ -52,18 +51,19 @@ def pack_tensors(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any] | N
         blocks.append(array.tobytes())
         start += array.nbytes
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % _ALIGNED)
+    text += b" " * (-len(text) % 8)  # the numbers begin at a multiple of eight bytes
     return b"".join([len(text).to_bytes(8, "little"), text, *blocks])
 
 
 def unpack_tensors(data: bytes, *, subject: str, remedy: str = "") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the tensors that `pack_tensors` packed, which look into `data`, and what else was said.
+    """Return the tensors that `pack_tensors` packed, as views of `data`, and the metadata object.
 
     Raises:
-        InputError: anything but tensors that fill the data between them, each of its type and shape.
+        InputError: anything but tensors that fill the data without gaps, each of its type and shape.
     """
+    longest_header = 1 << 20
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(_LONGEST_HEADER, len(data) - 8):
+    if len(data) < 8 or length > min(longest_header, len(data) - 8):
         raise InputError(
             subject, expected="tensors behind a header", received=f"{len(data)} bytes of something else", remedy=remedy
         )
@@ -75,7 +75,7 @@ def unpack_tensors(data: bytes, *, subject: str, remedy: str = "") -> tuple[dict
         spans.append(span)
     end = 0
     for first, last in sorted(spans):
-        if first != end:  # holes hide what nobody looks at, tensors over each other unfold
+        if first != end:  # gaps could hide data, and overlapping tensors expand a small file
             raise InputError(
                 subject, expected="tensors one behind the other", received="holes, or shared bytes", remedy=remedy
             )
@@ -98,7 +98,7 @@ def _tensor(
     most = len(body)
     shape = [as_integer(n, subject=subject, least=0, most=most) for n in as_list(entry.get("shape"), subject=subject)]
     span = [as_integer(n, subject=subject, least=0) for n in as_list(entry.get("data_offsets"), subject=subject)]
-    if len(shape) > _MOST_DIMENSIONS or len(span) != 2:
+    if len(shape) > 8 or len(span) != 2:
         raise InputError(subject, expected="a shape and two offsets", received=shown(entry), remedy=remedy)
     first, last = span
     if not first <= last <= most or last - first != math.prod(shape) * dtype.itemsize:

@@ -1,4 +1,4 @@
-"""The door for sound: WAV files of any rate and number of channels, integers of 8 to 32 bits and floats."""
+"""Read and write WAV files of any rate and number of channels, with integers of 8 to 32 bits or floats."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from scipy.signal import resample_poly
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
 
-_MOST_BYTES = 1 << 30
-_LEAST_RATE, _MOST_RATE = 4000, 384_000
-_MOST_CHANNELS = 64
+# Codes of the sample format in a WAV file; an extensible header holds the code in its second part.
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 _EXPECTED = "a WAV file (RIFF): integers of 8, 16, 24 or 32 bits, or floats"
 _REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recording"
@@ -24,10 +22,11 @@ _REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recordi
 
 @dataclass(frozen=True, eq=False)
 class Sound:
-    """One channel of sound.
+    """Samples of one channel of sound at a constant rate.
 
     Attributes:
-        samples: -1 to 1. rate: samples a second.
+        samples: amplitudes from -1 to 1.
+        rate: samples per second.
     """
 
     samples: Float32[np.ndarray, " N"]
@@ -35,11 +34,11 @@ class Sound:
 
     @property
     def seconds(self) -> float:
-        """How long it is."""
+        """Duration of the sound in seconds."""
         return len(self.samples) / self.rate
 
     def at_rate(self, rate: int) -> Sound:
-        """The same sound at another rate, what it could not hold filtered out."""
+        """Return the sound resampled to another rate, with a low-pass filter against aliasing."""
         if rate == self.rate or not len(self.samples):
             return Sound(self.samples, rate)
         ratio = Fraction(rate, self.rate)
@@ -47,33 +46,35 @@ class Sound:
         return Sound(samples.astype(np.float32), rate)
 
     def integers(self) -> np.ndarray:
-        """The samples as 16-bit integers; what is louder than 1 is cut."""
+        """Return the samples as 16-bit integers, clipped to [-1, 1]."""
         return np.round(np.clip(self.samples, -1.0, 1.0) * 32767.0).astype("<i2")
 
 
 def read_wave(path: str | Path) -> Sound:
-    """Read a WAV file; channels are averaged.
+    """Read a WAV file and average its channels.
 
     Raises:
         InputError: missing, damaged or foreign; a coding other than integers and floats; NaN.
     """
+    max_bytes, (lowest_rate, highest_rate), max_channels = 1 << 30, (4000, 384_000), 64
     subject = f"sound {path}"
-    data = read_bytes(path, subject="sound", most=_MOST_BYTES)
+    data = read_bytes(path, subject="sound", most=max_bytes)
     if data[:4] != b"RIFF" or data[8:12] != b"WAVE":
         raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=_REMEDY)
     chunks = _chunks(data)
     if len(chunks.get(b"fmt ", b"")) < 16 or b"data" not in chunks:
         raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=_REMEDY)
+    # Format header: sample format, channels, rate, bytes per second, bytes per block, bits per sample.
     kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
     if kind == _EXTENSIBLE and len(chunks[b"fmt "]) >= 26:
         (kind,) = struct.unpack("<H", chunks[b"fmt "][24:26])
     known = (kind == _PCM and bits in (8, 16, 24, 32)) or (kind == _FLOAT and bits in (32, 64))
     if not known:
         raise InputError(subject, expected=_EXPECTED, received=f"coding {kind} of {bits} bits", remedy=_REMEDY)
-    if not (1 <= channels <= _MOST_CHANNELS and _LEAST_RATE <= rate <= _MOST_RATE and block == channels * bits // 8):
+    if not (1 <= channels <= max_channels and lowest_rate <= rate <= highest_rate and block == channels * bits // 8):
         raise InputError(
             subject,
-            expected=f"1 to {_MOST_CHANNELS} channels at {_LEAST_RATE} to {_MOST_RATE} Hz",
+            expected=f"1 to {max_channels} channels at {lowest_rate} to {highest_rate} Hz",
             received=f"{channels} at {rate} Hz in blocks of {block} bytes",
         )
     raw = np.frombuffer(chunks[b"data"], np.uint8)
@@ -84,7 +85,7 @@ def read_wave(path: str | Path) -> Sound:
 
 
 def wave_bytes(sound: Sound) -> bytes:
-    """Return a WAV file of 16-bit integers."""
+    """Return the bytes of a mono WAV file of 16-bit integers."""
     data = sound.integers().tobytes()
     form = struct.pack("<HHIIHH", _PCM, 1, sound.rate, 2 * sound.rate, 2, 16)
     body = b"WAVEfmt " + struct.pack("<I", len(form)) + form + b"data" + struct.pack("<I", len(data)) + data
@@ -92,7 +93,7 @@ def wave_bytes(sound: Sound) -> bytes:
 
 
 def _chunks(data: bytes) -> dict[bytes, bytes]:
-    """The first chunk of each name; recorders that were cut off give sizes beyond the end."""
+    """Return the first chunk of each name; an interrupted recording may state sizes past its end."""
     out: dict[bytes, bytes] = {}
     at = 12
     while at + 8 <= len(data):
@@ -103,7 +104,7 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
 
 
 def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
-    """Samples as float64, -1 to 1."""
+    """Convert raw samples to float64 from -1 to 1."""
     if kind == _FLOAT:
         return raw.view(f"<f{bits // 8}").astype(np.float64)
     if bits == 8:

@@ -1,1 +1,1 @@
-"""Mesh files of other programs, read in their own order, and ours written; `mesh_io` is the way in."""
+"""Read mesh files of other programs in their own order, and write PLY; start at `mesh_io`."""
