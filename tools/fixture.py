@@ -40,7 +40,7 @@ CAPTURE = SynthConfig(cameras=8, frames=16, size=320, truth_step=2, normals_step
 def make_fixture(out: Path, topology_file: Path | None = None) -> dict[str, float]:
     """Write all files of the person under `out`; returns the checks, in millimetres where the name says so.
 
-    `topology_file` are her layers; None makes them anew, which needs anny.
+    `topology_file` are her layers; None makes them again, which needs anny.
     """
     with tempfile.TemporaryDirectory() as folder:
         if topology_file is None:
@@ -145,9 +145,9 @@ def _log_progress(what: str, share: float) -> None:
 
 
 def main(out: Path = Path("data/fixtures/person"), layers: OptionalPath = None, tracked_only: bool = False) -> None:
-    """Write the fixture person to `out`; `layers` is a topology.npz to keep (None: dressed anew).
+    """Write the fixture person to `out`; `layers` is a topology.npz to keep (None: dress her again).
 
-    `tracked_only` keeps the capture that stands there and writes a tracker's inputs anew.
+    `tracked_only` keeps the capture that stands there and writes a tracker's inputs again.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     checks = track_fixture(out) if tracked_only else make_fixture(out, layers)

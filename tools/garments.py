@@ -1,4 +1,4 @@
-"""Shirt, skirt and shoes cut from the base mesh's helper geometry, which fits every body and has authored weights."""
+"""Cut shirt, skirt and shoes from the base mesh's helper geometry, which fits every body and has authored weights."""
 
 from __future__ import annotations
 

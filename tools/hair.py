@@ -1,4 +1,4 @@
-"""A bob of hair: the helper's hair strips and the scalp, thickened into one shell over the head."""
+"""Make a bob of hair: the helper's hair strips and the scalp, thickened into one shell over the head."""
 
 from __future__ import annotations
 

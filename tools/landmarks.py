@@ -1,4 +1,4 @@
-"""51 face landmarks in dlib's order 17..67 on the open body, placed where the mesh's own face units act.
+"""Place 51 face landmarks in dlib's order 17..67 on the open body, where the mesh's own face units act.
 
 Approximate: a schematic, symmetric face (arcs for brows, eyes and lips) drawn between features that are measured on
 the mesh, then dropped onto its front. Expect some millimetres.
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from tools.anny_base import JOINT_NAMES, BaseMesh
 from tools.tpose_body import TPoseBody
 
-_LASH_LENGTH = 0.004  # metres that lashes reach beyond the outer corner of the eye
+_LASH_LENGTH = 0.004  # length in metres of lashes past the outer corner of the eye
 
 
 def face_landmarks(

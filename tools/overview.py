@@ -1,4 +1,4 @@
-"""The picture at the head of the README: one run from scan to driven template and trained student.
+"""Draw the picture at the head of the README: one run from scan to driven template and trained student.
 
 python -m tools.overview RUN --out docs/images/overview.png
 """

@@ -1,4 +1,4 @@
-"""The kept part of the base mesh in the T-pose."""
+"""Bring the kept part of the base mesh into the T-pose."""
 
 from __future__ import annotations
 

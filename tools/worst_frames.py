@@ -1,4 +1,4 @@
-"""The worst held-out views of a run, photograph and models beside each other, for docs/evaluation.md.
+"""Draw the worst held-out views of a run, photograph and models side by side, for docs/evaluation.md.
 
 python -m tools.worst_frames RUN --out docs/images/worst_frames_NAME.jpg
 """

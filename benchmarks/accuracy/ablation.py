@@ -1,4 +1,4 @@
-"""The ablation's table on a capture: the paper's rows, options, baselines, with the command that made it.
+"""Store the table of an ablation: the paper's rows, options and baselines, with the command that made it.
 
     python -m benchmarks ablation --run RUN
 
@@ -34,13 +34,13 @@ class AblationBenchmark:
     capture: OptionalPath = None
     """Folder of the capture, to train and measure first what is missing."""
     preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
-    """Of the training."""
+    """Capture of the training."""
     rows: tuple[str, ...] = ("paper",)
     """Rows and groups."""
     iterations_share: float = 1.0
     """Share of the preset's iterations."""
     name: str | None = None
-    """Of the stored file, `ablation_NAME`; the capture's by default."""
+    """Name of the stored file, `ablation_NAME`; by default that of the capture."""
 
     def run(self) -> None:
         """Run what is asked for, print the table, store the figures."""
@@ -72,7 +72,7 @@ def read_results(run: Path) -> dict[str, Any]:
 
 
 def figures(results: dict[str, Any]) -> dict[str, Any]:
-    """What is stored: sizes of the training, and the rows' figures to five digits."""
+    """Return what is stored: sizes of the training, and the rows' figures to five digits."""
     preset = results["preset"]
     rows = {
         row["title"]: {

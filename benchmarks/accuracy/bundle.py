@@ -1,4 +1,4 @@
-"""What a bundle's size costs: megabytes, and decibels of held-out views, by reduction.
+"""Measure what the size of a bundle costs: megabytes and decibels of held-out views, by reduction.
 
     python -m benchmarks bundle --run RUN --capture DIR [--frames 6] [--no-store]
 
@@ -44,7 +44,7 @@ WAYS = {
 
 @dataclass
 class Row:
-    """Figures of one way over views, by kind."""
+    """Figures of one variant over views, by kind."""
 
     psnr: dict[str, list[float]] = field(default_factory=dict)
     near: list[float] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""What becomes of damaged files: mutations of every kind of file that is read, through the door that reads it.
+"""Send mutations of every kind of file through its reader, and count crashes, hangs and unclear errors.
 
     python -m benchmarks damaged_files [--inputs 100000] [--door capture]
 

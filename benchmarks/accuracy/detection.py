@@ -1,4 +1,4 @@
-"""What a detector of keypoints finds, in photographs and in pictures of scans, and what becomes of it; masks.
+"""Measure detected keypoints in photographs and in pictures of scans, bodies fitted to them, and masks.
 
     python -m benchmarks detection photographs --capture DIR
     python -m benchmarks detection scans
@@ -102,11 +102,11 @@ class Scans:
     """Landmarks of bare scans."""
 
     people: int = 12
-    """How many procedural people, beside the captures' scans."""
+    """Number of procedural people, beside the captures' scans."""
     views: int = 12
     """Pictures of each."""
     variants: tuple[str, ...] = ("as it is", "turned", "mirrored", "20 % of the faces", "3 mm noise")
-    """What happens to the captures' scans; the people are taken as they are."""
+    """Changes of the captures' scans; the people are taken as they are."""
     store: bool = True
     """Write benchmarks/results/detection_scans.json."""
 
@@ -215,7 +215,7 @@ class Masks:
 
 
 def _point_errors(capture: Capture, body: BodyModel, frames: tuple[int, ...]) -> dict[str, object]:
-    """Errors of what the detector said, in pixels and millimetres at the person, and of the triangulated points."""
+    """Return errors of detected points, in pixels and in millimetres at the person, and of triangulated points."""
     keypoints = {name: found for name in capture.cameras if (found := capture.keypoints(name)) is not None}
     names = next(iter(keypoints.values())).names
     model = LandmarkModel.of(body, names)

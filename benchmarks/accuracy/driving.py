@@ -1,4 +1,4 @@
-"""What a user will see: parts driven by transferred weights against the same parts driven by the authored ones.
+"""Compare parts driven by transferred skin weights with the same parts driven by their authored weights.
 
     python -m benchmarks driving --captures DIR [--peer CHECKOUT] [--runs DIR] [--out NAME]
 
@@ -178,8 +178,8 @@ def main(options: Options) -> None:
         registered = None if run is None or not run.is_dir() else load_params_of_run(run)
         figures[truth.name] = run_capture(truth, table, options.motion_frames, registered)
         print_tables(console, truth.name, figures[truth.name])
-    said = (" --peer CHECKOUT" if options.peer else "") + (" --runs DIR" if options.runs else "")
-    path = store_results(options.out.stem, f"python -m benchmarks driving --captures DIR{said}", figures)
+    options_given = (" --peer CHECKOUT" if options.peer else "") + (" --runs DIR" if options.runs else "")
+    path = store_results(options.out.stem, f"python -m benchmarks driving --captures DIR{options_given}", figures)
     console.print(f"stored in {path}")
 
 

@@ -1,4 +1,4 @@
-"""What a template built from a scan alone does when it is driven, beside one built with everything true.
+"""Drive a template built from a bare scan, beside one built with true parameters and labels.
 
     python -m benchmarks driving_alone --captures DIR [--keep DIR] [--names woman_casual ...]
 

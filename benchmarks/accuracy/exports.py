@@ -1,4 +1,4 @@
-"""Splats in other programs' files: bytes, and decibels of what foreign readers get, against the player's picture.
+"""Measure splats in files of other programs: bytes, and decibels of what foreign readers get.
 
     python -m benchmarks exports --source ME.avatar [--frame 3] [--pictures DIR]
 
@@ -46,7 +46,7 @@ class ExportsBenchmark:
     source: Path
     """Bundle of an avatar."""
     frame: int = 0
-    """Of its motion."""
+    """Frame of its motion."""
     params: Path | None = None
     """Motion for WebAvatar's npz; by default the bundle's."""
     pictures: Path | None = None

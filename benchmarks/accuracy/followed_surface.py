@@ -1,13 +1,12 @@
-"""How far the surface that training follows is from the truth, and whether that hangs on the frame rate.
+"""Measure the distance of the tracked surface to the truth, by frame rate.
 
     python -m benchmarks followed_surface --run RUN --capture DIR --every 1 2 3
 
 The tracking of a preset follows the loose part of a RUN's template through every n-th training frame of its capture,
-from the RUN's own Gaussians and poses. Measured are the part's points, each against where it truly is ("vertexwise"),
-its surface, and pictures of cameras that training did not see; beside them what the tracking itself expects of its
-errors, with its rank correlation (Spearman's) with the true ones, point by point, and how far a way back drifts.
-The truth is for measuring alone. How the skirt's pattern
-matters was measured once, on repainted photographs (docs/research.md).
+from the RUN's own Gaussians and poses. The benchmark measures the distance of the part's points to their true places
+("vertexwise"), its surface, pictures of held-out cameras, the error that the tracking expects with its rank correlation
+(Spearman's) to the true one, and the drift of tracking back to the first frame. The truth is used for measuring alone.
+The influence of the skirt's pattern was measured once, on repainted photographs (docs/research.md).
 """
 
 from __future__ import annotations
@@ -66,19 +65,19 @@ class FollowedSurface:
     """One row each: every n-th training frame is followed."""
     preset: str = "cpu"
     part: str = "lower"
-    """That is measured."""
+    """Label of the measured part."""
     seconds: float | None = None
-    """Frames of the first so many are followed; None: all."""
+    """Track the frames of the first seconds only; None: all."""
     levels: int | None = None
-    """Of the preset's sizes of images, the first ones, the coarse; None: all."""
+    """Number of the preset's image sizes to use, from the coarsest; None: all."""
     simulate: tuple[bool, ...] = (True, False)
-    """With simulated clothes that foresee where frames begin, and without."""
+    """With simulated clothes as the forecast of each frame, and without."""
     held: tuple[float, ...] = ()
     """Weights of what pictures do not tell where it was foreseen, in the place of the preset's; one row each."""
     back: bool = False
     """Go back to the first frame too and measure the drift."""
     name: str = ""
-    """Of the stored file; by default that of the capture."""
+    """Name of the stored file; by default that of the capture."""
 
     def run(self) -> None:
         """Print all rows; what is done is stored."""
@@ -177,7 +176,7 @@ class Bench:
         }
 
     def _drift(self, track: Track, true: list[np.ndarray]) -> dict[str, float]:
-        """Mean drift of a way back, mm, and its rank correlation with the points' mean error; nothing without one."""
+        """Return the mean drift after tracking back, mm, and its rank correlation with the error; empty without it."""
         if track.drift is None:
             return {}
         drift = 1e3 * track.cage(track.drift[:, None])[:, 0].numpy()[self.same.own]

@@ -1,11 +1,11 @@
-"""Gestures of somebody who talks: feet, hands, beats, and how soon something comes back.
+"""Measure gestures of a speaking person: planted feet, distance of the hands, beats, repetitions.
 
     python -m benchmarks gestures
 
-A Piper voice (extra `[talk]`) says some minutes; the embedded body, seen in an A-pose alone, gestures to them:
-the way of the feet's joints, the distance of hands from the trunk's skin, when gestures are struck against stressed
-vowels, after how many seconds of speech a gesture is used again, and how alike any two pieces of the arms' angles are.
-Beside it how much of ARKit's expressions numbered ones leave (`avatar.speech.bases`).
+A Piper voice (extra `[talk]`) speaks for some minutes, and the embedded body, known from an A-pose alone, gestures to
+it. Measured are the path length of the feet's joints, the distance of hands from the trunk's skin, the delay of beats
+after stressed vowels, the seconds of speech until a gesture is used again, and the similarity of any two pieces of
+the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make (`avatar.speech.bases`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MINUTES = 4.0
 SEEDS = (0, 1, 2)
 WINDOW, STEP = 3.0, 0.5
 """Seconds of two pieces that are compared, and between those that are."""
-_APART = np.radians(50.0)  # by which the arms hang in the one frame seen
+_APART = np.radians(50.0)  # angle of the arms to the trunk in the one frame
 _PARTS = ("shoulder", "elbow", "wrist")
 _MOUTH = ("mouthPressLeft", "mouthRollLower", "mouthPucker", "mouthFunnel", "mouthSmileLeft", "eyeBlinkLeft")
 
@@ -69,7 +69,7 @@ class Gestures:
 
 
 def said_for(seconds: float) -> Speech:
-    """Return the benchmark's sentences said over and over at changing speeds, for so long."""
+    """Return the benchmark's sentences, repeated at changing speeds for the given minutes."""
     voice, phonemes, at = PiperVoice(threads=1), list[Phoneme](), 0.0
     texts = [voice.say(text, slower=slower).speech for text in SENTENCES for slower in (0.9, 1.0, 1.15)]
     order = np.random.default_rng(0).permutation(np.arange(10 * len(texts)) % len(texts))
@@ -142,7 +142,7 @@ def hands_apart(body: BodyModel, motion: BodyParams) -> float:
 
 
 def left_of(body: BodyModel, count: int) -> dict[str, float]:
-    """Return the share of displacements that is left with so many principal directions, and the lips' gap, mm."""
+    """Return the share of displacements that principal directions leave, by their number, and the lips' gap, mm."""
     drawn = np.random.default_rng(1).gamma(0.5, 0.4, size=(400, body.num_expressions)).clip(0.0, 1.0)
     faces = (drawn - drawn.mean(axis=0)) @ body.exprdirs.reshape(-1, body.num_expressions).T
     _, size, parts = np.linalg.svd(faces, full_matrices=False)

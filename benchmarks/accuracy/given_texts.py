@@ -1,4 +1,4 @@
-"""Which texts the aligner takes for a recording's: its own, and those of other recordings; how well it times them.
+"""Count the texts that the aligner accepts for a recording: its own, and those of other recordings.
 
     python -m benchmarks given_texts [--flite PROGRAM]
 
@@ -26,17 +26,17 @@ from benchmarks.support.results import store_results
 from smplxpp.core.files.wave_file import Sound
 
 OTHERS = (1, 4, 7, 8, 11, 13)
-"""How far behind its own the wrong texts of a sentence are."""
+"""Offsets from a sentence to its wrong texts."""
 _GATES = np.arange(-0.5, 1.0, 0.01)
 
 
 @dataclass
 class Taken:
-    """What became of texts.
+    """Counts of accepted and refused texts.
 
     Attributes:
-        right, wrong: agreement of those that the recogniser found a way through. texts: how many were given of each.
-        apart: seconds by which phonemes of right ones begin later than in truth.
+        right, wrong: agreement of the texts that the recogniser could align. texts: number given of each kind.
+        apart: delay of phoneme starts of right texts, in seconds.
     """
 
     right: list[float] = field(default_factory=list)
@@ -84,9 +84,9 @@ class GivenTexts:
         """Print and store the figures."""
         texts, recogniser = (*SENTENCES, *MORE), load_recogniser()
         voices: dict[str, Taken] = {}
-        for name, said in said_by_voices(self.flite):
+        for name, utterances in said_by_voices(self.flite):
             it = voices[name] = Taken()
-            for k, (sound, truth) in enumerate(said):
+            for k, (sound, truth) in enumerate(utterances):
                 given = [texts[(k + far) % len(texts)] for far in (0, *OTHERS)]
                 it.give(sound, given, recogniser, truth)
             print(f"{name:34s} {it.figures()} {milliseconds(it.apart)}", flush=True)

@@ -1,4 +1,4 @@
-"""Accuracy of `label_by_body` on scans of known people, and what its confidence is worth; prints tables, stores them.
+"""Measure `label_by_body` on scans of known people: accuracy, and the calibration of its confidence.
 
     SMPLXPP_PEOPLE=DIR python -m benchmarks labels_by_body [--count 36] [--seed 0] [--only NAME]
 

@@ -1,4 +1,4 @@
-"""What the lips' network sees in sound: mouth shapes, closures, delays, on voices that it never heard.
+"""Measure the lips' network on voices that it never heard: mouth shapes, closures, delays.
 
     python -m benchmarks live_lips [--flite PROGRAM]
 
@@ -89,8 +89,8 @@ class LiveLipsFigures:
             "told of, ms before a row's last sample": round(1e3 * network.delay),
         }
         voices = {}
-        for name, said in said_by_voices(self.flite):
-            voices[name] = measure(network, said)
+        for name, utterances in said_by_voices(self.flite):
+            voices[name] = measure(network, utterances)
             print(f"{name:34s} {voices[name]}")
         figures["voices"] = voices
         sound = next(said_by_voices(self.flite))[1][0][0]
@@ -127,12 +127,12 @@ def said_by_voices(flite: Path | None) -> Iterator[tuple[str, list[tuple[Sound, 
         yield f"espeak-ng {name}", [espeak.say(text, *options) for text in (*SENTENCES, *MORE)]
 
 
-def measure(network: LipNetwork, said: list[tuple[Sound, Speech]]) -> dict[str, float]:
+def measure(network: LipNetwork, utterances: list[tuple[Sound, Speech]]) -> dict[str, float]:
     """Return the figures of one voice."""
     nine, fifteen, kinds, alone = Counter[bool](), Counter[bool](), Counter[bool](), Counter[bool]()
     closed = missed = wrong = 0
     shown, wanted, quiet = [], [], []
-    for sound, speech in said:
+    for sound, speech in utterances:
         heard = network(sound)
         names = np.array([_name(speech, t) for t in heard.times])
         spoken = names != SILENCE
@@ -206,7 +206,7 @@ def _shapes(heard: Lips, shapes: dict[str, tuple[str, ...]]) -> np.ndarray:
 
 
 def _best_lag(shown: list[np.ndarray], wanted: list[np.ndarray]) -> tuple[float, float]:
-    """By how many seconds the jaw is later than the truth's, the network's delay apart, and their correlation then."""
+    """Return the delay of the jaw, without the network's own, in seconds, and the correlation at that delay."""
     best = (0.0, -1.0)
     column = ARTICULATORS.index("jaw")
     for lag in _LAGS:
@@ -222,7 +222,7 @@ def _best_lag(shown: list[np.ndarray], wanted: list[np.ndarray]) -> tuple[float,
 
 
 def _jitter(curves: list[np.ndarray]) -> float:
-    """How much articulators change their speed from one row to the next."""
+    """Return the mean change of the articulators' speed from one row to the next."""
     return float(np.mean(np.concatenate([np.abs(np.diff(one, 2, axis=0)) for one in curves])))
 
 

@@ -1,4 +1,4 @@
-"""Loose clothes simulated in motion that training did not show: how far they are from the truth, and what they cost.
+"""Simulate loose clothes in motion that training did not show: distance to the truth, milliseconds a step.
 
     python -m benchmarks loose_cloth --run RUN --capture DIR
 
@@ -44,7 +44,7 @@ from smplxpp.core.params import BodyParams
 
 SAMPLES = 50_000
 MOVED = 5e-4
-"""Metres, standard deviation, by which starts are moved for the chaos."""
+"""Standard deviation, in metres, of the perturbed starts that measure chaos."""
 STARTS = 4
 SAME = 2e-3
 """Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
@@ -63,7 +63,7 @@ class LooseCloth:
     draws: int = 0
     """Draws of a tracker's noise (`smplxpp capture degrade`) on the poses, each measured; 2 or more, or none."""
     name: str = ""
-    """Of the stored file; by default that of the capture."""
+    """Name of the stored file; by default that of the capture."""
 
     def run(self) -> None:
         """Print and store all rows.

@@ -1,4 +1,4 @@
-"""What a build says of scans that are whole, noisy, huge, or not what they should be: variants of the fixture's scan.
+"""Build damaged, noisy, huge and mislabelled variants of the fixture's scan, and list the warnings of each build.
 
     python -m benchmarks nasty_scans [--names whole mirrored ...]
 
@@ -165,7 +165,7 @@ def _fixture() -> tuple[Scan, dict[str, np.ndarray]]:
 
 
 def _verdict(scan: Scan) -> dict[str, object]:
-    """What a build of a scan says, and what it costs."""
+    """Return the warnings and failures of a build, its seconds and its memory."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "scan.npz", vertices=scan.vertices, faces=scan.faces, vertex_colors=scan.colors)
@@ -174,14 +174,14 @@ def _verdict(scan: Scan) -> dict[str, object]:
         command += ["--labels", str(folder / "labels.npz"), "--label-set", "capture", "--no-report"]
         command += ["--params", str(FIXTURE / "params/params.npz"), "--out", str(folder / "run"), "--json"]
         # wait4 gives this child's own time and memory.
-        with (folder / "said").open("w") as said:
-            actions = [(os.POSIX_SPAWN_DUP2, said.fileno(), 1), (os.POSIX_SPAWN_DUP2, said.fileno(), 2)]
+        with (folder / "said").open("w") as printed:
+            actions = [(os.POSIX_SPAWN_DUP2, printed.fileno(), 1), (os.POSIX_SPAWN_DUP2, printed.fileno(), 2)]
             child = os.posix_spawn(sys.executable, command, os.environ, file_actions=actions)
             _, status, usage = os.wait4(child, 0)
         cost = {"CPU seconds": usage.ru_utime + usage.ru_stime, "peak GiB": usage.ru_maxrss / 2**20}
         if status:
-            said = (folder / "said").read_text()
-            error = json.loads(said[said.index("{") :])["error"]["message"]
+            printed = (folder / "said").read_text()
+            error = json.loads(printed[printed.index("{") :])["error"]["message"]
             error = error.replace(str(folder / "scan.npz"), "scan.npz")
             return {"faces": len(scan.faces), "warn": None, "fail": None, "says": f"refused: {error}", **cost}
         checks = json.loads((folder / "run" / "metrics.json").read_text())["checks"]

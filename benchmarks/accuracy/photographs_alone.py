@@ -1,4 +1,4 @@
-"""A student from photographs, cameras and masks alone: how far each step of its run is from the truth.
+"""Measure each step of a run from photographs, cameras and masks alone against the truth.
 
     smplxpp build --capture PHOTOGRAPHS --out RUN; smplxpp train --run RUN --capture PHOTOGRAPHS --preset cpu
     smplxpp evaluate RUN --capture PHOTOGRAPHS

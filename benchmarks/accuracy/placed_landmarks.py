@@ -1,10 +1,10 @@
-"""Bodies registered to clothed scans from a few landmarks placed by hand: no parameters, no labels, no photographs.
+"""Register bodies to clothed scans from a few landmarks placed by hand.
 
     SMPLXPP_PEOPLE=FOLDER python -m benchmarks placed_landmarks
 
 A hand is simulated: the truth's points with errors of 8 mm a coordinate on the skin and 15 mm within limbs. Measured
 are the body's vertices and 22 joints against the truth, millimetres: of the landmarks alone, with the scan, and with
-the scan after a search for the body (`locate_body`) that is told the landmarks.
+the scan after a search for the body (`locate_body`) that takes the landmarks.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class PlacedLandmarks:
     people: int = 6
     """Procedural people beside the captured ones, spread over the cast."""
     seed: int = 0
-    """Of the hand's errors."""
+    """Seed of the simulated hand's errors."""
 
     def run(self) -> None:
         """Print and store the errors of everybody."""

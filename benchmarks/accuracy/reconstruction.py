@@ -1,4 +1,4 @@
-"""How near surfaces from photographs come to the truth, hull alone beside refined, with good masks and with bad ones.
+"""Measure surfaces from photographs against the truth: visual hull and refined, with true and with wrong masks.
 
     python -m benchmarks reconstruction --capture DIR [--name NAME]
 
@@ -172,7 +172,7 @@ def p2s_of_seen(found: Reconstruction, truth: TriangleMesh) -> dict[str, float]:
 
 
 def by_confidence(found: Reconstruction, truth: TriangleMesh) -> list[dict[str, float]]:
-    """Error of the vertices by how sure they are said to be."""
+    """Return the error of vertices by their confidence."""
     off = MM * point_to_surface(found.mesh.vertices, truth)[0]
     rows = []
     for low, high in ((0.0, 0.01), (0.01, 0.5), (0.5, 0.99), (0.99, 2.0)):

@@ -1,13 +1,13 @@
-"""What aligner, recogniser and the lips' network make of recordings of people.
+"""Measure aligner, recogniser and the lips' network on recordings of people.
 
     pip download --no-deps --no-binary :all: pocketsphinx    # or the file pocketsphinx-5.1.1.tar.gz of PyPI by hand
     tar xzf pocketsphinx-5.1.1.tar.gz
     python -m benchmarks recorded_people --recordings pocketsphinx-5.1.1
 
-The tests of pocketsphinx bring twelve whose words are known: five sentences of a novel, read for LibriVox (public
-domain), and seven of playing cards, a command and digits. Nobody marked their phonemes: the truth is the recogniser's
-own alignment of the right words, so that it says how far a way without words is from one with words, and of the
-aligner itself only which texts it takes. The recordings stay where they are.
+The tests of pocketsphinx contain twelve recordings with known words: five sentences of a novel, read for LibriVox
+(public domain), and seven of playing cards, a command and digits. Their phonemes are not annotated. The truth is the
+recogniser's own alignment of the right words, so that the figures compare recognition with alignment of known words;
+of the aligner itself they only tell which texts it accepts. The recordings stay in their folder.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LINE = re.compile(r"<s>(.*?)</s>\s*\((.*?)\)")
 
 @dataclass(frozen=True)
 class Recording:
-    """Somebody who says a text.
+    """A recording of a person who reads a text.
 
     Attributes:
         name: of its file. theirs: phonemes by the alignment that lies beside it, if one does.
@@ -84,7 +84,7 @@ def read_recordings(folder: Path) -> list[Recording]:
     """
     out = []
     for listing in ("librivox/transcription", "cards/cards.transcription"):
-        for text, name in _LINE.findall(read_text(folder / listing, subject="list of what is said")):
+        for text, name in _LINE.findall(read_text(folder / listing, subject="list of what is spoken")):
             path = (folder / listing).parent / f"{name}.wav"
             phones = path.with_suffix(".phone.json")
             sound = read_wave(path)
@@ -100,7 +100,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
     """Return the figures of some recordings, each given the texts of everyone."""
     taken, alone = Taken(), Counter[tuple[str, str]]()
     errors = words = refused = missed = bilabials = 0
-    said, heard_starts, their_starts = [], [], []
+    spoken, heard_starts, their_starts = [], [], []
     recognised, sounds = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for one in group:
         others = list(dict.fromkeys(other.text for other in everyone if other.text != one.text))
@@ -113,7 +113,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
         except InputError:
             refused += 1
             continue
-        said.append((one.sound, given))
+        spoken.append((one.sound, given))
         if one.theirs is not None:
             their_starts += starts_apart(one.theirs, given)
             alone.update(visemes_apart(one.theirs, given))
@@ -123,7 +123,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
         found, lost = closures_apart(given, free)
         missed, bilabials = missed + lost, bilabials + lost + len(found)
         sounds.update(visemes_apart(given, sounds_of(one.sound)))
-    phonemes = sum(len(speech.spoken) for _, speech in said)
+    phonemes = sum(len(speech.spoken) for _, speech in spoken)
     theirs = {"matched": len(their_starts), **milliseconds(their_starts)} if their_starts else None
     return {
         "recordings": {
@@ -146,14 +146,14 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
             "recognised": shares(recognised)["right"],
             "by sounds alone": shares(sounds)["right"],
         },
-        "the lips' network": measure(LipNetwork.shipped(), said),
+        "the lips' network": measure(LipNetwork.shipped(), spoken),
     }
 
 
-def word_errors(said: list[str], heard: list[str]) -> int:
+def word_errors(spoken: list[str], heard: list[str]) -> int:
     """Return the least words to be changed, left out and put in (Levenshtein's distance)."""
     best = list(range(len(heard) + 1))
-    for k, word in enumerate(said, 1):
+    for k, word in enumerate(spoken, 1):
         before, best[0] = best[0], k
         for j, other in enumerate(heard, 1):
             before, best[j] = best[j], min(best[j] + 1, best[j - 1] + 1, before + (word != other))

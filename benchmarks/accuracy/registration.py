@@ -1,4 +1,4 @@
-"""How near registered bodies come to the truth, from each kind of input and from bad starts; baselines beside them.
+"""Measure registered bodies against the truth, from each kind of input and from bad starts, beside baselines.
 
     smplxpp capture degrade DIR --out TRACKED
     python -m benchmarks registration --capture TRACKED [--run RUN]
@@ -94,7 +94,7 @@ class RegistrationBenchmark:
             print(f"stored {path.name}")
 
     def _refined(self, truth: _Truth) -> dict[str, object]:
-        """What refinement on photographs made of a run's registration."""
+        """Return errors of a run's poses after refinement on photographs."""
         if self.run_folder is None or not (self.run_folder / REFINED_PARAMS).is_file():
             return {}
         frames, params = load_stacked_params(self.run_folder / REFINED_PARAMS)
@@ -109,7 +109,7 @@ class RegistrationBenchmark:
 
 @dataclass(frozen=True, eq=False)
 class _Truth:
-    """What errors are measured by."""
+    """The exact parameters, and the errors of others against them."""
 
     body: BodyModel
     exact: BodyParams

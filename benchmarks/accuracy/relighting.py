@@ -1,4 +1,4 @@
-"""A student in another light against the person that was photographed in it: decibels of held-out views.
+"""Compare a student in another light with the person that was rendered in it: decibels of held-out views.
 
     python -m benchmarks relighting --run RUN [--capture DIR] [--no-store]
 
@@ -43,7 +43,7 @@ class RelightingBenchmark:
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
     """Trained run of a capture that `smplxpp synth` made."""
     capture: Path = FIXTURE
-    """That capture, with true surfaces in geometry/."""
+    """Capture of the run, with true surfaces in geometry/."""
     store: bool = True
     """Store the figures."""
 
@@ -60,7 +60,7 @@ class RelightingBenchmark:
 
 
 def measure(capture: Capture, player: AvatarPlayer, lights: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
-    """Return mean decibels by panorama and way."""
+    """Return mean decibels by panorama and method."""
     person = person_of(read_layers(capture.root / "geometry" / "topology.npz", "skirt"), "skirt")
     scores: dict[tuple[str, str], list[float]] = {}
     for frame in capture.frames:
@@ -89,12 +89,12 @@ def measure(capture: Capture, player: AvatarPlayer, lights: dict[str, np.ndarray
                     "relit, the stage's light divided out": player.draw(camera, relighting=own)[0],
                     "true picture and normals, relit": own.colors(before.image / 255.0, normal_map(stage, camera)),
                 }
-                for way, picture in pictures.items():
-                    scores.setdefault((name, way), []).append(decibels(picture, wanted, inside))
+                for method, picture in pictures.items():
+                    scores.setdefault((name, method), []).append(decibels(picture, wanted, inside))
                 in_stage = decibels(pictures["nothing done"], before.image / 255.0, inside)
                 scores.setdefault((name, "own light"), []).append(in_stage)
     return {
-        name: {way: round(float(np.mean(values)), 2) for (of, way), values in scores.items() if of == name}
+        name: {method: round(float(np.mean(values)), 2) for (of, method), values in scores.items() if of == name}
         for name in lights
     }
 

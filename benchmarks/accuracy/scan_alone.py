@@ -1,4 +1,4 @@
-"""How near a body found in a scan alone comes to the truth, and the labels that follow from it.
+"""Measure bodies found in bare scans against the truth, and the labels that follow from them.
 
     python -m benchmarks scan_alone [--people 12] [--who NAME ...] [--seed 0] [--variants "as it is" "3 mm noise"]
 
@@ -37,21 +37,21 @@ class ScanAlone:
     """Find bodies in scans and measure them; the worst first."""
 
     people: int = 12
-    """How many procedural people; 0: none."""
+    """Number of procedural people; 0: none."""
     who: tuple[str, ...] = ()
     """These of them by name (`benchmarks.people.cast`), in place of the first ones."""
     seed: int = 0
-    """Of the people."""
+    """Seed of the procedural people."""
     captured: bool = True
     """The fixture's scan and those of captures, too."""
     variants: tuple[str, ...] = ("as it is",)
-    """What has happened to the scans: names of `benchmarks.people.VARIANTS`, or "all"."""
+    """Changes of the scans: names of `benchmarks.people.VARIANTS`, or "all"."""
     labels: bool = True
     """Label the scans with the body that was found, too."""
     store: bool = True
     """Write benchmarks/results/scan_alone.json."""
     name: str = "scan_alone"
-    """Of the result."""
+    """Name of the result."""
 
     def run(self) -> None:
         """Print and store the figures."""

@@ -1,4 +1,4 @@
-"""Accuracy and time of the segmentation against a capture's true labels; prints a table and stores it.
+"""Measure accuracy and time of the segmentation against a capture's true labels.
 
     python -m benchmarks segmentation [--capture ../shared/captures/woman_casual]
 

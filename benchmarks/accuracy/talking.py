@@ -1,4 +1,4 @@
-"""When lips close and phonemes begin, against the times that a voice spoke at.
+"""Compare times of closed lips and of phonemes with the times at which a synthetic voice spoke.
 
     python -m benchmarks talking
 
@@ -49,7 +49,7 @@ VISEMES = {
 """Phonemes that look alike."""
 PICTURES = 30
 CLOSED = 0.95
-"""Of the lips' pressing, from which they count as closed."""
+"""Value of the lips' pressing from which they count as closed."""
 NEAR = 0.15
 """Seconds from the middle of a bilabial within which lips that close belong to it."""
 
@@ -70,24 +70,24 @@ class Talking:
         phonemes = bilabials = 0
         for text in SENTENCES:
             began = time.process_time()
-            said = voice.say(text)
-            factors.setdefault("synthesis", []).append((time.process_time() - began) / said.sound.seconds)
-            heard = {"the voice": said.speech}
+            spoken = voice.say(text)
+            factors.setdefault("synthesis", []).append((time.process_time() - began) / spoken.sound.seconds)
+            heard = {"the voice": spoken.speech}
             for name, words in (("words given", text), ("words recognised", None)):
                 began = time.process_time()
-                heard[name] = align(said.sound, words)
-                factors.setdefault(name, []).append((time.process_time() - began) / said.sound.seconds)
-                starts.setdefault(name, []).extend(starts_apart(said.speech, heard[name]))
-            phonemes += len(said.speech.spoken)
-            bilabials += sum(phoneme.name in BILABIALS for phoneme in said.speech.spoken)
+                heard[name] = align(spoken.sound, words)
+                factors.setdefault(name, []).append((time.process_time() - began) / spoken.sound.seconds)
+                starts.setdefault(name, []).extend(starts_apart(spoken.speech, heard[name]))
+            phonemes += len(spoken.speech.spoken)
+            bilabials += sum(phoneme.name in BILABIALS for phoneme in spoken.speech.spoken)
             for name in ("words given", "words recognised"):
-                confused.setdefault(name, Counter()).update(visemes_apart(said.speech, heard[name]))
+                confused.setdefault(name, Counter()).update(visemes_apart(spoken.speech, heard[name]))
             for slower in SPEEDS:
-                slow = said if slower == 1.0 else voice.say(text, slower=slower)
+                slow = spoken if slower == 1.0 else voice.say(text, slower=slower)
                 aligned = heard["words given"] if slower == 1.0 else align(slow.sound, text)
                 by_speed.setdefault(slower, []).extend(starts_apart(slow.speech, aligned))
             for name, speech in heard.items():
-                found, lost = closures_apart(said.speech, speech)
+                found, lost = closures_apart(spoken.speech, speech)
                 closures.setdefault(name, []).extend(found)
                 missed[name] = missed.get(name, 0) + lost
         figures = {
@@ -146,7 +146,7 @@ def visemes_apart(truth: Speech, other: Speech) -> Counter[tuple[str, str]]:
 
 
 def shares(counts: Counter[tuple[str, str]]) -> dict[str, float]:
-    """Return how much is equal, by true shape where anything is said, and the commonest mistakes; percent."""
+    """Return the percentage of right mouth shapes, by true shape, and the commonest mistakes."""
     spoken = Counter({pair: n for pair, n in counts.items() if pair[0] != SILENCE})
     right = sum(n for pair, n in spoken.items() if pair[0] == pair[1])
     out = {"right": round(100.0 * right / spoken.total(), 1)}

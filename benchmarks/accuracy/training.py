@@ -1,4 +1,4 @@
-"""A training from its run: minutes, steps a second, memory and quality of each stage, and where their time goes.
+"""Measure the training of a run: minutes, steps a second, memory and quality of each stage, shares of a step.
 
     python -m benchmarks training --run RUN --capture DIR
 
@@ -49,7 +49,7 @@ KINDS = {
     "skinning and Gaussians": ("_Skinning", "FramesFunction", "WorldFunction", "ColorsFunction"),
     "optimiser": ("_fused", "_foreach", "Optimizer"),
 }
-"""Of torch's operations, by what their names contain; the first kind that fits."""
+"""Kinds of torch's operations by parts of their names; the first kind that fits counts."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class TrainingBenchmark:
     capture: Path
     """Folder of its capture."""
     preset: Literal["paper-small", "cpu", "demo"] = "cpu"
-    """That it was trained with."""
+    """Preset of the training."""
     profile: bool = True
     """Take a few steps of every stage again, to see where their time goes."""
 

@@ -1,4 +1,4 @@
-"""Skin-weight transfer on garments that no setting was made for: weights and driven positions against authored ones.
+"""Measure skin-weight transfer on garments that no setting was chosen on: weights and driven positions.
 
     python -m benchmarks transfer_garments [--shapes 3] [--no-store]
 
@@ -80,7 +80,7 @@ def configured(config: TransferConfig, *, by_label: bool = True) -> Method:
 
 
 def methods() -> dict[str, Method]:
-    """What is compared: baselines, the published method, our default of 0.1, and ours."""
+    """Return the compared methods: baselines, the published one, our former default, and ours."""
     return {
         "nearest vertex": nearest_vertex,
         "nearest point": nearest_point,
@@ -119,7 +119,7 @@ def ratios(ours: Scores, published: Scores) -> dict[str, float]:
 
 
 def leave_one_out(variants: dict[str, dict[str, float]]) -> dict[str, dict[str, object]]:
-    """For each garment the variant that is best on all others, and its ratio on this one."""
+    """Return for each garment the variant that is best on all others, and its ratio on this one."""
     names = list(next(iter(variants.values())))
     out: dict[str, dict[str, object]] = {}
     for left in names:

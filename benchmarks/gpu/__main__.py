@@ -1,9 +1,9 @@
-"""Everything that was never run on CUDA, in the order of what matters, in as many minutes as given.
+"""Run what needs CUDA in as many minutes as given, the most important parts first.
 
     python -m benchmarks gpu --minutes 15
 
 Each part runs in a process of its own with its share of the time that is left; what the others need less is shared
-out again. benchmarks/results/gpu.json is written anew after each part. A part that fails, crashes or takes too long is
+out again. benchmarks/results/gpu.json is written again after each part. A part that fails, crashes or takes too long is
 stored with its error and what it had measured, and the next one begins. Without a CUDA device it says what it would run
 and ends with 2; with --dry-run every part runs on the CPU at toy size, and results go to the work folder.
 """
@@ -38,7 +38,7 @@ SHARES = {
     "nccl": 0.5,
     "cpu": 5.0,
 }
-"""Of the time, by part: gsplat compiles its kernels in the first."""
+"""Shares of the time by part; gsplat compiles its kernels in the first."""
 NEEDS_TEMPLATE = ("demo", "fit", "training", "paper_step", "student", "cpu")
 FAILED, NO_DEVICE = 1, 2
 LAST_WORDS = 2_000
@@ -50,7 +50,7 @@ class GpuBenchmark:
     """Run what needs a GPU and store what came out."""
 
     minutes: float = 15.0
-    """For all parts together."""
+    """Minutes for all parts together."""
     capture: Path = ROOT / "data" / "fixtures" / "person"
     """Folder of the capture to train on."""
     run_folder: Path | None = None

@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu.parts PART JOB.json
 
-JOB.json holds a `Job`; what the part finds goes to `PART.json` in the job's folder, anew with every figure, so that a
+JOB.json holds a `Job`; what the part finds is written to `PART.json` in the job's folder after every figure, so that a
 part that is stopped leaves what it had.
 """
 
@@ -37,7 +37,7 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True)
 class Job:
-    """What a part works on.
+    """Input of a part.
 
     Attributes:
         work: folder of this benchmark's files. run: with the template. capture: of the person.
@@ -61,7 +61,7 @@ class Job:
 
     @classmethod
     def load(cls, path: Path) -> Job:
-        """What `save` wrote."""
+        """Read what `save` wrote."""
         stored = json.loads(path.read_text())
         folders = {name: Path(stored[name]) for name in ("work", "run", "capture")}
         return cls(**folders, seconds=float(stored["seconds"]), device=stored["device"])
@@ -104,7 +104,7 @@ def demo(job: Job, note: Note) -> None:
 
 
 def cpu(job: Job, note: Note) -> None:
-    """The preset `cpu` on the GPU, in the same way."""
+    """The preset `cpu` on the GPU, like `demo`."""
     _to_the_end(job, note, "cpu")
 
 
@@ -170,23 +170,23 @@ def student(job: Job, note: Note) -> None:
             truth = model(motions[-1], center).gaussians
         rows[name] = {"difference_mm": largest_difference_mm(deform(motions[-1], center), truth)}
         note(rows=rows)
-        ways: dict[str, Callable] = {"eager": deform}
+        variants: dict[str, Callable] = {"eager": deform}
         if not job.toy:
             try:
-                ways["graph"] = Replayed(deform, motions[0], center)
-                rows[name]["graph_difference_mm"] = largest_difference_mm(ways["graph"](motions[-1], center), truth)
+                variants["graph"] = Replayed(deform, motions[0], center)
+                rows[name]["graph_difference_mm"] = largest_difference_mm(variants["graph"](motions[-1], center), truth)
             except RuntimeError as error:
                 rows[name]["graph_error"] = str(error)[:500]
-        for way, work in ways.items():
+        for variant, work in variants.items():
             for width, height in sizes:
                 seen = fitted(camera, width, height)
-                rows[name][f"{way} {width}x{height}"] = frames_a_second(work, motions, seen, pictures=pictures)
+                rows[name][f"{variant} {width}x{height}"] = frames_a_second(work, motions, seen, pictures=pictures)
                 note(rows=rows)
     note(rows=rows, **_memory(job))
 
 
 def nccl(job: Job, note: Note) -> None:
-    """What processes say to each other, by NCCL with one process (gloo in a dry run)."""
+    """Communication of processes by NCCL, with one process (gloo in a dry run)."""
     import torch.distributed as dist
 
     from avatar.training.engine.processes import join_processes
@@ -213,7 +213,7 @@ def nccl(job: Job, note: Note) -> None:
 PARTS: dict[str, Callable[[Job, Note], None]] = {
     part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl, cpu)
 }
-"""In the order of what matters."""
+"""Parts, the most important first."""
 
 
 def command(*arguments: object) -> dict[str, Any]:
@@ -266,7 +266,7 @@ def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]
 
 
 def _stages(answer: dict[str, Any]) -> dict[str, Any]:
-    """Of each stage: steps, their seconds, how many a second, PSNR of held-out views."""
+    """Return steps, seconds, steps a second and PSNR of held-out views of each stage."""
     out = {}
     for name, numbers in answer["stages"].items():
         done, seconds = numbers["iterations_done"], numbers["seconds_of_steps"]

@@ -27,7 +27,7 @@ from avatar.rig.rig import Motion
 from smplxpp.core.camera import Camera
 
 MOVING = ("pose", "expression", "jaw", "rest", "world_from_rest", "root_from_world")
-"""What of a `Motion` changes from frame to frame."""
+"""Fields of a `Motion` that change from frame to frame."""
 WARM_UP = 3
 
 
@@ -56,7 +56,7 @@ def plain_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
 
 
 class Deformer:
-    """What a student does between a pose and the rasteriser, its networks in `dtype`.
+    """The work of a student between a pose and the rasteriser, its networks in `dtype`.
 
     Args:
         student: with a field and blend shapes.
@@ -157,5 +157,5 @@ def frames_a_second(
 
 
 def largest_difference_mm(one: Drawable, other: Drawable) -> float:
-    """How far the same Gaussian lies apart in two frames, at most."""
+    """Return the largest distance of a Gaussian between two frames."""
     return 1e3 * float((one.means - other.means).norm(dim=-1).max())

@@ -1,4 +1,4 @@
-"""Point-to-surface distances beside other libraries: the same points, the same meshes, values and times.
+"""Compare point-to-surface distances with other libraries on the same points and meshes: values and times.
 
     python -m benchmarks metrics_peers --capture DIR [--peer-python PYTHON]
 
@@ -47,15 +47,15 @@ def worker(name: str, folder: Path) -> None:
     with np.load(folder / "problem.npz") as data:
         problem = dict(data)
     out = {}
-    for way in ("pred_to_gt", "gt_to_pred"):
+    for direction in ("pred_to_gt", "gt_to_pred"):
         seconds = []
         for _ in range(REPEATS):
             start = time.perf_counter()
-            out[way] = peer_distance(
-                name, problem[f"{way}_vertices"], problem[f"{way}_faces"], problem[f"{way}_points"]
+            out[direction] = peer_distance(
+                name, problem[f"{direction}_vertices"], problem[f"{direction}_faces"], problem[f"{direction}_points"]
             )
             seconds.append(time.perf_counter() - start)
-        out[f"{way}_seconds"] = np.array(statistics.median(seconds))
+        out[f"{direction}_seconds"] = np.array(statistics.median(seconds))
     np.savez(folder / f"{name}.npz", **out)
 
 
@@ -76,19 +76,19 @@ def run(capture: Path, peer_python: str, samples: int) -> dict:
     from smplxpp.metrics import compare, point_to_surface, sample_surface
 
     pred, gt = load_pair(capture)
-    ways = {
+    directions = {
         "pred_to_gt": (sample_surface(pred, samples).points, gt),
         "gt_to_pred": (sample_surface(gt, samples).points, pred),
     }
     ours, rows = {}, []
     row = {"library": "smplxpp"}
-    for way, (points, mesh) in ways.items():
+    for direction, (points, mesh) in directions.items():
         seconds = []
         for _ in range(REPEATS):
             start = time.perf_counter()
-            ours[way] = point_to_surface(points, mesh)[0]
+            ours[direction] = point_to_surface(points, mesh)[0]
             seconds.append(time.perf_counter() - start)
-        row |= {f"{way}_mm": ours[way].mean() * 1e3, f"{way}_seconds": statistics.median(seconds)}
+        row |= {f"{direction}_mm": ours[direction].mean() * 1e3, f"{direction}_seconds": statistics.median(seconds)}
     rows.append(row)
     seconds = []
     for _ in range(REPEATS):
@@ -99,8 +99,12 @@ def run(capture: Path, peer_python: str, samples: int) -> dict:
         seconds.append(time.perf_counter() - start)
     with tempfile.TemporaryDirectory() as folder:
         problem = {}
-        for way, (points, mesh) in ways.items():
-            problem |= {f"{way}_points": points, f"{way}_vertices": mesh.vertices, f"{way}_faces": mesh.faces}
+        for direction, (points, mesh) in directions.items():
+            problem |= {
+                f"{direction}_points": points,
+                f"{direction}_vertices": mesh.vertices,
+                f"{direction}_faces": mesh.faces,
+            }
         np.savez(Path(folder) / "problem.npz", **problem)
         for name in PEERS:
             command = [peer_python, str(Path(__file__).resolve()), "--worker", name, folder]
@@ -110,14 +114,16 @@ def run(capture: Path, peer_python: str, samples: int) -> dict:
                 continue
             with np.load(Path(folder) / f"{name}.npz") as theirs:
                 row = {"library": name}
-                for way in ways:
+                for direction in directions:
                     row |= {
-                        f"{way}_mm": float(theirs[way].mean() * 1e3),
-                        f"{way}_seconds": float(theirs[f"{way}_seconds"]),
-                        f"{way}_max_difference_mm": float(np.abs(theirs[way] - ours[way]).max() * 1e3),
+                        f"{direction}_mm": float(theirs[direction].mean() * 1e3),
+                        f"{direction}_seconds": float(theirs[f"{direction}_seconds"]),
+                        f"{direction}_max_difference_mm": float(
+                            np.abs(theirs[direction] - ours[direction]).max() * 1e3
+                        ),
                     }
-                total = sum(row[f"{way}_seconds"] for way in ways)
-                row["times_ours"] = total / sum(rows[0][f"{way}_seconds"] for way in ways)
+                total = sum(row[f"{direction}_seconds"] for direction in directions)
+                row["times_ours"] = total / sum(rows[0][f"{direction}_seconds"] for direction in directions)
                 rows.append(row)
     return {
         "capture": capture.name,
@@ -145,13 +151,15 @@ def main() -> None:
     from benchmarks.support.results import store_results
 
     report = run(args.capture, args.peer_python, args.samples)
-    print(f"{report['pred_faces']} faces against a scan of {report['gt_faces']}, {report['samples']} points each way")
+    print(
+        f"{report['pred_faces']} faces against a scan of {report['gt_faces']}, {report['samples']} points a direction"
+    )
     print(f"{'library':18} {'p2s mm':>9} {'s2p mm':>9} {'max diff mm':>12} {'seconds':>8} {'x ours':>7}")
     for row in report["rows"]:
         if "absent" in row:
             print(f"{row['library']:18} absent: {row['absent']}")
             continue
-        difference = max(row.get(f"{way}_max_difference_mm", 0.0) for way in ("pred_to_gt", "gt_to_pred"))
+        difference = max(row.get(f"{direction}_max_difference_mm", 0.0) for direction in ("pred_to_gt", "gt_to_pred"))
         seconds = row["pred_to_gt_seconds"] + row["gt_to_pred_seconds"]
         print(
             f"{row['library']:18} {row['pred_to_gt_mm']:9.5f} {row['gt_to_pred_mm']:9.5f} {difference:12.2g} "

@@ -1,4 +1,4 @@
-"""Speed and errors of skin-weight transfer beside the published method's reference implementation, in one run.
+"""Compare skin-weight transfer with the published method's reference implementation: seconds and errors.
 
     python -m benchmarks transfer_speed --captures DIR --peer CHECKOUT
 

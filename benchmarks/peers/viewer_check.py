@@ -1,10 +1,10 @@
-"""An exported PLY in another viewer: its picture beside ours, by PSNR and for the eye.
+"""Compare the picture of an exported PLY in another viewer with our own, by PSNR.
 
     python -m benchmarks viewer_check [--run RUN | --splats FILE] [--pictures DIR] [--no-store]
 
 Gaussians are sampled on a template, given colours that depend on the view, posed, exported, and drawn by the web viewer
 `@mkkellogg/gaussian-splats-3d` (three.js, WebGL) in a headless Chromium; our picture is drawn from the bound Gaussians,
-so that the whole way through the file is on trial. Needs npm and chromium; the viewer is put into `--tools` once.
+so that writing and reading of the file are both tested. Needs npm and chromium; the viewer is put into `--tools` once.
 The viewer cuts Gaussians at sqrt(8) standard deviations, stretches those that look round, and rounds colours to 8 bits:
 the pictures cannot agree to the last bit.
 """
@@ -267,7 +267,7 @@ def photograph(ply: Path, coefficients: int, cameras: dict[str, Camera], options
 
 @dataclass
 class Site:
-    """What the page reports."""
+    """Return what the page reports."""
 
     url: str
     images: dict[int, bytes]

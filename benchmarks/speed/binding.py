@@ -1,4 +1,4 @@
-"""Gaussians from their triangles to the world and their colours: native kernels beside the same formulas in torch.
+"""Time Gaussians from their triangles to the world, with colours: native kernels beside torch.
 
     python -m benchmarks binding [--run RUN] [--repeats 15] [--no-store]
 
@@ -35,12 +35,12 @@ LEAVES = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "d
 
 @dataclass(frozen=True)
 class BindingBenchmark:
-    """Time the way from local attributes to what a rasteriser takes."""
+    """Time the steps from local attributes to what a rasteriser takes."""
 
     run: Path | None = None
     """Folder of a built template; the fixture's is built where none is given."""
     repeats: int = 15
-    """Of the kernels; the torch formulas get a third."""
+    """Repeats of the kernels; the torch formulas get a third."""
     store: bool = True
     """Store the figures."""
 
@@ -58,10 +58,10 @@ class BindingBenchmark:
 
 
 def measure(bound: BoundGaussians, template: Template, repeats: int) -> dict:
-    """Milliseconds by work and by way of doing it."""
+    """Return milliseconds by work and by implementation."""
     vertices = torch.tensor(template.vertices, dtype=torch.float32)
     faces = torch.tensor(template.faces)
-    ways = {
+    variants = {
         "kernel": (triangle_frames, world_from_frames, view_colors),
         "torch": (
             lambda v, f: TriangleFrames(*triangle_frames_reference(v, f)[:4]),
@@ -71,16 +71,16 @@ def measure(bound: BoundGaussians, template: Template, repeats: int) -> dict:
     }
     figures: dict[str, dict] = {}
     for work in ("forward", "attributes", "attributes and vertices"):
-        jobs = {name: job(work, bound, vertices, faces, way) for name, way in ways.items()}
+        jobs = {name: job(work, bound, vertices, faces, variant) for name, variant in variants.items()}
         figures[work] = race(jobs, repeats)
     return figures
 
 
 def job(
-    work: str, bound: BoundGaussians, vertices: torch.Tensor, faces: torch.Tensor, way: tuple
+    work: str, bound: BoundGaussians, vertices: torch.Tensor, faces: torch.Tensor, variant: tuple
 ) -> Callable[[], object]:
     """One run of the work: nothing is kept from one to the next but a standing mesh's frames."""
-    to_frames, to_world, to_colors = way
+    to_frames, to_world, to_colors = variant
     camera = torch.tensor([[0.0, 1.0, 3.0]])
     backward = work != "forward"
     leaves = {name: getattr(bound, name).clone().requires_grad_(backward) for name in LEAVES}

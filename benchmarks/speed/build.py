@@ -1,4 +1,4 @@
-"""A scan to a finished, validated template: seconds by stage, peak memory, and the checks.
+"""Time the build of a template from a scan: seconds by stage, peak memory, checks.
 
     python -m benchmarks build [--captures DIR] [--repeats 3]
 

@@ -1,4 +1,4 @@
-"""Captures: images a second through a loader, memory over a long capture, every reader on a known scene.
+"""Measure reading of captures: images a second, memory over a long capture, every reader on a known scene.
 
 python -m benchmarks capture_loader
 """
@@ -82,10 +82,10 @@ def write_images(root: Path, *, size: tuple[int, int], count: int, photographs: 
 
 
 def throughput(root: Path, count: int) -> dict[str, object]:
-    """Each way of reading the same files beside the plain decode of them, in alternation; medians of three rounds."""
+    """Time each reader of the same files beside a plain decode, in alternation; return medians of three rounds."""
     write_images(root / "black", size=(1500, 2000), count=count, photographs=False)
     write_images(root / "photos", size=(3000, 4000), count=count // 4, photographs=True)
-    # Nothing is kept: every image is decoded anew.
+    # Nothing is kept: every image is decoded again.
     black = open_capture(root / "black", cache_bytes=0)
     photos = open_capture(root / "photos", cache_bytes=0).resized(0.5)
     kept = open_capture(root / "black")
@@ -156,17 +156,17 @@ def plain_both(capture: Capture, view: tuple[str, int]) -> tuple[np.ndarray, np.
 
 
 def read_image(capture: Capture, view: tuple[str, int]) -> np.ndarray:
-    """As a trainer would read photographs."""
+    """Photographs, as a training reads them."""
     return capture.image(*view)
 
 
 def read_foreground(capture: Capture, view: tuple[str, int]) -> tuple[np.ndarray, np.ndarray]:
-    """As a trainer would read the person."""
+    """The person alone, as a training reads it."""
     return capture.foreground(*view)
 
 
 def read_composited(capture: Capture, view: tuple[str, int]) -> np.ndarray:
-    """As float, on a colour."""
+    """The person as float, on a background colour."""
     return capture.composited(*view, (1.0, 1.0, 1.0))
 
 

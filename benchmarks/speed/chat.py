@@ -1,4 +1,4 @@
-"""How long an answer takes, part by part, and whether sound and poses are together: a conversation with a made voice.
+"""Time each part of an answer in a conversation with a synthetic voice, and the offset of sound and poses.
 
     python -m benchmarks chat --avatar me.avatar
 
@@ -185,7 +185,7 @@ def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
         timed("words, at the end", recogniser.end)
         block = samples[RATE // 2 : RATE // 2 + BLOCK].astype(np.float32) / np.float32(32768.0)
         timed("voice activity, a block", lambda heard=block: activity(heard))
-        timed("frames, a sentence", lambda said=spoken.speech: performer.talk(said))
+        timed("frames, a sentence", lambda speech=spoken.speech: performer.talk(speech))
         timed("picture", page.draw)
     return {part: round(float(np.mean(seconds)), 4) for part, seconds in out.items()}
 

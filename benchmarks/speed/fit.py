@@ -1,4 +1,4 @@
-"""The fit on a capture: iterations a second, quality of held-out views as time goes by, where time goes.
+"""Measure the fit to one frame: iterations a second, quality of held-out views over time, shares of a step.
 
     python -m benchmarks fit --capture DIR [--gaussians 150000] [--iterations 600]
 

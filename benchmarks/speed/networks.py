@@ -1,4 +1,4 @@
-"""Seconds and parameters of the networks: teacher presets, the student's field, blend shapes, ST-LPIPS.
+"""Measure the networks: milliseconds, parameters and memory of teacher, field, blend shapes and ST-LPIPS.
 
     python -m benchmarks networks [--presets cpu demo] [--device cpu]
 

@@ -1,4 +1,4 @@
-"""The Gaussian rasteriser on the CPU: exactness, milliseconds by stage and instruction set, scaling, peers.
+"""Measure the Gaussian rasteriser on the CPU: exactness, time by stage and instruction set, scaling, peers.
 
     python -m benchmarks rasterizer [--repeats 5] [--peer-lib LIB.so] [--opensplat CHECKOUT BUILD] [--no-store]
 
@@ -55,7 +55,7 @@ class RasterizerBenchmark:
     """Measure the CPU backend."""
 
     repeats: int = 5
-    """Of each time; small scenes get three times as many."""
+    """Repeats of each measurement; small scenes get three times as many."""
     peer_lib: Path | None = None
     """A library with the interface of the first version of the kernels, to be timed beside."""
     opensplat: tuple[Path, Path] | None = None
@@ -160,7 +160,7 @@ def race(jobs: dict[str, Callable[[], dict[str, float]]], repeats: int) -> dict[
 
 
 def milliseconds(levels: tuple[str, ...], repeats: int, peer_lib: Path | None) -> dict[str, dict]:
-    """By scene and number of channels: every level beside the others, and the peer."""
+    """Return milliseconds by scene and number of channels, of every instruction set and of the peer."""
     figures = {}
     for name, (count, width, height, sigma) in SCENES.items():
         scene = body_scene(count, width, height, sigma=sigma)
@@ -175,7 +175,7 @@ def milliseconds(levels: tuple[str, ...], repeats: int, peer_lib: Path | None) -
 
 
 def limits(repeats: int) -> dict[str, object]:
-    """What one pair of pixel and Gaussian costs, beside what this machine can do at all."""
+    """Return the cost of a pair of pixel and Gaussian, beside the limits of this machine."""
     a = torch.randn(1024, 1024)
     b, target = torch.randn(1024, 1024), torch.empty(1024, 1024)
     peak = 2 * 1024**3 / fastest(lambda: torch.mm(a, b, out=target), 3 * repeats) / 1e9
@@ -191,7 +191,7 @@ def limits(repeats: int) -> dict[str, object]:
         channels = job.image.shape[-1]
         flop = flop_per_pair(channels)
         # A forward pass reads a Gaussian's ellipse and channels for each entry of a list; a backward pass again, and
-        # reads and writes its row of gradients. The picture passes once each way.
+        # reads and writes its row of gradients. The picture is read once and written once.
         traffic = {"blend": 8 + 32 + 4 * channels, "unblend": 8 + 32 + 4 * channels + 128}
         picture = 4 * width * height * (channels + 1)
         stages = {}
@@ -221,7 +221,7 @@ def fastest(run: Callable[[], object], repeats: int) -> float:
 
 
 def scaling(repeats: int) -> dict[str, dict[str, dict[str, float]]]:
-    """How the time grows with each quantity, the others as in 50k at 512x512 with ten channels."""
+    """Return times by each quantity, the others as in 50k at 512x512 with ten channels."""
     base = body_scene(50_000, 512, 512)
     keep = ("forward_ms", "both_ms")
     scenes = {

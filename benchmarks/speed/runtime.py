@@ -1,13 +1,13 @@
-"""The torch student against the runtime without torch: milliseconds of a picture by part, on one thread.
+"""Time a picture of the torch student and of the runtime without torch, by part, on one thread.
 
     python -m benchmarks runtime --run RUN [--repeats 20] [--no-store]
 
-A picture is a new pose and a view of 512x512 from the front. Both take turns in one process, picture by picture. What
-is measured is the processor's time, which other work on the machine disturbs little, and the least of all pictures.
-Parts: pose, joints and expression
-(torch: and blended transforms of all vertices); field, displacements; blend, blend shapes; world, skinning, frames of
-triangles, the way to the world (torch: and colours); draw, the picture (runtime: and colours). Rows: the run's own
-student, and students of the run's sizes with Gaussians as they are sampled on the template before any training.
+A picture is a new pose and a view of 512x512 from the front. Both take turns in one process, picture by picture.
+Times are those of the processor, which other work on the machine disturbs little; the least of all pictures counts.
+Parts: pose (joints and expression; torch: and blended transforms of all vertices), field (displacements), blend
+(blend shapes), world (skinning, frames of triangles, transform to the world; torch: and colours), draw (the picture;
+runtime: and colours). Rows: the run's own student, and students of its sizes with Gaussians as sampled on the
+template before any training.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class RuntimeBenchmark:
         """Print and store the figures."""
         figures: dict[str, object] = {}
         for name, student in students_of(self.run_folder).items():
-            for way, parts in compare(student, self.repeats).items():
-                figures[f"{name} Gaussians, {way}"] = parts
+            for implementation, parts in compare(student, self.repeats).items():
+                figures[f"{name} Gaussians, {implementation}"] = parts
         print(json.dumps(figures, indent=1))
         if self.store:
             store_results("runtime", f"python -m benchmarks runtime --run {self.run_folder.name}", figures)
@@ -84,7 +84,7 @@ def sampled(like: Student, count: int) -> Student:
 
 
 def compare(student: Student, repeats: int) -> dict[str, dict[str, float]]:
-    """Return the least milliseconds of each part, and of all of them, of either way."""
+    """Return the least milliseconds of each part and of their sum, with torch and without."""
     torch.set_num_threads(1)
     camera = from_the_front(student.rig.template)
     poses = poses_of(student)
@@ -95,14 +95,14 @@ def compare(student: Student, repeats: int) -> dict[str, dict[str, float]]:
         player = AvatarPlayer(path, threads=1, clock=time.process_time)
         loading, size = 1e3 * (time.process_time() - begin), path.stat().st_size
     drawn = torch_pictures(student, camera)
-    best = {way: dict.fromkeys((*PARTS, "all"), float("inf")) for way in ("torch", "runtime")}
+    best = {implementation: dict.fromkeys((*PARTS, "all"), float("inf")) for implementation in ("torch", "runtime")}
     for k in range(repeats):
         params = poses.frame(k % len(poses))
         player.pose(params)
         player.draw(camera)
-        for way, seconds in (("runtime", dict(player.seconds)), ("torch", drawn(params))):
+        for implementation, seconds in (("runtime", dict(player.seconds)), ("torch", drawn(params))):
             seconds["all"] = sum(seconds.values())
-            best[way] = {part: min(ms, 1e3 * seconds[part]) for part, ms in best[way].items()}
+            best[implementation] = {part: min(ms, 1e3 * seconds[part]) for part, ms in best[implementation].items()}
     best["runtime"] |= {"load": loading, "megabytes": size / 1e6}
     best["runtime"]["times as fast"] = best["torch"]["all"] / best["runtime"]["all"]
     return best

@@ -1,4 +1,4 @@
-"""The page's kernels against the runtime's, and both renderers of the page where the CPU plays the GPU.
+"""Time the page's WebAssembly kernels beside the native ones, and both renderers of the page.
 
     python -m benchmarks web_player --run RUN [--before MODULES] [--repeats 20] [--no-store]
 
@@ -111,8 +111,8 @@ class WebPlayerBenchmark:
         loose = self.run_folder / "83_cloth" / "garments.npz"
         garments = load_garments(loose, template) if loose.exists() else []
         subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
-        ways = {"WebAssembly": WEB / "build" / "modules.mjs"}
-        ways |= {} if self.before is None else {"TypeScript": self.before.resolve()}
+        variants = {"WebAssembly": WEB / "build" / "modules.mjs"}
+        variants |= {} if self.before is None else {"TypeScript": self.before.resolve()}
         figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             for name, student in students.items():
@@ -121,8 +121,8 @@ class WebPlayerBenchmark:
                 extras = BundleExtras(name="benchmark", garments=own, motion=poses_of(student))
                 write_bundle(path, student, extras)
                 figures[f"{name} Gaussians, native"] = native(path, self.repeats)
-                for way, modules in ways.items():
-                    figures[f"{name} Gaussians, {way}"] = in_node(path, modules, self.repeats)
+                for variant, modules in variants.items():
+                    figures[f"{name} Gaussians, {variant}"] = in_node(path, modules, self.repeats)
                 if student is trained and self.pictures and find_chromium():
                     figures |= drawn(path, from_the_front(template), self.pictures)
         print(json.dumps(figures, indent=1))

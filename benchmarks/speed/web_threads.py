@@ -1,4 +1,4 @@
-"""The page's pose on one thread and on two, beside the native library's.
+"""Time a pose in the page and in the native library, on one thread and on two.
 
     python -m benchmarks web_threads --run RUN [--rounds 10] [--no-store]
 
@@ -88,8 +88,8 @@ class WebThreadsBenchmark:
             for name, student in students_of(self.run_folder).items():
                 path = Path(folder) / "me.avatar"
                 write_bundle(path, student, BundleExtras(name="benchmark", motion=poses_of(student)))
-                for way, rows in compare(path, self.rounds).items():
-                    figures[f"{name} Gaussians, {way}"] = rows
+                for variant, rows in compare(path, self.rounds).items():
+                    figures[f"{name} Gaussians, {variant}"] = rows
         print(json.dumps(figures, indent=1))
         if self.store:
             command = f"python -m benchmarks web_threads --run {self.run_folder.name} --rounds {self.rounds}"
@@ -97,7 +97,7 @@ class WebThreadsBenchmark:
 
 
 def compare(path: Path, rounds: int) -> dict[str, Row]:
-    """Return milliseconds of a bundle's poses by way and number of threads, and how many times as fast two are."""
+    """Return milliseconds of a bundle's poses by variant and number of threads, and how many times as fast two are."""
     files = {
         "index.html": _PAGE.encode(),
         "worker.js": (_WORKER % (json.dumps(THREADS), POSES)).encode(),
@@ -105,7 +105,7 @@ def compare(path: Path, rounds: int) -> dict[str, Row]:
         "me.avatar": path.read_bytes(),
     }
     players = [AvatarPlayer(path, threads=threads, clock=time.perf_counter) for threads in THREADS]
-    found: dict[str, list[list[Row]]] = {way: [[] for _ in THREADS] for way in ("native", "WebAssembly")}
+    found: dict[str, list[list[Row]]] = {variant: [[] for _ in THREADS] for variant in ("native", "WebAssembly")}
     with (
         PageServer(files) as server,
         tempfile.TemporaryDirectory() as folder,
@@ -117,16 +117,16 @@ def compare(path: Path, rounds: int) -> dict[str, Row]:
         for k in range(rounds):
             for rows, more in zip(found["native"], native(players, POSES * k), strict=True):
                 rows += more
-            said = json.loads(page.evaluate(f"round({POSES * k}).then(JSON.stringify)"))
-            for rows, more in zip(found["WebAssembly"], said["rows"], strict=True):
+            reported = json.loads(page.evaluate(f"round({POSES * k}).then(JSON.stringify)"))
+            for rows, more in zip(found["WebAssembly"], reported["rows"], strict=True):
                 rows += more
-        assert said["helped"][1] > 0, "no second thread took part"
+        assert reported["helped"][1] > 0, "no second thread took part"
         server.shutdown()
     out: dict[str, Row] = {}
-    for way, by_threads in found.items():
+    for variant, by_threads in found.items():
         one, two = (summary(rows) for rows in by_threads)
-        out |= {f"{way}, 1 thread": one, f"{way}, 2 threads": two}
-        out[f"{way}, times as fast"] = {part: one[part] / two[part] for part in one}
+        out |= {f"{variant}, 1 thread": one, f"{variant}, 2 threads": two}
+        out[f"{variant}, times as fast"] = {part: one[part] / two[part] for part in one}
     return out
 
 

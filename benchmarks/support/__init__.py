@@ -1,1 +1,1 @@
-"""What several benchmarks share: the store of results, scenes and voices, the page of results."""
+"""Share the store of results, captures with a known truth, voices and the page of results."""

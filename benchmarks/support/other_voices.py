@@ -31,7 +31,7 @@ _PHONEME, _SYNCHRONOUS, _PHONEMES_IN_IPA, _UTF8 = 7, 2, 3, 1
 def by_flite(program: Path, voice: str, text: str) -> tuple[Sound, Speech]:
     """Say a text with flite, whose `-psdur` prints when each phoneme ends."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "said.wav"
+        out = Path(folder) / "spoken.wav"
         command = [str(program), "-voice", voice, "-psdur", "-t", text, "-o", str(out)]
         printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=900).stdout
         sound = read_wave(out)
@@ -109,7 +109,7 @@ class Espeak:
 
 
 def _speech(times: list[tuple[str, float, float]], seconds: float) -> Speech:
-    """What is known of it, within the sound and in order."""
+    """Return the phonemes within the sound, in order."""
     out: list[Phoneme] = []
     for name, start, end in times:
         start, end = max(start, out[-1].end if out else 0.0), min(end, seconds)
