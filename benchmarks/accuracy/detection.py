@@ -43,11 +43,7 @@ from smplxpp.detect import load_detector
 from smplxpp.detect.person_mask import PersonSegmenter
 from smplxpp.detect.plates import PlateModel
 from smplxpp.metrics.pose_error import pose_error
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
-from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.observations import Observations
-from smplxpp.register.triangulate import triangulate
+from smplxpp.register import LandmarkModel, Observations, RegisterConfig, register, triangulate
 
 _MM = 1000.0
 _SURE = 0.5

@@ -22,8 +22,7 @@ from pipelines.viewer.session import lies_within
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.params import BodyParams
 from smplxpp.core.spread import spread
-from smplxpp.register import Observations, ScanObservation, register
-from smplxpp.register.landmarks import LandmarkModel
+from smplxpp.register import LandmarkModel, Observations, ScanObservation, register
 from smplxpp.register.locate import locate_body
 
 ON_SKIN, WITHIN = 0.008, 0.015

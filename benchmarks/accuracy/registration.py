@@ -33,10 +33,7 @@ from smplxpp.core.labels import SKIN
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.metrics.pose_error import pose_error
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
-from smplxpp.register.kinematics import BodyState
-from smplxpp.register.observations import Observations, ScanObservation
+from smplxpp.register import BodyState, Observations, RegisterConfig, ScanObservation, register
 
 OFF_DEGREES = 15.0
 """A start this far off: the length of each joint's error, in a random direction."""

@@ -121,7 +121,7 @@ class Build:
         from pipelines.stages.build import build
         from smplxpp.clean.remesh import require_remesher
         from smplxpp.detect import load_detector
-        from smplxpp.register.landmark_file import read_landmarks
+        from smplxpp.register import read_landmarks
         from smplxpp.segment import Corrections
 
         keep_out_of_capture(self.out, self.capture)

@@ -83,7 +83,7 @@ class Register:
         from pipelines.runs.folders import keep_out_of_capture, own_run_folder, take_file
         from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE
         from pipelines.stages.register_capture import register_capture
-        from smplxpp.register.landmark_file import read_landmarks
+        from smplxpp.register import read_landmarks
 
         keep_out_of_capture(self.out, self.capture)
         require_at_least("option seed", self.seed, 0)

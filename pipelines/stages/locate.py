@@ -24,10 +24,8 @@ from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.detect import load_detector
-from smplxpp.register.bare import bare_of_scan
-from smplxpp.register.landmark_file import read_landmarks
+from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import LocatedBody, locate_body
-from smplxpp.register.observations import ScanObservation
 from smplxpp.segment import label_by_body
 
 SURE = 0.6
@@ -62,7 +60,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         "detector": witness,
         "facing_degrees": found.candidates[0].facing_degrees,
         "confidence": found.confidence,
-        "problems": list(found.problems),
+        "problems": list(found.notes),
         "candidates": found.candidates,
         "bare": float(bare.mean()),
     }
@@ -75,7 +73,7 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
         0.2,
         higher_is_better=True,
         explanation="how far the best way to stand in the scan is ahead of the best that faces another way"
-        + "".join(f"; {problem}" for problem in found.problems),
+        + "".join(f"; {problem}" for problem in found.notes),
     )
     return StageOutput([check], jsonable(numbers))
 

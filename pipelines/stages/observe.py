@@ -20,9 +20,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register.landmark_file import read_landmarks
-from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.observations import Observations
+from smplxpp.register import LandmarkModel, Observations, read_landmarks
 from smplxpp.segment import map_labels
 
 ELSEWHERE = 255

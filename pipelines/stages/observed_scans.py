@@ -16,7 +16,7 @@ from smplxpp.capture import Capture
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.register.observations import ScanObservation, ViewMap
+from smplxpp.register import ScanObservation, ViewMap
 from smplxpp.segment import read_labels, vote_on_faces
 
 CLEAR_MAJORITY = 0.6

@@ -19,9 +19,7 @@ from pipelines.stages.registration import registration_checks, stacked_rows, sum
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.json_file import jsonable
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
-from smplxpp.register.follow import follow, lost_frames
+from smplxpp.register import RegisterConfig, follow, lost_frames, register
 
 
 def register_capture(
@@ -86,7 +84,7 @@ def _work(
         raise InputError(
             "registration",
             expected="a body in at least one frame",
-            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.problems) or 'nobody was seen'}",
+            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.notes) or 'nobody was seen'}",
             remedy="look at the inputs with `smplxpp capture check`",
         )
     _save(folder / "params.npz", stacked_rows(fit.frames, fit.params))
@@ -98,7 +96,7 @@ def _work(
         joint_names=np.array(body.joint_names),
         confidence=fit.confidence,
     )
-    problems = (*observed.all_problems(), *fit.problems, *lost)
+    problems = (*observed.all_problems(), *fit.notes, *lost)
     content = summary(body, observations, fit, problems)
     (folder / "registration.json").write_text(json.dumps(jsonable(content), indent=1) + "\n")
     medians = {

@@ -12,9 +12,7 @@ from jaxtyping import Float64
 from smplxpp.body import BodyModel
 from smplxpp.core.checks import Check
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register.body_fit import BodyFit
-from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.observations import Observations
+from smplxpp.register import BodyFit, LandmarkModel, Observations
 
 CONFIDENT = 0.5
 """Mean confidence of the body's joints from which a frame counts as seen, not guessed by the priors."""
@@ -155,7 +153,7 @@ def _few(frames: Sequence[int], count: int = 8) -> str:
 
 def summary(body: BodyModel, observed: Observations, fit: BodyFit, problems: Sequence[str]) -> dict[str, Any]:
     """What `registration.json` says: residuals by frame before and after, reprojection by camera, problems."""
-    residuals: Mapping[str, Mapping[str, Any]] = {"after": fit.residuals, "before": fit.start}
+    residuals: Mapping[str, Mapping[str, Any]] = {"after": fit.residuals, "before": fit.initial_residuals}
     return {
         "frames": list(fit.frames),
         "absent": [frame for frame in observed.frames if frame not in fit.frames],

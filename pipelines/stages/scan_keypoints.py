@@ -14,7 +14,7 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_at_least
 from smplxpp.detect import Detector
-from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
+from smplxpp.register import Triangulation, TriangulationConfig, triangulate
 
 Landmarks = dict[str, tuple[Float64[np.ndarray, " 3"], float]]
 # Confidence from which a view counts as one that sees a point.

@@ -29,7 +29,7 @@ from pipelines.viewer.session import LabelledScan, LabelSession
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_numbers
-from smplxpp.register.landmark_file import read_landmarks
+from smplxpp.register import read_landmarks
 from smplxpp.segment import Corrections
 
 

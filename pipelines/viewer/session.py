@@ -14,7 +14,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.core.topology import component_labels
-from smplxpp.register.landmark_file import write_landmarks
+from smplxpp.register import write_landmarks
 from smplxpp.segment import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.corrected_faces import ScanSurface
 from smplxpp.segment.corrections import Correction, faces_of

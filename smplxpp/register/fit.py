@@ -1,4 +1,7 @@
-"""Register a body to what was seen of a person, over all frames: `register`."""
+"""Register a body to keypoints, landmarks, masks, label maps and scans over all frames: `register`.
+
+The package's docstring states what is minimised; this module holds the schedule.
+"""
 
 from __future__ import annotations
 
@@ -10,32 +13,18 @@ from jaxtyping import Bool, Float64
 from smplxpp.body import BodyModel
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.spread import spread
-from smplxpp.register.anatomy import Anatomy
-from smplxpp.register.bare import bare_vertices, hands_of
-from smplxpp.register.body_fit import BodyFit
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.keypoint_term import KeypointTerm
+from smplxpp.register.clothing import bare_vertices, hand_vertices
+from smplxpp.register.keypoint_term import KeypointTerm, PreparedKeypoints, prepare_keypoints
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
 from smplxpp.register.landmark_term import LandmarkTerm, PlacedLandmarks
+from smplxpp.register.landmarks import is_finger, visible_vertices
 from smplxpp.register.normal_equations import Columns, NormalEquations
-from smplxpp.register.observations import Observations, check_observations
-from smplxpp.register.outline import Outline
-from smplxpp.register.priors import Priors, Start, white_noise
+from smplxpp.register.observations import BodyFit, Observations, RegisterConfig, check_observations
+from smplxpp.register.priors import Anatomy, Priors
 from smplxpp.register.scan_term import ScanTerm
-from smplxpp.register.seen_keypoints import SeenKeypoints, see_keypoints
-from smplxpp.register.silhouette_term import SilhouetteTerm, Surface
-from smplxpp.register.solver import Terms, gauss_newton
-from smplxpp.register.start import joined_points, state_from_points
-
-# Deviations that a fit is believed to have where nothing tells them: radians, metres, betas.
-_START_NOISE = (np.radians(2.0), 0.01, 0.3)
-# A fit has slow errors too, which its noise does not show: beside keypoints it counts as so many times as noisy.
-_BESIDE_KEYPOINTS = 2.0
-_LEAST_NOISE = (np.radians(0.5), 0.003)
-_OVERLAP = 10
-# A joint whose place is known to this (metres) has confidence 1/2.
-_HALF_KNOWN = 0.02
-_FACE = "face_"
+from smplxpp.register.silhouette_term import Outline, SilhouetteTerm, Surface
+from smplxpp.register.solver import Terms, gauss_newton, joint_confidence
+from smplxpp.register.start import joined_points, start_of, state_from_points
 
 
 def register(
@@ -47,14 +36,14 @@ def register(
 ) -> BodyFit:
     """Fit pose, shape and translation of a body to keypoints, landmarks, masks, label maps and scans in any mixture.
 
-    Gauss-Newton on the sum of squares of: keypoints (robust, pixels), landmarks (robust, metres), masks
-    (`SilhouetteTerm`), scans (`ScanTerm`), joint ranges, a zero-mean pose prior and unit betas (`Anatomy`; no data set
-    was learned from), robust accelerations, and a given fit as far as its own noise says. Named points alone come
-    first. One shape for all frames, told by `observed.shape_frames`. Clothes never pull the body onto themselves: they
-    keep a gap that is learned (`Gaps`).
+    Gauss-Newton minimises the robust sum of squares that the package's docstring states. Keypoints and landmarks alone
+    are fitted first, then everything. All frames share one shape, which `observed.shape_frames` determine. Cloth never
+    pulls the body onto itself: it keeps a gap that is estimated (`Gaps`).
 
     Args:
-        observed: cameras and everything seen through them; held-out cameras are not in it.
+        body: the body model.
+        observed: cameras and everything seen through them, without held-out cameras.
+        config: options.
         progress: called with the work under way and its share done.
 
     Raises:
@@ -72,14 +61,19 @@ def register(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Frames that are solved together: rows of the whole. `kept`: those whose answer counts."""
+    """Frames that are solved together.
+
+    Attributes:
+        rows: of the frames in the whole sequence.
+        kept: whether a frame's result is used; the others overlap with the neighbouring windows.
+    """
 
     rows: np.ndarray
     kept: Bool[np.ndarray, " T"]
 
 
 class _Registration:
-    """One registration under way."""
+    """The state of one registration: prepared observations, and the vertices known to be bare."""
 
     def __init__(
         self, body: BodyModel, observed: Observations, config: RegisterConfig, progress: ProgressCallback
@@ -87,9 +81,9 @@ class _Registration:
         self.body, self.observed, self.config, self.progress = body, observed, config, progress
         self.kinematics, self.frames = Kinematics(body), np.array(observed.frames)
         self.points = BodyPoints.of_vertices(body, np.arange(body.vertex_count))
-        self.seen: SeenKeypoints | None = see_keypoints(body, observed, config)
+        self.seen: PreparedKeypoints | None = prepare_keypoints(body, observed, config)
         self.placed = PlacedLandmarks.of(body, observed.landmarks, observed.frames)
-        self.problems = [words for one in (self.seen, self.placed) if one is not None for words in one.problems]
+        self.notes = [note for one in (self.seen, self.placed) if one is not None for note in one.notes]
         shape_frames = observed.shape_frames or observed.frames
         self.tells_shape = np.isin(self.frames, shape_frames)
         self.outlines = self._outlines()
@@ -97,41 +91,42 @@ class _Registration:
         self.bare = np.zeros(body.vertex_count, dtype=bool)
 
     def fit(self) -> BodyFit:
-        state = self._start()
-        before = state
-        whole = len(self.frames) <= self.config.window
-        if whole:
-            state, equations = self._solve(
-                state, _Window(np.arange(len(self.frames)), np.ones(len(self.frames), dtype=bool)), True
-            )
-            confidence = self._confidence(state, equations, np.arange(len(self.frames)))
+        """Run the schedule and return the result with its residuals and confidence."""
+        initial = state = self._start()
+        everything = np.arange(len(self.frames))
+        if len(self.frames) <= self.config.window:
+            # A short take is one window, in which shape and poses are solved together.
+            state, equations = self._solve(state, _Window(everything, np.ones(len(everything), dtype=bool)), True)
+            confidence = joint_confidence(self.kinematics, state, equations, everything)
         else:
+            # A long one gets its shape from some frames, then the poses of window after window with that shape.
             state = self._solve_shape(state)
             state, confidence = self._solve_windows(state)
         residuals = self._measure(state)
-        self.problems += self._far_landmarks(state)
-        start = self._measure(before) if self.observed.initial is not None else {}
+        self.notes += self._far_landmarks(state)
+        before = self._measure(initial) if self.observed.initial is not None else {}
         params = state.to_params(self.body, fps=self.observed.fps)
-        return BodyFit(tuple(self.observed.frames), params, confidence, residuals, start, tuple(self.problems))
+        return BodyFit(tuple(self.observed.frames), params, confidence, residuals, before, tuple(self.notes))
 
-    # -- what is there
+    # -- preparation
 
     def _columns(self) -> Columns:
+        """Choose the unknowns: parameters that nothing observes are not solved for and keep their values."""
         names = np.array(self.body.joint_names)
         landmarks = {name for one in (self.seen, self.placed) if one is not None for name in one.landmarks.names}
-        fingers = np.array([not _is_finger(name) for name in names])
-        sees_fingers = any(_is_finger(name) or name.endswith("_tip") for name in landmarks)
-        face = any(name.startswith(_FACE) for name in landmarks)
-        # A given fit is kept slow and believed where nothing else is seen.
+        sees_fingers = any(is_finger(name) or name.endswith("_tip") for name in landmarks)
+        face = any(name.startswith("face_") for name in landmarks)
+        # An initial fit is a measurement of fingers and jaw, which smoothness then keeps slow.
         given = self.observed.initial is not None
-        turns = np.full(len(names), True)
-        turns[~fingers] = sees_fingers or given
-        turns[["eye" in name for name in names]] = False
-        turns[names == "jaw"] = face or given
+        free = np.full(len(names), True)
+        free[[is_finger(name) for name in names]] = sees_fingers or given
+        free[["eye" in name for name in names]] = False
+        free[names == "jaw"] = face or given
         E = self.body.num_expressions
-        return Columns(np.flatnonzero(turns), len(names), E if face else 0, E, self.body.num_betas)
+        return Columns(np.flatnonzero(free), len(names), E if face else 0, E, self.body.num_betas)
 
     def _outlines(self) -> dict[tuple[str, int], Outline]:
+        """Read all masks as signed distance fields, by camera and row, and note those that are missing."""
         read = self.observed.mask
         out: dict[tuple[str, int], Outline] = {}
         if read is None:
@@ -148,13 +143,14 @@ class _Registration:
             self.progress("masks", (row + 1) / len(self.frames))
         for name, frames in missing.items():
             if len(frames) < len(self.frames) or out:
-                self.problems.append(
+                self.notes.append(
                     f"camera {name}: no mask, or an empty one, in {len(frames)} of {len(self.frames)} frames, "
                     f"first in frame {frames[0]}; they are left out"
                 )
         return out
 
     def _start(self) -> BodyState:
+        """Return the initial fit, or the T-pose aligned to triangulated keypoints and landmarks."""
         if self.observed.initial is not None:
             return BodyState.of_params(self.body, self.observed.initial)
         tables = [(one.landmarks.names, one.points) for one in (self.seen, self.placed) if one is not None]
@@ -178,40 +174,45 @@ class _Registration:
     # -- solving
 
     def _solve_shape(self, state: BodyState) -> BodyState:
-        """The shape, and poses, of frames spread over those that may tell it."""
+        """Return the state with the shape that evenly spread frames determine."""
         rows = np.array(spread(np.flatnonzero(self.tells_shape).tolist(), self.config.shape_frames))
         solved, _ = self._solve(state.select(rows), _Window(rows, np.ones(len(rows), dtype=bool)), True)
         return replace(state, betas=solved.betas)
 
     def _solve_windows(self, state: BodyState) -> tuple[BodyState, Float64[np.ndarray, "T J"]]:
-        """Poses of all frames, window after window, of the solved shape."""
+        """Return the poses of all frames, solved in overlapping windows with the shape held, and their confidence."""
+        overlap = 10  # frames on each side whose results are dropped, so that windows join smoothly
         count, length = len(self.frames), self.config.window
         rotations, transl, expression = state.rotations.copy(), state.transl.copy(), state.expression.copy()
         confidence = np.zeros((count, self.body.joint_count))
         for first in range(0, count, length):
             inner = np.arange(first, min(first + length, count))
-            rows = np.arange(max(0, first - _OVERLAP), min(count, first + length + _OVERLAP))
+            rows = np.arange(max(0, first - overlap), min(count, first + length + overlap))
             window = _Window(rows, np.isin(rows, inner))
             solved, equations = self._solve(state.select(rows), window, False)
             rotations[inner] = solved.rotations[window.kept]
             transl[inner] = solved.transl[window.kept]
             expression[inner] = solved.expression[window.kept]
-            confidence[inner] = self._confidence(solved, equations, np.flatnonzero(window.kept))
+            confidence[inner] = joint_confidence(self.kinematics, solved, equations, np.flatnonzero(window.kept))
         return BodyState(rotations, transl, state.betas, expression), confidence
 
     def _solve(self, state: BodyState, window: _Window, solve_shape: bool) -> tuple[BodyState, NormalEquations]:
+        """Solve one window: named points first, then all terms with the vertices that are now known to be bare."""
         config, rows = self.config, window.rows
         terms = self._terms(state, rows)
         equations = NormalEquations(self.columns, len(state))
         if terms.points():
+            # The robust kernel narrows from 40 standard deviations to one in two thirds of the steps.
             scales = np.geomspace(40.0, 1.0, max(1, 2 * config.joint_steps // 3))
             scales = np.concatenate([scales, np.ones(config.joint_steps - len(scales))])
             state, equations = self._step("joints", state, terms, config.joint_steps, solve_shape, scales)
+        # Labels are looked up on the body as it stands now; without any labels, hands are taken for bare.
         bare = bare_vertices(self.kinematics, state, self.observed, self.frames[rows].tolist(), self.points)
         if bare is not None:
             self.bare = bare
         elif not self.bare.any():
-            self.bare = hands_of(self.body) if self.observed.bare is None else self.observed.bare
+            self.bare = hand_vertices(self.body) if self.observed.bare is None else self.observed.bare
+        # Surfaces need an approximate body, because their correspondences are nearest points.
         terms = replace(terms, silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         if terms.surfaces():
             state, equations = self._step("surfaces", state, terms, config.surface_steps, solve_shape, None)
@@ -228,10 +229,12 @@ class _Registration:
         solve_shape: bool,
         scales: Float64[np.ndarray, " n"] | None,
     ) -> tuple[BodyState, NormalEquations]:
+        """Run Gauss-Newton steps, report them, and let the cutoff of surfaces fall from step to step."""
+
         def done(k: int) -> None:
             self.progress(what, (k + 1) / steps)
             for term in terms.surfaces():
-                # What is far is believed at first; a contour of something else less and less.
+                # From the whole reach to 0.4 of it in four steps: far points pull at first, outliers less and less.
                 term.reach = max(0.4, 1.0 - 0.15 * k) * term.first_reach
 
         return gauss_newton(
@@ -247,10 +250,17 @@ class _Registration:
 
     def _terms(self, state: BodyState, rows: np.ndarray) -> Terms:
         frames, anatomy = self.frames[rows], Anatomy.of(self.body.joint_count)
+        """Return the priors and the terms of named points for some rows."""
         start = None
         if self.observed.initial is not None:
-            given = BodyState.of_params(self.body, self.observed.initial)
-            start = self._believed(given, rows)
+            start = start_of(
+                BodyState.of_params(self.body, self.observed.initial),
+                self.frames,
+                rows,
+                stated=self.observed.initial_noise,
+                beside_keypoints=self.seen is not None,
+                beside_landmarks=self.placed is not None,
+            )
         priors = Priors(self.columns, frames, anatomy, self.config, start=start, fps=self.observed.fps)
         keypoints = None
         if self.seen is not None:
@@ -263,20 +273,8 @@ class _Registration:
             None if self.placed is None else LandmarkTerm(self.body, self.placed.of_rows(rows), self.config.landmark_m)
         )
 
-    def _believed(self, given: BodyState, rows: np.ndarray) -> Start | None:
-        """A given fit as a measurement: as good as it is smooth; beside keypoints what these do not tell, as twists."""
-        stated = self.observed.initial_noise
-        if stated is not None:
-            return Start(given.select(rows), stated.pose, stated.transl, stated.shape)
-        pose, transl = white_noise(given, self.frames) or _START_NOISE[:2]
-        pose, transl = max(pose, _LEAST_NOISE[0]), max(transl, _LEAST_NOISE[1])
-        if self.seen is not None:
-            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, np.inf)
-        if self.placed is not None:  # what a hand corrects is believed less; a few points do not tell the shape
-            return Start(given.select(rows), max(_BESIDE_KEYPOINTS * pose, _START_NOISE[0]), np.inf, _START_NOISE[2])
-        return Start(given.select(rows), pose, transl, _START_NOISE[2])
-
     def _silhouettes(self, state: BodyState, rows: np.ndarray) -> SilhouetteTerm | None:
+        """Return the term of masks for some rows; None if they have no masks."""
         outlines = {
             (name, k): self.outlines[name, int(row)]
             for k, row in enumerate(rows)
@@ -285,55 +283,29 @@ class _Registration:
         }
         if not outlines:
             return None
+        # A random sample of the visible vertices, and normals of the shape as it stands.
         rng = np.random.default_rng(self.config.seed)
-        skin = np.flatnonzero(_outer_part(self.body))
-        index = np.sort(rng.permutation(skin)[: self.config.rim_samples])
+        index = np.sort(rng.permutation(visible_vertices(self.body))[: self.config.rim_samples])
         shaped = self.points.rest + self.points.shape_dirs @ state.betas
         surface = Surface(self.points, self.body.faces, self.body.mesh(shaped).vertex_normals)
         return SilhouetteTerm(surface, index, self.bare, self.observed.cameras, outlines, self.config)
 
     def _scans(self, rows: np.ndarray) -> ScanTerm | None:
+        """Return the term of scans for some rows; None if they have no scans."""
         frames = self.frames[rows].tolist()
         scans = {k: self.observed.scans[frame] for k, frame in enumerate(frames) if frame in self.observed.scans}
         return ScanTerm(self.kinematics, self.points, self.bare, scans, self.config) if scans else None
 
-    # -- what came out
-
-    def _confidence(self, state: BodyState, equations: NormalEquations, rows: np.ndarray) -> Float64[np.ndarray, "n J"]:
-        """`1 / (1 + (s / 20 mm)^2)` with s the standard deviation of a joint's place."""
-        joints = BodyPoints.of_joints(self.body, np.arange(self.body.joint_count))
-        out = np.zeros((len(rows), self.body.joint_count))
-        for k, row in enumerate(rows):
-            motion = self.kinematics.motion(joints, self.kinematics.posture(state, int(row)))
-            jacobian = self.columns.jacobian(motion)[..., : self.columns.count]
-            covariance = equations.covariance(int(row))
-            variance = np.einsum("jxp,pq,jxq->j", jacobian, covariance, jacobian, optimize=True)
-            out[k] = 1.0 / (1.0 + np.maximum(variance, 0.0) / _HALF_KNOWN**2)
-        return out
+    # -- results
 
     def _measure(self, state: BodyState) -> dict[str, Float64[np.ndarray, " T"]]:
+        """Return the residuals of a state in all frames; gaps are not known, so all cloth counts as it is."""
         rows = np.arange(len(self.frames))
-        terms = self._terms(state, rows)
-        silhouettes, scans = self._silhouettes(state, rows), self._scans(rows)
-        postures = [self.kinematics.posture(state, int(row)) for row in rows]
-        out: dict[str, np.ndarray] = {}
-        if terms.keypoints is not None:
-            term = terms.keypoints
-            out["keypoints_px"] = np.array([term.residual_px(r, self.kinematics, p) for r, p in enumerate(postures)])
-        if terms.landmarks is not None:
-            away = np.array([terms.landmarks.distances(r, self.kinematics, p) for r, p in enumerate(postures)])
-            out["landmarks_mm"] = 1e3 * np.array([np.median(d[d == d]) if (d == d).any() else np.nan for d in away])
-        if silhouettes is not None:
-            out["silhouette_px"] = np.array(
-                [silhouettes.residual_px(r, self.kinematics, p) for r, p in enumerate(postures)]
-            )
-        if scans is not None:
-            both = np.array([scans.residual_mm(r, self.kinematics, p) for r, p in enumerate(postures)])
-            out["skin_mm"], out["inside_mm"] = both[:, 0], both[:, 1]
-        return out
+        terms = replace(self._terms(state, rows), silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
+        return terms.residuals(self.kinematics, state)
 
     def _far_landmarks(self, state: BodyState) -> list[str]:
-        """Which landmarks the body did not come to: misplaced ones, or a fit that went wrong."""
+        """Return notes about landmarks far from the fitted body: misplaced ones, or a fit that failed."""
         out = []
         for row in range(len(self.frames) if self.placed is not None else 0):
             term = self._landmark_term(np.array([row]))
@@ -343,13 +315,3 @@ class _Registration:
             if far:
                 out.append(f"frame {self.frames[row]}: landmarks far from the fitted body's: {', '.join(far)}")
         return out
-
-
-def _is_finger(name: str) -> bool:
-    return any(finger in name for finger in ("index", "middle", "pinky", "ring", "thumb"))
-
-
-def _outer_part(body: BodyModel) -> Bool[np.ndarray, " V"]:
-    """Vertices that images can show: no eyes, teeth and tongue."""
-    hidden = [k for k, name in enumerate(body.part_label_names) if any(w in name for w in ("eye", "teeth", "tongue"))]
-    return ~np.isin(body.part_labels, hidden)

@@ -1,4 +1,4 @@
-"""A body followed from one frame through its neighbours, where no keypoints say where it went: `follow`."""
+"""Track a body from one frame through its neighbours by masks and scans, without keypoints: `follow`."""
 
 from __future__ import annotations
 
@@ -12,19 +12,9 @@ from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.raster import rasterize_mesh
-from smplxpp.register.config import RegisterConfig
 from smplxpp.register.fit import register
 from smplxpp.register.kinematics import BodyState
-from smplxpp.register.observations import Observations, StartNoise
-
-PREDICTED = StartNoise(pose=np.radians(8.0), transl=0.05, shape=1e-3)
-"""How wrong the last two frames' motion, going on, is about the next; the shape is known."""
-# Shares of the last turn and move that may go on: limbs swing, and limbs stop.
-_MOMENTA = (0.8, 0.3)
-# Disagreement that is no longer that of clothes which move: as a factor of the first frame's, and beyond it.
-_LOST, _LOST_LEAST = 1.25, 0.03
-# Height of the pictures in which two answers are compared.
-_COMPARED_HEIGHT = 240
+from smplxpp.register.observations import Observations, RegisterConfig, StartNoise
 
 
 def follow(
@@ -36,20 +26,25 @@ def follow(
     config: RegisterConfig | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> BodyParams:
-    """A start for every frame, from the fit of a single one.
+    """Track a body from the fit of one frame to an initial fit of all frames.
 
-    Frames are taken one by one, outwards from the known one: each begins where the motion of the two before it leads
-    and is registered to its own masks, scans and keypoints with the shape held.
+    Frames are registered one by one, outwards from the known one, with the shape held. Each starts at two predictions
+    that continue the motion of the two frames before it with much and with little momentum, because limbs swing and
+    limbs stop; the fit that disagrees less with the masks is kept.
 
     Args:
-        observed: what is seen; its `initial` is not looked at.
+        body: the body model.
+        observed: masks and scans; its `initial` is ignored.
         known: one row, of frame `at`.
+        at: number of the known frame.
+        config: options of each registration; eight steps on surfaces are enough from one frame to the next.
+        progress: called with the work under way and its share done.
 
     Returns:
-        A row for each of `observed.frames`.
+        One row for each of `observed.frames`.
 
     Raises:
-        InputError: `at` is none of the frames, or nothing is seen in all of them.
+        InputError: `at` is none of the frames, or no frame has any observation.
     """
     frames = observed.frames
     if at not in frames or len(known) != 1:
@@ -62,11 +57,12 @@ def follow(
     place = frames.index(at)
     known = BodyState.of_params(body, known).to_params(body, fps=observed.fps)
     found: dict[int, BodyParams] = {at: known}
-    for way in (frames[place + 1 :], frames[:place][::-1]):
+    # Forwards from the known frame to the end, then backwards to the beginning.
+    for later in (frames[place + 1 :], frames[:place][::-1]):
         past = [known]
-        for frame in way:
-            starts = [predicted(body, past, momentum) for momentum in _MOMENTA[: len(past)]]
-            fits = [_one(body, observed, frame, start, config) for start in starts]
+        for frame in later:
+            starts = [predicted(body, past, momentum) for momentum in (0.8, 0.3)[: len(past)]]
+            fits = [_registered(body, observed, frame, start, config) for start in starts]
             fit = min(fits, key=lambda found: disagreement(body, observed, frame, found))
             past = [past[-1], fit]
             found[frame] = fit
@@ -75,7 +71,7 @@ def follow(
 
 
 def predicted(body: BodyModel, past: Sequence[BodyParams], momentum: float) -> BodyParams:
-    """Where a share of the motion of the last two of some rows leads; the last one where there is but one."""
+    """Extrapolate the last two rows by a share of the motion between them; a single row is returned as it is."""
     last = past[-1]
     if len(past) == 1:
         return last
@@ -86,15 +82,19 @@ def predicted(body: BodyModel, past: Sequence[BodyParams], momentum: float) -> B
     return BodyState(rotations, moved, now.betas, now.expression).to_params(body, fps=last.fps)
 
 
-def _one(body: BodyModel, observed: Observations, frame: int, start: BodyParams, config: RegisterConfig) -> BodyParams:
-    """One frame registered; where nothing is seen in it, where it was expected."""
+def _registered(
+    body: BodyModel, observed: Observations, frame: int, start: BodyParams, config: RegisterConfig
+) -> BodyParams:
+    """Register one frame to its masks and scan; a frame without any keeps the prediction."""
+    # Errors of a prediction from the last two frames; the shape is known.
+    noise = StartNoise(pose=np.radians(8.0), transl=0.05, shape=1e-3)
     seen = {frame: observed.scans[frame]} if frame in observed.scans else {}
     one = replace(
         observed,
         frames=(frame,),
         scans=seen,
         initial=start,
-        initial_noise=PREDICTED,
+        initial_noise=noise,
         shape_frames=(frame,),
         keypoints={},
     )
@@ -103,14 +103,19 @@ def _one(body: BodyModel, observed: Observations, frame: int, start: BodyParams,
 
 
 def lost_frames(body: BodyModel, observed: Observations, params: BodyParams, *, at: int) -> tuple[str, ...]:
-    """Words about frames whose masks a body that was followed explains much worse than those of the frame it began at.
+    """Return a note about frames whose masks disagree with the tracked body much more than those of its first frame.
+
+    Cloth that moves changes the disagreement by less than a quarter and three hundredths; more means a lost limb.
 
     Args:
-        params: a row a frame, as `follow` gives them.
+        body: the body model.
+        observed: masks.
+        params: one row a frame, as `follow` returns them.
+        at: number of the frame at which the tracking began.
     """
     frames = observed.frames
     wrong = [disagreement(body, observed, frame, params.frame(row)) for row, frame in enumerate(frames)]
-    bound = _LOST * wrong[frames.index(at)] + _LOST_LEAST
+    bound = 1.25 * wrong[frames.index(at)] + 0.03
     lost = [frame for frame, share in zip(frames, wrong, strict=True) if share > bound]
     if not lost:
         return ()
@@ -121,9 +126,9 @@ def lost_frames(body: BodyModel, observed: Observations, params: BodyParams, *, 
 
 
 def disagreement(body: BodyModel, observed: Observations, frame: int, params: BodyParams) -> float:
-    """Share of pixels, of all masks of a frame, that a body and the person do not both cover; 0 without masks.
+    """Return the number of pixels that either a body or the mask covers but not both, over the masks' size; else 0.
 
-    Clothes make it large for any body, and less so for the right one.
+    Clothes make it large for every body, but least for the right one. Views are compared at about 240 rows.
     """
     if observed.mask is None:
         return 0.0
@@ -133,7 +138,7 @@ def disagreement(body: BodyModel, observed: Observations, frame: int, params: Bo
         mask = observed.mask(name, frame)
         if mask is None:
             continue
-        step = max(1, camera.height // _COMPARED_HEIGHT)
+        step = max(1, camera.height // 240)
         small = camera.resized(camera.width // step, camera.height // step)
         drawn = rasterize_mesh(mesh, small, threads=1).face_id >= 0
         person = mask[step // 2 :: step, step // 2 :: step][: small.height, : small.width] > 127

@@ -1,13 +1,14 @@
-"""Points of a posed body and how they move with every parameter, in closed form.
+"""Pose points of a body by linear blend skinning and differentiate them by every parameter, in closed form.
 
-A joint j turned by a small rotation vector d (in its parent's posed frame, `R_j <- exp(d) R_j`) moves every point that
-hangs on it about the posed joint p_j:
+A small rotation vector d of joint j (in its parent's posed frame, `R_j <- exp(d) R_j`) moves every point that is
+skinned to j or to a descendant of j about the posed joint p_j:
 
     dx_i = sum_{k in descendants(j)} w_ik (P_j d) x (G_k x_i - p_j) = -[A_ij - W_ij p_j]_x P_j d
 
-with P_j the parent's posed rotation, `A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j,
-itself among them. Shape moves the rest points and the joints; the change of pose correctives with the pose is left out
-of the derivative (they are millimetres), not of the points.
+with P_j the posed rotation of the parent, G_k the transform of joint k, w_ik the skinning weights,
+`A_ij = sum_k w_ik G_k x_i` and `W_ij = sum_k w_ik` over the descendants of j, which include j. The shape moves the rest
+points and the joints. The derivative of the pose correctives by the pose is neglected because they are millimetres; the
+points themselves contain them.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from smplxpp.skinning.linear_blend import forward_kinematics
 
 @dataclass(frozen=True, eq=False)
 class BodyState:
-    """A body in T frames; one shape.
+    """Pose, translation and expression of a body in T frames, and its one shape.
 
     Attributes:
-        rotations: of each joint relative to its parent's frame. transl: metres.
-        betas: shape. expression: of each frame.
+        rotations: of each joint, relative to its parent's frame.
+        transl: metres.
+        betas: coefficients of the shape.
+        expression: coefficients of the expression of each frame.
     """
 
     rotations: Float64[np.ndarray, "T J 3 3"]
@@ -42,12 +45,12 @@ class BodyState:
         return len(self.rotations)
 
     def select(self, rows: slice | Integer[np.ndarray, " n"]) -> BodyState:
-        """Some of the frames."""
+        """Return the state of some of the frames."""
         return replace(self, rotations=self.rotations[rows], transl=self.transl[rows], expression=self.expression[rows])
 
     @staticmethod
     def of_params(body: BodyModel, params: BodyParams) -> BodyState:
-        """The state of parameters; their mean shape, padded or cut to the body's number of coefficients."""
+        """Convert parameters; the shape is their mean, padded or cut to the body's number of coefficients."""
         return BodyState(
             rotations=body.joint_rotations(params),
             transl=params.transl.copy(),
@@ -56,7 +59,8 @@ class BodyState:
         )
 
     def to_params(self, body: BodyModel, *, fps: float | None = None) -> BodyParams:
-        """The same as parameters, hands complete."""
+        """Convert to parameters, whose hand poses are relative to flat hands."""
+        # The full pose has the blocks of `POSE_BLOCKS` in order; those that the body does not have stay zero.
         vectors = rotvec_from_matrix(self.rotations)
         pose = np.zeros((len(self), sum(joints for _, joints in POSE_BLOCKS), 3))
         names, start = [name for name, _ in POSE_BLOCKS], np.cumsum([0] + [joints for _, joints in POSE_BLOCKS])
@@ -77,11 +81,14 @@ class BodyState:
 
 @dataclass(frozen=True, eq=False)
 class BodyPoints:
-    """N points that a body carries.
+    """N points that move with a body by linear blend skinning.
 
     Attributes:
-        rest: on the mean shape, metres. weights: skinning weights.
-        shape_dirs, expression_dirs: metres a unit. pose_dirs: pose correctives, None without.
+        rest: positions on the mean shape at rest, metres.
+        shape_dirs: derivatives by betas, metres.
+        expression_dirs: derivatives by the coefficients of the expression, metres.
+        weights: skinning weights.
+        pose_dirs: pose correctives, metres; None if there are none.
     """
 
     rest: Float64[np.ndarray, "N 3"]
@@ -95,7 +102,7 @@ class BodyPoints:
 
     @staticmethod
     def of_vertices(body: BodyModel, index: Integer[np.ndarray, " N"]) -> BodyPoints:
-        """Vertices of a body."""
+        """Take some of a body's vertices as points."""
         return BodyPoints(
             body.v_template[index],
             body.shapedirs[index],
@@ -106,7 +113,7 @@ class BodyPoints:
 
     @staticmethod
     def of_joints(body: BodyModel, index: Integer[np.ndarray, " N"]) -> BodyPoints:
-        """Joints of a body: each hangs on its parent, the root on itself."""
+        """Take some of a body's joints as points; each is skinned to its parent, the root to itself."""
         carrier = np.where(body.parents[index] < 0, index, body.parents[index])
         regressor = body.joint_regressor[index]
         return BodyPoints(
@@ -118,7 +125,7 @@ class BodyPoints:
 
     @staticmethod
     def joined(parts: list[BodyPoints]) -> BodyPoints:
-        """Several one after the other; pose correctives of parts without are zero."""
+        """Concatenate sets of points; the pose correctives of sets without any are zero."""
         have = [part.pose_dirs for part in parts if part.pose_dirs is not None]
         width = have[0].shape[2] if have else 0
         dirs = [np.zeros((len(p), 3, width)) if p.pose_dirs is None else p.pose_dirs for p in parts]
@@ -131,7 +138,7 @@ class BodyPoints:
         )
 
     def select(self, rows: Integer[np.ndarray, " n"] | Bool[np.ndarray, " N"]) -> BodyPoints:
-        """Some of the points, in any order."""
+        """Return some of the points, in the given order."""
         return BodyPoints(
             self.rest[rows],
             self.shape_dirs[rows],
@@ -141,7 +148,7 @@ class BodyPoints:
         )
 
     def mixed(self, index: Integer[np.ndarray, "M C"], weight: Float[np.ndarray, "M C"]) -> BodyPoints:
-        """M points between C near ones each (corners of a face): all that they have is blended."""
+        """Interpolate M points between C points each, such as the corners of a face, with all their attributes."""
 
         def blend(values: np.ndarray) -> np.ndarray:
             return np.einsum("mc,mc...->m...", weight, values[index])
@@ -157,17 +164,22 @@ class BodyPoints:
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """One frame of a state, its skeleton posed.
+    """The posed skeleton of one frame.
 
     Attributes:
-        turned: rotations of the joints in the world. joints: posed. transforms: posed from rest.
-        parent_turned: rotation of each joint's parent, the identity at the root.
+        rotations: of the joints, in world coordinates.
+        joints: positions of the joints, metres.
+        transforms: of the joints, from rest to posed.
+        parent_rotations: of each joint's parent in world coordinates, the identity for the root.
+        betas: coefficients of the shape.
+        expression: coefficients of the expression.
+        pose_feature: input of the pose correctives, `R_j - I` of all joints but the root.
     """
 
-    turned: Float64[np.ndarray, "J 3 3"]
+    rotations: Float64[np.ndarray, "J 3 3"]
     joints: Float64[np.ndarray, "J 3"]
     transforms: Float64[np.ndarray, "J 4 4"]
-    parent_turned: Float64[np.ndarray, "J 3 3"]
+    parent_rotations: Float64[np.ndarray, "J 3 3"]
     betas: Float64[np.ndarray, " B"]
     expression: Float64[np.ndarray, " E"]
     pose_feature: Float64[np.ndarray, " P"]
@@ -175,11 +187,13 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class PointsMotion:
-    """Points of one frame and their derivatives.
+    """Points of one frame with their derivatives; the derivative by the translation is the identity.
 
     Attributes:
-        points: world, metres. pose: by turns of each joint in its parent's frame, radians.
-        shape, expression: by a unit. The translation's derivative is the identity.
+        points: in world coordinates, metres.
+        pose: derivatives by the rotation vector of each joint in its parent's frame, metres a radian.
+        shape: derivatives by betas, metres.
+        expression: derivatives by the coefficients of the expression, metres.
     """
 
     points: Float64[np.ndarray, "N 3"]
@@ -189,10 +203,12 @@ class PointsMotion:
 
 
 class Kinematics:
-    """The skeleton of a body with what its derivatives need.
+    """Forward kinematics of a body of the SMPL family, with derivatives.
 
-    Args:
-        body: any of the SMPL family.
+    Attributes:
+        rest_joints: joints of the mean shape at rest, metres.
+        joint_dirs: derivatives of the joints at rest by betas, metres.
+        descends_from: whether joint (row) is joint (column) or a descendant of it.
     """
 
     def __init__(self, body: BodyModel) -> None:
@@ -200,48 +216,50 @@ class Kinematics:
         self.rest_joints = body.joint_regressor @ body.v_template
         self.joint_dirs = np.einsum("jv,vxb->jxb", body.joint_regressor, body.shapedirs)
         count = body.joint_count
-        hangs_on = np.eye(count, dtype=bool)
-        for joint in range(count):  # whether a joint hangs on another
+        descends_from = np.eye(count, dtype=bool)
+        for joint in range(count):
             above = joint
             while self.parents[above] >= 0:
                 above = int(self.parents[above])
-                hangs_on[joint, above] = True
-        self.hangs_on: Bool[np.ndarray, "J J"] = hangs_on
+                descends_from[joint, above] = True
+        self.descends_from: Bool[np.ndarray, "J J"] = descends_from
 
     def posture(self, state: BodyState, row: int) -> Posture:
-        """Pose the skeleton of one frame."""
+        """Pose the skeleton in one frame of a state."""
         rest = self.rest_joints + self.joint_dirs @ state.betas
         transforms, joints = forward_kinematics(rest, self.parents, state.rotations[row], transl=state.transl[row])
-        turned = transforms[:, :3, :3]
-        parent = np.where((self.parents < 0)[:, None, None], np.eye(3), turned[np.maximum(self.parents, 0)])
+        rotations = transforms[:, :3, :3]
+        parent = np.where((self.parents < 0)[:, None, None], np.eye(3), rotations[np.maximum(self.parents, 0)])
         feature = (state.rotations[row, 1:] - np.eye(3)).ravel()
-        return Posture(turned, joints, transforms, parent, state.betas, state.expression[row], feature)
+        return Posture(rotations, joints, transforms, parent, state.betas, state.expression[row], feature)
 
     def points(self, points: BodyPoints, posture: Posture) -> Float64[np.ndarray, "N 3"]:
-        """Pose points."""
+        """Return the posed positions of points, metres."""
         rest = self._rest(points, posture)
         flat = points.weights @ posture.transforms[:, :3].reshape(-1, 12)
         blended = flat.reshape(-1, 3, 4)
         return np.einsum("nxy,ny->nx", blended[..., :3], rest) + blended[..., 3]
 
     def motion(self, points: BodyPoints, posture: Posture) -> PointsMotion:
-        """Pose points, with derivatives."""
+        """Return the posed positions of points and their derivatives by all parameters."""
         count = len(self.parents)
         rest = self._rest(points, posture)
-        # Where each joint alone would take each point, weighted; then summed over all that hangs on a joint.
-        moved = rest @ posture.turned.transpose(0, 2, 1).transpose(1, 0, 2).reshape(3, -1)
+        # w_ik G_k x_i for each point i and joint k; the sum over k is the skinned point.
+        moved = rest @ posture.rotations.transpose(0, 2, 1).transpose(1, 0, 2).reshape(3, -1)
         moved = (moved.reshape(-1, count, 3) + posture.transforms[:, :3, 3]) * points.weights[..., None]
-        hanging = self.hangs_on.astype(np.float64)
-        arm = np.einsum("nkx,kj->njx", moved, hanging, optimize=True)
-        arm -= (points.weights @ hanging)[..., None] * posture.joints
-        # -[a]_x P, column by column: P_c x a.
-        px, py, pz = posture.parent_turned.transpose(1, 0, 2)[:, None]  # each (1, J, axis)
+        # A_ij - W_ij p_j: sums over the descendants of j, the lever arm of a rotation about p_j.
+        descends = self.descends_from.astype(np.float64)
+        arm = np.einsum("nkx,kj->njx", moved, descends, optimize=True)
+        arm -= (points.weights @ descends)[..., None] * posture.joints
+        # -[a]_x P: its column c is the cross product of column c of P with the arm a.
+        px, py, pz = posture.parent_rotations.transpose(1, 0, 2)[:, None]  # each (1, J, axis)
         ax, ay, az = (arm[..., k, None] for k in range(3))
         pose = np.empty((len(arm), 3, count, 3))
         np.subtract(py * az, pz * ay, out=pose[:, 0])
         np.subtract(pz * ax, px * az, out=pose[:, 1])
         np.subtract(px * ay, py * ax, out=pose[:, 2])
-        blended = (points.weights @ posture.turned.reshape(count, 9)).reshape(-1, 3, 3)
+        # The shape moves the rest point, which the blended rotation carries along, and the transforms of the joints.
+        blended = (points.weights @ posture.rotations.reshape(count, 9)).reshape(-1, 3, 3)
         shape = blended @ points.shape_dirs
         shape += np.einsum("nk,kxb->nxb", points.weights, self._joint_shape(posture), optimize=True)
         return PointsMotion(
@@ -254,14 +272,14 @@ class Kinematics:
     def updated(
         self,
         state: BodyState,
-        turns: Float64[np.ndarray, "T J 3"],
+        rotvecs: Float64[np.ndarray, "T J 3"],
         transl: Float64[np.ndarray, "T 3"],
         betas: Float64[np.ndarray, " B"],
         expression: Float64[np.ndarray, "T E"],
     ) -> BodyState:
-        """The state after small steps, `R_j <- exp(d_j) R_j`."""
+        """Return the state after an update, in which the rotation of joint j becomes `exp(d_j) R_j`."""
         return BodyState(
-            matrix_from_rotvec(turns) @ state.rotations,
+            matrix_from_rotvec(rotvecs) @ state.rotations,
             state.transl + transl,
             state.betas + betas,
             state.expression + expression,
@@ -272,7 +290,8 @@ class Kinematics:
         return rest if points.pose_dirs is None else rest + points.pose_dirs @ posture.pose_feature
 
     def _joint_shape(self, posture: Posture) -> Float64[np.ndarray, "J 3 B"]:
-        """How a joint's transform moves with the shape, `dp_j - R_j dJ_j`."""
+        """Return the derivative of each transform's translation by betas, `dp_j - R_j dJ_j`."""
+        # dp_j, from the root outwards: a posed joint moves with its parent and with their rotated offset.
         moved = np.zeros_like(self.joint_dirs)
         for level in _order(self.parents):
             parent = self.parents[level]
@@ -280,12 +299,12 @@ class Kinematics:
                 moved[level] = self.joint_dirs[level]
             else:
                 offset = self.joint_dirs[level] - self.joint_dirs[parent]
-                moved[level] = moved[parent] + posture.turned[parent] @ offset
-        return moved - posture.turned @ self.joint_dirs
+                moved[level] = moved[parent] + posture.rotations[parent] @ offset
+        return moved - posture.rotations @ self.joint_dirs
 
 
 def _order(parents: np.ndarray) -> list[int]:
-    """Joints, parents before children."""
+    """Return the joints ordered so that parents come before children."""
     depth = np.zeros(len(parents), dtype=int)
     for joint in range(len(parents)):
         above = joint

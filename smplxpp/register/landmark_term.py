@@ -1,4 +1,9 @@
-"""Points of the body that are known in space, as those placed by hand on a scan: residuals in metres."""
+"""Add points of the body that are known in space, such as landmarks placed by hand on a scan, as residuals in metres.
+
+The term of a frame is `sum_k GM(|x_k - p_k|; 3 s_k) / s_k^2` over landmarks k, with the body's point x_k, the placed
+point p_k, and GM the kernel of Geman and McClure. The standard deviation s_k of a point inside a limb is three times
+that of a point on the skin, because a joint's centre cannot be seen.
+"""
 
 from __future__ import annotations
 
@@ -9,44 +14,34 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.register.keypoint_faults import other_side
-from smplxpp.register.keypoint_term import carried_points
+from smplxpp.register.keypoint_faults import other_side, sides_are_exchanged
 from smplxpp.register.kinematics import Kinematics, Posture
-from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.normal_equations import NormalEquations
-from smplxpp.register.robust import geman_mcclure
-from smplxpp.register.sides import sides_are_exchanged
-
-# Beyond this many deviations a landmark counts less and less (Geman and McClure).
-_CUTOFF = 3.0
-# Nobody sees a joint's centre: within a limb a hand is so many times less sure than on the skin.
-_WITHIN = 3.0
-# Metres: a landmark that the body keeps farther away than this, and than so many deviations, is named.
-_FAR, _FAR_DEVIATIONS = 0.03, 3.0
+from smplxpp.register.landmarks import LandmarkModel, LandmarkPoints
+from smplxpp.register.normal_equations import NormalEquations, geman_mcclure
 
 PlacedPoints = Mapping[int, Mapping[str, Float[np.ndarray, " 3"]]]
-"""Points by frame and name."""
+"""Points in world coordinates, metres, by frame and name."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedLandmarks:
-    """Landmarks of T frames as a table.
+    """A table of the landmarks that were placed in T frames.
 
     Attributes:
-        landmarks: what the names are on the body.
-        points: world, metres; NaN where a frame has none.
-        problems: what was wrong with them, in words.
+        landmarks: the named points of the body.
+        points: in world coordinates, metres; NaN where a frame has none.
+        notes: sentences about faults and what was done about them.
     """
 
     landmarks: LandmarkModel
     points: Float64[np.ndarray, "T K 3"]
-    problems: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def of(body: BodyModel, placed: PlacedPoints, frames: Sequence[int]) -> PlacedLandmarks | None:
-        """Those of the frames that the body has; None without any.
+        """Collect the landmarks that the body has; None if there are none.
 
-        Where feet or face would point backwards, left and right were taken for each other, and are exchanged back.
+        Left and right are exchanged back where feet or face would point backwards.
         """
         found = PlacedLandmarks._table(body, placed, frames)
         if found is None or not sides_are_exchanged(found.landmarks.names, found.points):
@@ -54,20 +49,20 @@ class PlacedLandmarks:
         turned = {frame: {other_side(name): point for name, point in one.items()} for frame, one in placed.items()}
         mended = PlacedLandmarks._table(body, turned, frames)
         assert mended is not None  # a body has both sides of what it has
-        words = (
+        note = (
             "left and right of the landmarks are exchanged: feet or face would point backwards; exchanged back "
             "(left is the person's left)"
         )
-        return PlacedLandmarks(mended.landmarks, mended.points, (*mended.problems, words))
+        return PlacedLandmarks(mended.landmarks, mended.points, (*mended.notes, note))
 
     @staticmethod
     def _table(body: BodyModel, placed: PlacedPoints, frames: Sequence[int]) -> PlacedLandmarks | None:
         asked = tuple(dict.fromkeys(name for frame in frames for name in placed.get(frame, {})))
         landmarks = LandmarkModel.of(body, asked)
-        problems: tuple[str, ...] = ()
+        notes: tuple[str, ...] = ()
         if landmarks.unknown:
             shown = ", ".join(landmarks.unknown[:8]) + (", ..." if len(landmarks.unknown) > 8 else "")
-            problems = (f"landmarks that the body {body.name!r} does not have are left out: {shown}",)
+            notes = (f"landmarks that the body {body.name!r} does not have are left out: {shown}",)
         if not landmarks.names:
             return None
         points = np.full((len(frames), len(landmarks.names), 3), np.nan)
@@ -75,49 +70,51 @@ class PlacedLandmarks:
             for k, name in enumerate(landmarks.names):
                 if name in placed.get(frame, {}):
                     points[row, k] = placed[frame][name]
-        return PlacedLandmarks(landmarks, points, problems)
+        return PlacedLandmarks(landmarks, points, notes)
 
     def of_rows(self, rows: np.ndarray) -> PlacedLandmarks:
-        """Those of some of the frames."""
-        return PlacedLandmarks(self.landmarks, self.points[rows], self.problems)
+        """Return the landmarks of some of the frames."""
+        return PlacedLandmarks(self.landmarks, self.points[rows], self.notes)
 
 
 class LandmarkTerm:
-    """`sum_k w |x_k - p_k|^2 / s_k^2`, robust; s is three times as large for what lies within a limb.
+    """Distances of landmarks; see the module's docstring.
 
     Args:
-        placed: of the frames of the registration.
+        body: the body model.
+        placed: landmarks of the frames of the registration.
         sigma: standard deviation of a landmark on the skin, metres.
     """
 
+    cutoff = 3.0
+    """Standard deviations at which the robust weight is a quarter, and beyond which a landmark is reported."""
+
     def __init__(self, body: BodyModel, placed: PlacedLandmarks, sigma: float) -> None:
         self.names, self.points = placed.landmarks.names, placed.points
-        self.carried, self.mixing = carried_points(body, placed.landmarks)
+        self.landmarks = LandmarkPoints.of(body, placed.landmarks)
         within = (placed.landmarks.joint_index >= 0) | [name.startswith("coco_") for name in self.names]
-        self.sigma = sigma * np.where(within, _WITHIN, 1.0)
+        self.sigma = sigma * np.where(within, 3.0, 1.0)
         self.scale = 1.0
 
     def add(
         self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
     ) -> None:
-        """Add the landmarks of a frame."""
+        """Add the landmarks of one frame to the normal equations."""
         there = np.flatnonzero(np.isfinite(self.points[row]).all(axis=1))
         if not len(there):
             return
-        motion = kinematics.motion(self.carried, posture)
-        residual = (self.mixing @ motion.points)[there] - self.points[row, there]
+        motion, points = self.landmarks.motion(kinematics, posture)
+        residual = points[there] - self.points[row, there]
         sigma = self.scale * self.sigma[there]
-        weight = np.sqrt(geman_mcclure(np.linalg.norm(residual, axis=1), _CUTOFF * sigma)) / sigma
-        jacobian = equations.columns.jacobian(motion)
-        rows = np.asarray(self.mixing @ jacobian.reshape(len(jacobian), -1)).reshape(-1, *jacobian.shape[1:])[there]
-        scaled = weight[:, None, None] * rows
+        weight = np.sqrt(geman_mcclure(np.linalg.norm(residual, axis=1), self.cutoff * sigma)) / sigma
+        scaled = weight[:, None, None] * self.landmarks.combined(equations.columns.jacobian(motion))[there]
         equations.add(row, scaled.reshape(-1, scaled.shape[-1]), (weight[:, None] * residual).reshape(-1), shape=shape)
 
     def distances(self, row: int, kinematics: Kinematics, posture: Posture) -> Float64[np.ndarray, " K"]:
-        """How far the body's points are from those of a frame, metres; NaN where it has none."""
-        return np.linalg.norm(self.mixing @ kinematics.points(self.carried, posture) - self.points[row], axis=1)
+        """Return the distances of the body's points to the landmarks of a frame, metres; NaN where it has none."""
+        return np.linalg.norm(self.landmarks.points(kinematics, posture) - self.points[row], axis=1)
 
     def far(self, distances: Float64[np.ndarray, " K"]) -> list[str]:
-        """The names, with their distances, of landmarks that the body did not come to."""
-        far = np.flatnonzero(distances > np.maximum(_FAR, _FAR_DEVIATIONS * self.sigma))
+        """Return names and distances of landmarks that the body misses by over 3 cm and over three deviations."""
+        far = np.flatnonzero(distances > np.maximum(0.03, self.cutoff * self.sigma))
         return [f"{self.names[k]} ({1e3 * distances[k]:.0f} mm)" for k in far]

@@ -1,12 +1,16 @@
-"""The normal equations of a sequence: a dense block a frame, smoothness between frames, one shape for all.
+"""Accumulate and solve the normal equations of a sequence: a dense block a frame, smoothness, one shared shape.
 
-Unknowns of a frame are the turns of its free joints, its translation and, where it is free, its expression; those of
-the shape come last and are shared. `H x = -g` with
+One Gauss-Newton step minimises `sum_i |r_i + J_i x|^2` over the update x of all unknowns, where residuals r and
+Jacobians J are already divided by their standard deviations and multiplied by the root of their robust weights
+(iteratively reweighted least squares). The unknowns of a frame are rotation vectors of its free joints, its translation
+and, where it is free, its expression; the shape is shared by all frames and comes last. The equations `H x = -g` have
 
-    H = [ D + S    C ]      D block-diagonal, S the smoothness (it couples a column of one frame with the same column of
-        [   C^T    B ]      the two next ones alone, so that D + S is banded), C and B from the shape.
+    H = [ D + S    C ]      D block-diagonal (one block a frame), S the second differences of the smoothness term,
+        [   C^T    B ]      C the coupling of frames and shape, B the shape alone.
 
-It is solved by a banded Cholesky factorisation and the Schur complement of the shape.
+S couples an unknown only with the same unknown of the next two frames, so that D + S is banded. The system is solved
+by a banded Cholesky factorisation of D + S and the Schur complement `B - C^T (D + S)^-1 C` of the shape, in
+O(T P^3) for T frames of P unknowns.
 """
 
 from __future__ import annotations
@@ -22,12 +26,14 @@ from smplxpp.register.kinematics import PointsMotion
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Which unknowns a frame has, in which order: turns, translation, expression.
+    """The order of a frame's unknowns: rotation vectors of joints, translation, expression.
 
     Attributes:
-        joints: those that turn. joint_count: of the body.
-        expressions: how many coefficients are free: all of the body's or none. expression_count: of the body.
-        betas: of the body.
+        joints: indices of the joints that are free to rotate.
+        joint_count: number of joints of the body.
+        expressions: number of free coefficients of the expression, all of the body's or none.
+        expression_count: number of coefficients of the expression that the body has.
+        betas: number of coefficients of the shape.
     """
 
     joints: Int64[np.ndarray, " n"]
@@ -38,21 +44,21 @@ class Columns:
 
     @property
     def count(self) -> int:
-        """Unknowns of a frame."""
+        """The number of unknowns of a frame."""
         return 3 * len(self.joints) + 3 + self.expressions
 
     @property
     def transl(self) -> slice:
-        """Of the translation."""
+        """The columns of the translation."""
         return slice(3 * len(self.joints), 3 * len(self.joints) + 3)
 
     @property
     def expression(self) -> slice:
-        """Of the expression."""
+        """The columns of the expression."""
         return slice(3 * len(self.joints) + 3, self.count)
 
     def jacobian(self, motion: PointsMotion) -> Float64[np.ndarray, "N 3 _"]:
-        """Derivatives of points by a frame's unknowns, then by the shape's."""
+        """Return the derivatives of points by a frame's unknowns, followed by those by the shape."""
         points = len(motion.points)
         parts = [
             motion.pose[:, :, self.joints].reshape(points, 3, -1),
@@ -65,25 +71,29 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a solution asks for.
+    """An update of all unknowns of T frames.
 
     Attributes:
-        turns: radians, zero for joints that do not turn. transl: metres.
+        rotvecs: rotation vectors, radians, in the frames of the joints' parents; zero for joints that are not free.
+        transl: metres.
+        betas: shared by all frames.
+        expression: coefficients.
     """
 
-    turns: Float64[np.ndarray, "T J 3"]
+    rotvecs: Float64[np.ndarray, "T J 3"]
     transl: Float64[np.ndarray, "T 3"]
     betas: Float64[np.ndarray, " B"]
     expression: Float64[np.ndarray, "T E"]
 
     def limited(self, *, angle: float, length: float) -> Step:
-        """No turn above `angle` radians and no move above `length` metres: a frame's step is shortened as a whole."""
-        turn = np.linalg.norm(self.turns, axis=2).max(axis=1)
+        """Return the step with each frame shortened until no joint rotates by more than `angle` radians and the body
+        moves by at most `length` metres; the shape is shortened as much as the most shortened frame."""
+        turn = np.linalg.norm(self.rotvecs, axis=2).max(axis=1)
         move = np.linalg.norm(self.transl, axis=1)
         share = 1.0 / np.maximum(1.0, np.maximum(turn / angle, move / length))
         least = share.min()
         return Step(
-            self.turns * share[:, None, None],
+            self.rotvecs * share[:, None, None],
             self.transl * share[:, None],
             self.betas * least,
             self.expression * share[:, None],
@@ -91,10 +101,11 @@ class Step:
 
 
 class NormalEquations:
-    """Sums of squares of T frames, added row by row.
+    """The matrix and gradient of a sum of squares over T frames, to which terms are added row by row.
 
     Args:
-        columns: the unknowns. frames: T.
+        columns: order of the unknowns.
+        frames: their number T.
     """
 
     def __init__(self, columns: Columns, frames: int) -> None:
@@ -103,16 +114,16 @@ class NormalEquations:
         self.blocks, self.gradient = np.zeros((frames, P, P)), np.zeros((frames, P))
         self.shape_blocks = np.zeros((frames, P, B))
         self.shape, self.shape_gradient = np.zeros((B, B)), np.zeros(B)
-        # Smoothness: the coupling of column c at t with itself at t, t + 1, t + 2.
+        # The band of S: how unknown c of frame t is coupled with itself in frames t, t + 1 and t + 2.
         self.smooth = np.zeros((3, frames, P))
 
     def add(
         self, frame: int, rows: Float[np.ndarray, "M _"], residuals: Float[np.ndarray, " M"], *, shape: bool = True
     ) -> None:
-        """Add `|residuals + rows x|^2`; the rows are weighted already and end with the shape's columns.
+        """Add `|residuals + rows x|^2`, whose rows are already weighted and end with the columns of the shape.
 
         Args:
-            shape: whether the frame may tell the shape; else its shape columns are left out.
+            shape: whether the term may change the shape; else the columns of the shape are ignored.
         """
         P = self.columns.count
         self.gradient[frame] += rows[:, :P].T @ residuals
@@ -125,7 +136,7 @@ class NormalEquations:
     def add_smoothness(
         self, first: int, weight: Float[np.ndarray, " P"], second_difference: Float[np.ndarray, " P"]
     ) -> None:
-        """Add `w |a + x_{t} - 2 x_{t+1} + x_{t+2}|^2` for each column, t = `first`."""
+        """Add `w |a + x_t - 2 x_{t+1} + x_{t+2}|^2` for each unknown, with t = `first` and a its present value."""
         kernel = (1.0, -2.0, 1.0)
         for k, value in enumerate(kernel):
             self.gradient[first + k] += value * weight * second_difference
@@ -133,14 +144,16 @@ class NormalEquations:
                 self.smooth[later - k, first + k] += value * kernel[later] * weight
 
     def solve(self, *, damping: float, solve_shape: bool) -> Step:
-        """Solve for the step; `damping` is added to the diagonal, relative to it and, a little, absolutely."""
+        """Solve `(H + damping (diag H + 1)) x = -g` for the step (Levenberg-Marquardt with fixed damping)."""
         P, T, B = self.columns.count, self.frames, self.columns.betas
+        # D + diag S, damped: relative to the diagonal, and absolutely so that unobserved unknowns stay where they are.
         blocks = self.blocks.copy()
         diagonal = np.einsum("tpp->tp", blocks)
         diagonal += self.smooth[0]
         diagonal += damping * (diagonal + 1.0)
+        # Lower banded storage, banded[i - j, j]: blocks reach P - 1 below the diagonal, smoothness reaches 2 P.
         width = 2 * P if T > 1 else P - 1
-        banded = np.zeros((width + 1, T * P))  # lower form: banded[i - j, j]
+        banded = np.zeros((width + 1, T * P))
         view = banded.reshape(width + 1, T, P)
         for column in range(P):
             view[: P - column, :, column] = blocks[:, column:, column].T
@@ -151,24 +164,37 @@ class NormalEquations:
         if not solve_shape:
             x = -cho_solve_banded((factor, True), self.gradient.reshape(-1), check_finite=False).reshape(T, P)
             return self._step(x, np.zeros(B))
+        # Eliminate the frames: (D + S)^-1 applied to the gradient and to C leaves a small system of the shape alone.
         right = np.concatenate([self.gradient.reshape(-1, 1), self.shape_blocks.reshape(T * P, B)], axis=1)
         solved = cho_solve_banded((factor, True), right, check_finite=False)
         coupling = self.shape_blocks.reshape(T * P, B)
         schur = self.shape + damping * np.diag(np.diag(self.shape) + 1.0) - coupling.T @ solved[:, 1:]
         reduced = self.shape_gradient - coupling.T @ solved[:, 0]
         betas = -cho_solve((cholesky(schur, lower=True), True), reduced)
+        # Back-substitute the shape into the frames.
         x = -solved[:, 0] - solved[:, 1:] @ betas
         return self._step(x.reshape(T, P), betas)
 
     def covariance(self, frame: int) -> Float64[np.ndarray, "P P"]:
-        """Of a frame's unknowns with everything else held: the inverse of its block."""
+        """Return the covariance of a frame's unknowns with all others held fixed, which is the inverse of its block."""
         block = self.blocks[frame] + np.diag(self.smooth[0, frame] + 1e-9)
         return np.linalg.inv(block)
 
     def _step(self, x: np.ndarray, betas: np.ndarray) -> Step:
         c = self.columns
-        turns = np.zeros((self.frames, c.joint_count, 3))
-        turns[:, c.joints] = x[:, : 3 * len(c.joints)].reshape(self.frames, -1, 3)
+        rotvecs = np.zeros((self.frames, c.joint_count, 3))
+        rotvecs[:, c.joints] = x[:, : 3 * len(c.joints)].reshape(self.frames, -1, 3)
         expression = np.zeros((self.frames, c.expression_count))
         expression[:, : c.expressions] = x[:, c.expression]
-        return Step(turns, x[:, c.transl], betas, expression)
+        return Step(rotvecs, x[:, c.transl], betas, expression)
+
+
+def geman_mcclure(
+    residual: Float[np.ndarray, " N"], cutoff: Float[np.ndarray, " N"] | float
+) -> Float64[np.ndarray, " N"]:
+    """Return the weights of iteratively reweighted least squares for the kernel of Geman and McClure.
+
+    The kernel `r^2 / (1 + (r / c)^2)` has the weight `1 / (1 + (r / c)^2)^2`, which is 1 near 0, a quarter at the
+    cutoff c, and 1 everywhere for c = inf.
+    """
+    return 1.0 / (1.0 + (residual / cutoff) ** 2) ** 2

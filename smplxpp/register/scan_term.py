@@ -1,4 +1,18 @@
-"""Scans: bare skin attracts both ways, what covers it stays outside, as far from it as it always is."""
+"""Compare scans with the body: skin attracts in both directions, cloth stays outside at its estimated gap.
+
+For a point p of a scan let d be its signed distance to the body (negative inside) along the body's normal. The
+residuals and robust weights (GM is the weight of Geman and McClure, s the standard deviation of a scan) are
+
+    skin of the scan         d            GM(d; reach) / s^2
+    inside the body          d            GM(d; 3 reach) / s^2                    any label but skin
+    cloth outside            d - gap      cloth_share GM(d - gap; 2.5 w) / w^2    w^2 = spread^2 + s^2
+    bare vertex v of a body  n . (v - p)  GM(n . (v - p); reach) / s^2            p the nearest skin of the scan, normal
+    n
+
+The gap and its spread are estimated for every pair of label and limb (`Gaps`), after every step. Points count only
+where scan and body face alike. The weights are divided so that a scan counts as at most 1000 independent points,
+because the errors of its neighbouring points are correlated.
+"""
 
 from __future__ import annotations
 
@@ -12,27 +26,27 @@ from scipy.spatial import cKDTree
 from smplxpp.core.labels import SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.gaps import Gaps
+from smplxpp.register.clothing import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
-from smplxpp.register.normal_equations import NormalEquations
-from smplxpp.register.observations import ScanObservation
-from smplxpp.register.robust import geman_mcclure
+from smplxpp.register.normal_equations import NormalEquations, geman_mcclure
+from smplxpp.register.observations import RegisterConfig, ScanObservation
 
-# Labels in groups: skin, unknown, and each thing that is worn.
-_UNKNOWN_GROUP, _GROUPS = 0, 16
-_LARGEST_GAP = 0.15
-_LEAST_SEEN = 20
-# A scan's point and the body's must face the same way for one to be the other: cosine.
+# Labels are grouped for their gaps: 0 is unknown, label k is group k + 1, and the last group takes all further labels.
+_GROUPS = 16
+# Cosine of the angle between the normals of scan and body, from which a point of one can correspond to the other.
 _FACING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSample:
-    """Points of one scan.
+    """Points drawn from one scan.
 
     Attributes:
-        points, normals: world. labels: ids, negative where not known. skin: a tree of those that are skin.
+        points: in world coordinates, metres.
+        normals: unit vectors.
+        labels: ids, negative where unknown.
+        skin: a search tree of the points that are skin; None if there are none.
+        skin_index: indices of the points in that tree.
     """
 
     points: Float64[np.ndarray, "N 3"]
@@ -43,7 +57,7 @@ class ScanSample:
 
     @staticmethod
     def of(scan: ScanObservation, samples: int, seed: int) -> ScanSample:
-        """Vertices drawn by the area about them."""
+        """Draw vertices of a scan with probabilities in proportion to their area, without replacement."""
         mesh = scan.mesh
         area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas / 3, 3), minlength=mesh.vertex_count)
         rng = np.random.default_rng(seed)
@@ -58,15 +72,14 @@ class ScanSample:
 
 
 class ScanTerm:
-    """Signed distances between scans and the body, along normals, metres.
-
-    For a scan's point p with the body's closest point c, normal n and distance d (negative inside): skin, and the
-    body's bare vertices to their nearest skin of the scan: d = 0. All else: d >= 0, and d = gap of its label and limb,
-    as far as that gap's spread allows.
+    """Signed distances between scans and the body, metres; see the module's docstring.
 
     Args:
-        body_points: all vertices of the body. bare: which of them are skin for sure.
+        kinematics: of the body.
+        body_points: all vertices of the body.
+        bare: vertices that are known to be bare skin.
         scans: by row of the registration.
+        config: standard deviations and cutoffs.
     """
 
     def __init__(
@@ -85,12 +98,12 @@ class ScanTerm:
         self.limb = np.argmax(self.body.weights, axis=1)
         self.gaps = Gaps.unknown(_GROUPS * self.body.joint_count)
         self.reach = self.first_reach = config.scan_reach_m
-        self._seen: list[tuple[np.ndarray, np.ndarray]] = []
+        self._distances: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(
         self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
     ) -> None:
-        """Add the scan of a frame, if it has one."""
+        """Add the scan of one frame, if there is one, to the normal equations."""
         if row not in self.samples:
             return
         index, weight_of, direction, residual, weight = self._residuals(row, kinematics, posture)
@@ -99,46 +112,43 @@ class ScanTerm:
         rows, root = np.einsum("nx,nxp->np", direction, jacobian, optimize=True), np.sqrt(weight)
         equations.add(row, rows * root[:, None], residual * root, shape=shape)
 
-    def learn(self) -> None:
-        """Take the gaps from what was seen since the last time."""
-        if self._seen:
-            place, distance = (np.concatenate(parts) for parts in zip(*self._seen, strict=True))
-            self.gaps = Gaps.learned(
-                place, distance, len(self.gaps.median), least=_LEAST_SEEN, tight=self.config.tight_m
-            )
-        self._seen = []
+    def estimate_gaps(self) -> None:
+        """Estimate the gaps from the distances of the last step; a place needs 20 of them."""
+        if self._distances:
+            place, distance = (np.concatenate(parts) for parts in zip(*self._distances, strict=True))
+            self.gaps = Gaps.estimated(place, distance, len(self.gaps.median), least=20, tight=self.config.tight_m)
+        self._distances = []
 
     def residual_mm(self, row: int, kinematics: Kinematics, posture: Posture) -> tuple[float, float]:
-        """Mean distance of the scan's skin to the body, and mean depth of all else within it; NaN without a scan."""
+        """Return mean distance of the scan's skin to the body and mean depth of the rest inside it; NaN for none."""
         if row not in self.samples:
             return float("nan"), float("nan")
         sample = self.samples[row]
-        field = self._field(kinematics, posture)
-        found = field.query(sample.points)
+        mesh = TriangleMesh(kinematics.points(self.body_points, posture), self.body.faces)
+        found = SignedDistanceField(mesh, solid=True).query(sample.points)
         skin = sample.labels == SKIN.id
         close = float(1e3 * np.abs(found.distance[skin]).mean()) if skin.any() else float("nan")
         inside = float(1e3 * np.maximum(-found.distance[~skin], 0).mean()) if (~skin).any() else float("nan")
         return close, inside
 
-    def _field(self, kinematics: Kinematics, posture: Posture) -> SignedDistanceField:
-        mesh = TriangleMesh(kinematics.points(self.body_points, posture), self.body.faces)
-        return SignedDistanceField(mesh, solid=True)
-
     def _residuals(self, row: int, kinematics: Kinematics, posture: Posture) -> tuple[np.ndarray, ...]:
+        """Return corners, barycentric weights, directions, residuals and weights of all point pairs of a frame."""
         sample, config = self.samples[row], self.config
-        vertices = kinematics.points(self.body_points, posture)
-        mesh = TriangleMesh(vertices, self.body.faces)
+        # Closest point of the body to every point of the scan, with the limb that it belongs to.
+        mesh = TriangleMesh(kinematics.points(self.body_points, posture), self.body.faces)
         found = SignedDistanceField(mesh, solid=True).query(sample.points)
         corners = self.body.faces[found.face]
         bary = barycentric_coordinates(found.closest, mesh.vertices[corners])
         limb = self.limb[corners[np.arange(len(corners)), np.argmax(bary, axis=1)]]
         facing = np.einsum("nx,nx->n", found.normal, sample.normals) > _FACING
         skin = sample.labels == SKIN.id
-        group = np.where(sample.labels < 0, _UNKNOWN_GROUP, np.minimum(sample.labels + 1, _GROUPS - 1))
+        # The gap that was estimated for this label on this limb.
+        group = np.where(sample.labels < 0, 0, np.minimum(sample.labels + 1, _GROUPS - 1))
         place = group * self.body.joint_count + limb
         d, gap, spread = found.distance, self.gaps.median[place], self.gaps.spread[place]
-        # Moving the body's point outwards lowers the distance: d(d) = -n . dx.
+        # Moving the body's point outwards lowers the distance: dd = -n . dx.
         direction = -found.gradient
+        # Robust weights of the three kinds; those of cloth vanish where no gap is known yet.
         sigma = config.scan_m
         of_skin = facing * geman_mcclure(d, self.reach) / sigma**2
         of_inside = geman_mcclure(d, 3 * self.reach) / sigma**2
@@ -147,8 +157,10 @@ class ScanTerm:
         inside = ~skin & (d < 0)
         residual = np.where(skin | inside, d, d - gap)
         weight = np.where(skin, of_skin, np.where(inside, of_inside, facing * of_gap))
-        learned = ~skin & facing & (d > -0.02) & (d < _LARGEST_GAP)
-        self._seen.append((place[learned], d[learned]))
+        # Distances from -2 cm to 15 cm enter the next estimate of the gaps; farther ones belong to other things.
+        usable = ~skin & facing & (d > -0.02) & (d < 0.15)
+        self._distances.append((place[usable], d[usable]))
+        # The reverse direction: bare vertices of the body to the scan.
         rows: list[tuple[np.ndarray, ...]] = [(corners, bary, direction, residual, weight / self._crowding(sample))]
         if sample.skin is not None and len(self.bare_index):
             rows.append(self._from_body(sample, mesh))
@@ -156,11 +168,11 @@ class ScanTerm:
         return corners, bary, direction, residual, weight
 
     def _crowding(self, sample: ScanSample) -> float:
-        """Neighbours on a scan err together: so many of them count as one."""
+        """Return how many points of the sample count as one, because the errors of neighbours are correlated."""
         return max(1.0, len(sample.points) / 1000.0)
 
     def _from_body(self, sample: ScanSample, mesh: TriangleMesh) -> tuple[np.ndarray, ...]:
-        """The body's bare vertices to the scan's nearest skin, along the scan's normal."""
+        """Return the same arrays for the body's bare vertices and the nearest skin of the scan, along its normal."""
         assert sample.skin is not None
         vertices, index = mesh.vertices[self.bare_index], self.bare_index
         distance, nearest = sample.skin.query(vertices, distance_upper_bound=self.reach)

@@ -1,4 +1,9 @@
-"""Gauss-Newton over a window of frames: all terms, one step after the other."""
+"""Minimise all terms of a window of frames by damped Gauss-Newton steps, and measure the result.
+
+Every step linearises the terms at the state, computes their robust weights there (iteratively reweighted least
+squares), and solves the normal equations with a fixed Levenberg-Marquardt damping of 1e-3. Steps are limited in length
+instead of being tested for descent. After a step the gaps between body and cloth are estimated again.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +14,25 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.register.keypoint_term import KeypointTerm
-from smplxpp.register.kinematics import BodyState, Kinematics
+from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
 from smplxpp.register.landmark_term import LandmarkTerm
 from smplxpp.register.normal_equations import Columns, NormalEquations
 from smplxpp.register.priors import Priors
 from smplxpp.register.scan_term import ScanTerm
 from smplxpp.register.silhouette_term import SilhouetteTerm
 
-_LARGEST_TURN, _LARGEST_MOVE = 0.35, 0.25
-_DAMPING = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """What the frames of a window are compared with; any may be missing.
+    """The terms of a window of frames; each kind of observation may be missing.
 
     Attributes:
-        tells_shape: frames that the shape is solved on.
+        priors: terms that need no observation.
+        tells_shape: whether a frame may change the shape.
+        keypoints: reprojection errors.
+        landmarks: distances of points in space.
+        silhouettes: distances to the contours of masks.
+        scans: distances to scans.
     """
 
     priors: Priors
@@ -36,12 +43,30 @@ class Terms:
     scans: ScanTerm | None = None
 
     def points(self) -> list[KeypointTerm | LandmarkTerm]:
-        """Those of named points, which come first."""
+        """Return the terms of named points, which are fitted first."""
         return [term for term in (self.keypoints, self.landmarks) if term is not None]
 
     def surfaces(self) -> list[SilhouetteTerm | ScanTerm]:
-        """Those that learn gaps."""
+        """Return the terms of surfaces, which estimate gaps."""
         return [term for term in (self.silhouettes, self.scans) if term is not None]
+
+    def residuals(self, kinematics: Kinematics, state: BodyState) -> dict[str, Float64[np.ndarray, " T"]]:
+        """Return the residuals of every kind of observation in each frame, in pixels or millimetres; NaN for none."""
+        postures = [kinematics.posture(state, row) for row in range(len(state))]
+        out: dict[str, np.ndarray] = {}
+        if self.keypoints is not None:
+            term = self.keypoints
+            out["keypoints_px"] = np.array([term.residual_px(r, kinematics, p) for r, p in enumerate(postures)])
+        if self.landmarks is not None:
+            away = np.array([self.landmarks.distances(r, kinematics, p) for r, p in enumerate(postures)])
+            out["landmarks_mm"] = 1e3 * np.array([np.median(d[d == d]) if (d == d).any() else np.nan for d in away])
+        if self.silhouettes is not None:
+            contours = self.silhouettes
+            out["silhouette_px"] = np.array([contours.residual_px(r, kinematics, p) for r, p in enumerate(postures)])
+        if self.scans is not None:
+            both = np.array([self.scans.residual_mm(r, kinematics, p) for r, p in enumerate(postures)])
+            out["skin_mm"], out["inside_mm"] = both[:, 0], both[:, 1]
+        return out
 
 
 def gauss_newton(
@@ -55,24 +80,32 @@ def gauss_newton(
     point_scales: Float64[np.ndarray, " n"] | None = None,
     step_done: Callable[[int], None] = lambda k: None,
 ) -> tuple[BodyState, NormalEquations]:
-    """Minimise the terms from a state.
+    """Minimise the terms, starting at a state.
 
     Args:
-        point_scales: by step, multiples of the named points' noise, falling to 1: what is far still pulls at first.
+        kinematics: of the body.
+        columns: order of the unknowns.
+        state: initial values.
+        terms: what is minimised.
+        steps: number of Gauss-Newton steps.
+        solve_shape: whether the shape is solved for; else it is held.
+        point_scales: for each step, the multiple of the noise of named points; values that fall to 1 widen the robust
+            kernel at first, so that far points still pull (graduated non-convexity).
+        step_done: called after each step with its index.
 
     Returns:
-        The state and the equations at its last step.
+        The state, and the normal equations of the last step.
     """
     equations = NormalEquations(columns, len(state))
     for k in range(steps):
         for named in terms.points():
             named.scale = 1.0 if point_scales is None else float(point_scales[k])
         equations = assemble(kinematics, columns, state, terms, solve_shape=solve_shape)
-        step = equations.solve(damping=_DAMPING, solve_shape=solve_shape)
-        step = step.limited(angle=_LARGEST_TURN, length=_LARGEST_MOVE)
-        state = kinematics.updated(state, step.turns, step.transl, step.betas, step.expression)
+        # Linearisation holds for some 20 degrees; longer steps are shortened.
+        step = equations.solve(damping=1e-3, solve_shape=solve_shape).limited(angle=0.35, length=0.25)
+        state = kinematics.updated(state, step.rotvecs, step.transl, step.betas, step.expression)
         for term in terms.surfaces():
-            term.learn()
+            term.estimate_gaps()
         step_done(k)
     return state, equations
 
@@ -80,7 +113,7 @@ def gauss_newton(
 def assemble(
     kinematics: Kinematics, columns: Columns, state: BodyState, terms: Terms, *, solve_shape: bool
 ) -> NormalEquations:
-    """The normal equations at a state."""
+    """Return the normal equations of all terms at a state."""
     equations = NormalEquations(columns, len(state))
     used = [*terms.points(), *terms.surfaces()]
     for row in range(len(state)):
@@ -89,3 +122,24 @@ def assemble(
             term.add(equations, row, kinematics, posture, shape=bool(terms.tells_shape[row]) and solve_shape)
     terms.priors.add(equations, state, shape=solve_shape)
     return equations
+
+
+def joint_confidence(
+    kinematics: Kinematics, state: BodyState, equations: NormalEquations, rows: np.ndarray
+) -> Float64[np.ndarray, "n J"]:
+    """Return the confidence of every joint's position in some frames, from 0 to 1.
+
+    The confidence is `1 / (1 + (s / 20 mm)^2)`, where `s^2 = trace(J C J^T)` is the variance of the joint's position, J
+    its Jacobian by the unknowns of the frame, and C their covariance with all other frames held.
+    """
+    body, columns = kinematics.body, equations.columns
+    half_known = 0.02  # metres: the standard deviation at which the confidence is 1/2
+    joints = BodyPoints.of_joints(body, np.arange(body.joint_count))
+    out = np.zeros((len(rows), body.joint_count))
+    for k, row in enumerate(rows):
+        motion = kinematics.motion(joints, kinematics.posture(state, int(row)))
+        jacobian = columns.jacobian(motion)[..., : columns.count]
+        covariance = equations.covariance(int(row))
+        variance = np.einsum("jxp,pq,jxq->j", jacobian, covariance, jacobian, optimize=True)
+        out[k] = 1.0 / (1.0 + np.maximum(variance, 0.0) / half_known**2)
+    return out

@@ -1,4 +1,11 @@
-"""Keypoints of several cameras to points in space, robustly, with what was wrong with them in words."""
+"""Triangulate keypoints of several cameras robustly, and note the faults that were found in them.
+
+1. Consensus: every pair of cameras proposes each point; the proposal with the least truncated cost wins (MSAC).
+2. Faults: exchanged sides, wrong calibrations and other people are found against the other cameras (from four cameras
+   on) and mended or dropped; the points are triangulated again after each.
+3. Refinement: Gauss-Newton on the reprojection errors with Cauchy weights, alternating with an estimate of each
+   camera's pixel noise, three times. The covariance of a point is the inverse of its normal matrix.
+"""
 
 from __future__ import annotations
 
@@ -17,29 +24,29 @@ from smplxpp.register.keypoint_faults import (
     find_camera_fault,
     find_other_people,
     find_swapped,
-    in_words,
     mirror_index,
+    number_ranges,
     pose_difference,
 )
 from smplxpp.register.multiview import Sightings, all_pairs, consensus, pixel_noise, refine, resection
 
-# With fewer cameras nobody can say which of them is wrong.
-_LEAST_TO_JUDGE = 4
+# Alternations of mending and triangulating, and of refining and estimating the noise; both settle within three.
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class TriangulationConfig:
-    """How points are triangulated.
+    """Options of a triangulation.
 
     Attributes:
-        threshold: pixels that a sighting may be off, as a share of the image's height.
-        threshold_metres: the same at the person's distance; the larger counts (a close-up shows errors larger).
-        least_confidence: of a sighting that counts.
-        least_degrees: between the rays of a pair of cameras that may propose a point.
-        most_pairs: of cameras that propose; beyond, so many of them at random.
+        threshold: largest reprojection error of an inlier, as a share of the image's height.
+        threshold_metres: the same in metres at the person's distance; the larger one counts, because a close-up
+            magnifies the errors of a detector.
+        least_confidence: confidence below which a sighting is ignored.
+        least_degrees: smallest angle between the rays of a pair of cameras that may propose a point.
+        most_pairs: number of pairs above which a random choice of this size proposes.
         seed: of that choice.
-        diagnose: look for swapped sides, other people and misplaced cameras, and mend or leave out what is found.
+        diagnose: whether to search for exchanged sides, other people and wrong calibrations.
     """
 
     threshold: float = 0.02
@@ -58,11 +65,13 @@ class TriangulationConfig:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """How far sightings are from the points' projections.
+    """Reprojection errors of some sightings.
 
     Attributes:
-        median_px, p95_px: over the inliers; NaN without any.
-        inliers, count: sightings that count, and all.
+        median_px: median over the inliers, pixels; NaN without any.
+        p95_px: 95 % quantile over the inliers.
+        inliers: number of inliers.
+        count: number of all sightings.
     """
 
     median_px: float
@@ -73,18 +82,22 @@ class Reprojection:
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Points in space.
+    """Triangulated points with their uncertainty.
 
     Attributes:
-        names, frames, cameras: of the tables' axes.
-        points: world, metres; NaN where fewer than two cameras agree, or fewer than a third of those that see it.
-        covariance: square metres, of the pixels' noise alone; NaN where the point is.
-        inliers: sightings that agree with the point.
+        names: of the K points.
+        frames: numbers of the F frames.
+        cameras: names of the C cameras.
+        points: in world coordinates, metres; NaN where fewer than two cameras, or fewer than a third of those that see
+            the point, agree.
+        covariance: of the points from the pixel noise alone, square metres; NaN where the point is.
+        inliers: whether a sighting agrees with the point.
         noise_px: standard deviation of a coordinate in each camera's pixels, estimated from the residuals.
-        by_camera, by_point: reprojection.
-        keypoints: what was used: sides swapped back, without the cameras that were left out and the views of others.
-        left_out: cameras that were.
-        problems: what was wrong and what was done about it.
+        by_camera: reprojection errors of each camera.
+        by_point: reprojection errors of each named point.
+        keypoints: the keypoints that were used, with mended sides, without dropped cameras and views.
+        left_out: names of the cameras that were dropped.
+        notes: sentences about the faults and what was done about them.
     """
 
     names: tuple[str, ...]
@@ -98,11 +111,11 @@ class Triangulation:
     by_point: Mapping[str, Reprojection]
     keypoints: Mapping[str, Keypoints2D]
     left_out: tuple[str, ...] = ()
-    problems: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def sigma(self) -> Float64[np.ndarray, "F K"]:
-        """Standard deviation of a coordinate, metres: the root of the covariance's mean diagonal."""
+        """The standard deviation of a coordinate, metres, which is the root of the covariance's mean diagonal."""
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 3.0)
 
 
@@ -114,40 +127,40 @@ def triangulate(
     frames: Sequence[int] | None = None,
     config: TriangulationConfig | None = None,
 ) -> Triangulation:
-    """Triangulate named points of all frames.
+    """Triangulate the named points of all frames.
 
-    Every point is proposed by pairs of cameras, the proposal that most cameras agree with is refined by least squares
-    of the reprojection. Then, from four cameras on, what contradicts the majority is looked for: views with left and
-    right exchanged (exchanged back), views of somebody else (left out), cameras that stand elsewhere than their
-    calibration says (named with the angle that resection against the others' points gives, and left out). Frames in
-    which fewer than two cameras see the person are named and have no points.
+    From four cameras on, faults are searched for: views with left and right exchanged are mended, views of another
+    person are dropped, and cameras with a wrong calibration are dropped and noted with the correction that resection
+    against the other cameras' points finds. Frames in which fewer than two cameras see the person have no points.
 
-    What all cameras agree on cannot be told from the truth: if every view has its sides exchanged, the points are those
-    of a mirrored person, and only a body that is fitted to them shows it.
+    A fault that all cameras share cannot be found: if every view has its sides exchanged, the result is a mirrored
+    person, and only a body that is fitted to it shows the fault.
 
     Args:
         keypoints: by camera, in the pixels of `cameras`.
-        cameras: by name; those without keypoints are not used.
-        names: of points; None: all that any camera has.
-        frames: None: all that any camera has.
-        config: see there.
+        cameras: by name; those without keypoints are ignored.
+        names: of the points; None for all that any camera has.
+        frames: numbers; None for all that any camera has.
+        config: options.
 
     Raises:
         InputError: keypoints of fewer than two cameras, or of a camera that is not given.
     """
     config = config or TriangulationConfig()
-    table, problems = _table(keypoints, cameras, names, frames, config)
-    table = _with_thresholds(table, _first(table, config), config)
-    table, points, told, left_out = (
-        _judged(table, config) if config.diagnose else (table, _first(table, config), [], [])
+    table, notes = _table(keypoints, cameras, names, frames, config)
+    # Consensus twice: its depths turn the threshold in metres into pixels, with which it is repeated.
+    table = _with_thresholds(table, _proposed(table, config), config)
+    table, points, faults, left_out = (
+        _mended(table, config) if config.diagnose else (table, _proposed(table, config), [], [])
     )
+    # Refinement and noise depend on each other, because the noise decides which sightings are inliers.
     s = table.sightings
     unit = _unit(table, cameras, config)
     for _ in range(_ROUNDS):
         refined, _, inliers = refine(s, points)
         s = replace(s, noise=pixel_noise(s, refined, inliers, unit=unit))
     points, covariance, inliers = refine(s, points)
-    return _result(replace(table, sightings=s), points, covariance, inliers, left_out, [*problems, *told])
+    return _result(replace(table, sightings=s), points, covariance, inliers, left_out, [*notes, *faults])
 
 
 def _table(
@@ -157,6 +170,7 @@ def _table(
     frames: Sequence[int] | None,
     config: TriangulationConfig,
 ) -> tuple[Table, list[str]]:
+    """Arrange the sightings as a table, with notes about frames that fewer than two cameras see."""
     unknown = sorted(set(keypoints) - set(cameras))
     used = tuple(name for name in cameras if name in keypoints)
     if unknown or len(used) < 2:
@@ -169,6 +183,7 @@ def _table(
         names = tuple(dict.fromkeys(name for camera in used for name in keypoints[camera].names))
     if frames is None:
         frames = sorted({int(frame) for camera in used for frame in keypoints[camera].frames})
+    # Arrays over cameras, frames and points; weights below the least confidence are 0.
     chosen = [keypoints[camera].select(names, frames) for camera in used]
     weight = np.stack([one.confidence for one in chosen])
     weight = np.where(weight >= config.least_confidence, weight, 0.0)
@@ -179,17 +194,17 @@ def _table(
     sightings = Sightings.of(own, pixels.reshape(*flat, 2), weight.reshape(flat), threshold=threshold)
     seen = ((weight > 0).sum(axis=2) > 0).sum(axis=0)
     empty = [frame for frame, count in zip(frames, seen, strict=True) if count < 2]
-    problems = [f"frame {in_words(empty)}: fewer than two cameras see the person; no points"] if empty else []
-    return Table(sightings, tuple(names), tuple(int(f) for f in frames), used), problems
+    notes = [f"frame {number_ranges(empty)}: fewer than two cameras see the person; no points"] if empty else []
+    return Table(sightings, tuple(names), tuple(int(f) for f in frames), used), notes
 
 
 def _unit(table: Table, cameras: Mapping[str, Camera], config: TriangulationConfig) -> Float64[np.ndarray, " C"]:
-    """What a detector's noise is of the order of, in each camera's pixels."""
+    """Return the order of magnitude of a detector's noise, in each camera's pixels: a quarter of the threshold."""
     return 0.25 * config.threshold * np.array([float(cameras[name].height) for name in table.cameras])
 
 
 def _with_thresholds(table: Table, points: Float64[np.ndarray, "N 3"], config: TriangulationConfig) -> Table:
-    """The table with what a sighting may be off at the distance of what each camera sees."""
+    """Raise each camera's threshold to what the threshold in metres is in its pixels at the person's depth."""
     s = table.sightings
     known = (s.weight > 0) & np.isfinite(points).all(axis=1)
     threshold = s.threshold.copy()
@@ -201,21 +216,24 @@ def _with_thresholds(table: Table, points: Float64[np.ndarray, "N 3"], config: T
     return replace(table, sightings=replace(s, threshold=threshold))
 
 
-def _first(table: Table, config: TriangulationConfig) -> Float64[np.ndarray, "N 3"]:
+def _proposed(table: Table, config: TriangulationConfig) -> Float64[np.ndarray, "N 3"]:
+    """Return the consensus of pairs of cameras."""
     pairs = all_pairs(len(table.cameras), most=config.most_pairs, seed=config.seed)
     return consensus(table.sightings, pairs, least_degrees=config.least_degrees)
 
 
-def _judged(
+def _mended(
     table: Table, config: TriangulationConfig
 ) -> tuple[Table, Float64[np.ndarray, "N 3"], list[str], list[str]]:
-    """The table without what others contradict, its first points, what was found, and the cameras left out."""
-    points = _first(table, config)
+    """Mend or drop faulty views; return the table, its points, notes about the faults, and the dropped cameras."""
+    points = _proposed(table, config)
+    least_cameras = 4  # among fewer, it cannot be decided which one is wrong
     swapped = np.zeros((len(table.cameras), len(table.frames)), dtype=bool)
     left_out: list[str] = []
-    elsewhere: list[str] = []
-    if len(table.cameras) < _LEAST_TO_JUDGE:
+    faults: list[str] = []
+    if len(table.cameras) < least_cameras:
         return table, points, [], []
+    # 1. Exchanged sides: mend them and triangulate again, since the mended views support other points.
     refined = refine(table.sightings, points)[0]
     for _ in range(_ROUNDS):
         found = find_swapped(table, refined)
@@ -223,11 +241,12 @@ def _judged(
             break
         swapped ^= found
         table = _exchanged(table, found)
-        points = _first(table, config)
+        points = _proposed(table, config)
         refined = refine(table.sightings, points)[0]
-    problems = [_swap_words(table, k, row) for k, row in enumerate(swapped) if row.any()]
+    notes = [_swap_note(table, k, row) for k, row in enumerate(swapped) if row.any()]
+    # 2. Faulty cameras: drop the worst one and triangulate again, until none contradicts the rest.
     names = list(table.cameras)
-    while len(names) - len(left_out) >= _LEAST_TO_JUDGE:
+    while len(names) - len(left_out) >= least_cameras:
         fault = find_camera_fault(table, refined)
         if fault is None:
             break
@@ -235,35 +254,36 @@ def _judged(
         left_out.append(names[camera])
         given = table.sightings
         table = _without(table, np.arange(len(names)) == camera, np.ones(len(table.frames), dtype=bool))
-        points = _first(table, config)
+        points = _proposed(table, config)
         refined = refine(table.sightings, points)[0]
-        if misplaced:  # by how much: against points that it has no part in
+        if misplaced:  # measured against points that it had no part in
             turn, shift = pose_difference(given.cam_from_world[camera], resection(given, camera, refined).pose)
             move = f" and move by {1e3 * shift:.0f} mm" if shift > 1e-3 else ""
-            elsewhere.append(
+            faults.append(
                 f"camera {names[camera]}: its calibration is off: it would have to turn by {turn:.1f} degrees{move} to "
                 "agree with the others; left out"
             )
         else:
-            elsewhere.append(f"camera {names[camera]}: its keypoints are of another person; left out")
+            faults.append(f"camera {names[camera]}: its keypoints are of another person; left out")
+    # 3. Views of another person in single frames.
     others = find_other_people(table, refined)
     if others.any():
         for k in np.flatnonzero(others.any(axis=1)):
             numbers = [frame for frame, other in zip(table.frames, others[k], strict=True) if other]
-            elsewhere.append(f"camera {names[k]}, frame {in_words(numbers)}: keypoints of another person; left out")
+            faults.append(f"camera {names[k]}, frame {number_ranges(numbers)}: keypoints of another person; left out")
             table = _without(table, np.arange(len(names)) == k, others[k])
-        points = _first(table, config)
-    return table, points, [*problems, *elsewhere], left_out
+        points = _proposed(table, config)
+    return table, points, [*notes, *faults], left_out
 
 
-def _swap_words(table: Table, camera: int, row: Bool[np.ndarray, " F"]) -> str:
+def _swap_note(table: Table, camera: int, row: Bool[np.ndarray, " F"]) -> str:
     numbers = [frame for frame, swapped in zip(table.frames, row, strict=True) if swapped]
-    where = "the whole view" if row.all() else f"frame {in_words(numbers)}"
+    where = "the whole view" if row.all() else f"frame {number_ranges(numbers)}"
     return f"camera {table.cameras[camera]}: left and right are swapped in {where}; swapped back"
 
 
 def _exchanged(table: Table, swapped: Bool[np.ndarray, "C F"]) -> Table:
-    """The table with left and right of some views exchanged; what has no other side among the names is not seen."""
+    """Exchange left and right in some views; points whose counterpart is missing count as not seen."""
     s, mirror = table.sightings, mirror_index(table.names)
     pixels, weight = table.by_frame(s.pixels).copy(), table.by_frame(s.weight).copy()
     source = np.where(mirror < 0, 0, mirror)
@@ -275,7 +295,7 @@ def _exchanged(table: Table, swapped: Bool[np.ndarray, "C F"]) -> Table:
 
 
 def _without(table: Table, cameras: Bool[np.ndarray, " C"], frames: Bool[np.ndarray, " F"]) -> Table:
-    """The table with nothing seen in some views."""
+    """Remove all sightings of some views."""
     weight = table.by_frame(table.sightings.weight).copy()
     weight[np.ix_(cameras, frames)] = 0.0
     return replace(table, sightings=replace(table.sightings, weight=weight.reshape(table.sightings.weight.shape)))
@@ -287,8 +307,9 @@ def _result(
     covariance: Float64[np.ndarray, "N 3 3"],
     inliers: Bool[np.ndarray, "C N"],
     left_out: Sequence[str],
-    problems: Sequence[str],
+    notes: Sequence[str],
 ) -> Triangulation:
+    """Summarise the reprojection errors and reshape all arrays to frames and points."""
     s, shape = table.sightings, (len(table.frames), len(table.names))
     length = table.by_frame(np.linalg.norm(s.residuals(points), axis=2))
     agree, seen = table.by_frame(inliers), table.by_frame(s.weight > 0)
@@ -316,5 +337,5 @@ def _result(
             if name not in left_out
         },
         left_out=tuple(left_out),
-        problems=tuple(problems),
+        notes=tuple(notes),
     )

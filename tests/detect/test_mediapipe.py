@@ -11,7 +11,7 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.register.landmarks import LandmarkModel
+from smplxpp.register import LandmarkModel
 from tests.conftest import ROOT
 
 FIXTURE = ROOT / "data" / "fixtures" / "person"

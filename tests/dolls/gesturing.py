@@ -14,7 +14,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.labels import LOWER
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 from smplxpp.template.template import Template
 from tests.dolls.doll import Doll, Part, ball, make_template, place_camera
 

@@ -24,7 +24,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
-from smplxpp.register.landmark_file import read_landmarks, write_landmarks
+from smplxpp.register import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set

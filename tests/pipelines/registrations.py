@@ -13,8 +13,7 @@ from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.capture import Capture
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import BodyParams
-from smplxpp.register.body_fit import BodyFit
-from smplxpp.register.observations import Observations
+from smplxpp.register import BodyFit, Observations
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 HELD_OUT = "Cam004"

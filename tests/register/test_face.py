@@ -10,10 +10,8 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.core.camera import Camera
 from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
+from smplxpp.register import Observations, RegisterConfig, register
 from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.observations import Observations
 from tests.register.people import moving, ring
 
 BODY = load_body()

@@ -11,9 +11,7 @@ from smplxpp.core.labels import SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import rotvec_from_matrix
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
-from smplxpp.register.observations import Observations, ScanObservation
+from smplxpp.register import Observations, RegisterConfig, ScanObservation, register
 from tests.register.people import disturbed, keypoints, masks, moving, ring, vertex_error_mm
 
 BODY = load_body()
@@ -38,7 +36,7 @@ def test_exact_keypoints_give_the_pose(person, cameras):
     assert 1e3 * np.linalg.norm(true - found, axis=2).mean() < 4.0
     assert (fit.params.betas == fit.params.betas[0]).all()  # one shape
     assert fit.residuals["keypoints_px"].max() < 1.0
-    assert not fit.start and not fit.problems
+    assert not fit.initial_residuals and not fit.notes
 
 
 def test_noisy_keypoints_and_masks(person, cameras):
@@ -53,7 +51,7 @@ def test_noisy_keypoints_and_masks(person, cameras):
         SMALL,
     )
     assert vertex_error_mm(BODY, both.params, person) < vertex_error_mm(BODY, alone.params, person) < 15.0
-    assert np.nanmean(both.residuals["silhouette_px"]) < np.nanmean(both.start["silhouette_px"])
+    assert np.nanmean(both.residuals["silhouette_px"]) < np.nanmean(both.initial_residuals["silhouette_px"])
     assert both.confidence.shape == (FRAMES, BODY.joint_count)
     assert (both.confidence[:, :22] > 0.5).all()
 
@@ -135,7 +133,7 @@ def test_a_body_does_not_stand_out_of_its_clothes(person):
     )
     fit = register(BODY, Observations((0,), scans={0: scan}, initial=fat), SMALL)
     assert fit.residuals["inside_mm"][0] < 0.3
-    assert fit.residuals["inside_mm"][0] <= fit.start["inside_mm"][0]
+    assert fit.residuals["inside_mm"][0] <= fit.initial_residuals["inside_mm"][0]
 
 
 def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
@@ -147,7 +145,7 @@ def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
         mask=lambda c, f: None if (c, f) == ("C2", 1) else mask[c, f],
     )
     fit = register(BODY, observed, SMALL)
-    assert any("camera C2" in problem and "frame 1" in problem for problem in fit.problems)
+    assert any("camera C2" in problem and "frame 1" in problem for problem in fit.notes)
     assert np.isfinite(fit.residuals["silhouette_px"]).all()
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
-from smplxpp.register.config import RegisterConfig
+from smplxpp.register import Observations, RegisterConfig
 from smplxpp.register.follow import disagreement, follow, predicted
-from smplxpp.register.observations import Observations
 from tests.register.people import masks, moving, ring, vertex_error_mm
 
 BODY = load_body()

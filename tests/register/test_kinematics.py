@@ -55,7 +55,7 @@ def test_derivatives_are_differences(scene):
     kinematics, state, points, _ = scene
     motion = kinematics.motion(points, kinematics.posture(state, 1))
     zeros = {
-        "turns": np.zeros((2, 55, 3)),
+        "rotvecs": np.zeros((2, 55, 3)),
         "transl": np.zeros((2, 3)),
         "betas": np.zeros(BODY.num_betas),
         "expression": np.zeros((2, BODY.num_expressions)),
@@ -71,7 +71,7 @@ def test_derivatives_are_differences(scene):
 
     for joint in (0, 3, 12, 16, 20, 40):
         for axis in range(3):
-            assert np.abs(difference("turns", (1, joint, axis)) - motion.pose[:, :, joint, axis]).max() < 1e-8
+            assert np.abs(difference("rotvecs", (1, joint, axis)) - motion.pose[:, :, joint, axis]).max() < 1e-8
     for k in (0, 7, 19):
         assert np.abs(difference("betas", k) - motion.shape[:, :, k]).max() < 1e-8
         assert np.abs(difference("expression", (1, k)) - motion.expression[:, :, k]).max() < 1e-8

@@ -43,8 +43,8 @@ def test_solution_is_the_dense_one(solve_shape):
     exact = -np.linalg.solve(dense[:size, :size], target[:size])
     step = equations.solve(damping=0.0, solve_shape=solve_shape)
     frames = exact[:n].reshape(T, P)
-    assert step.turns[:, [0, 2]].reshape(T, -1) == pytest.approx(frames[:, :6], abs=1e-9)
-    assert (step.turns[:, 1] == 0).all()
+    assert step.rotvecs[:, [0, 2]].reshape(T, -1) == pytest.approx(frames[:, :6], abs=1e-9)
+    assert (step.rotvecs[:, 1] == 0).all()
     assert step.transl == pytest.approx(frames[:, 6:9], abs=1e-9)
     assert step.expression == pytest.approx(frames[:, 9:], abs=1e-9)
     assert step.betas == pytest.approx(exact[n:] if solve_shape else np.zeros(BETAS), abs=1e-9)
@@ -57,15 +57,15 @@ def test_one_frame_alone():
     equations.add(0, rows, residuals)
     step = equations.solve(damping=0.0, solve_shape=True)
     exact = -np.linalg.lstsq(rows, residuals, rcond=None)[0]
-    assert np.concatenate([step.turns.ravel(), step.transl.ravel(), step.betas]) == pytest.approx(exact)
+    assert np.concatenate([step.rotvecs.ravel(), step.transl.ravel(), step.betas]) == pytest.approx(exact)
 
 
 def test_a_long_step_is_shortened_as_a_whole():
     _, equations, _, _ = build(np.random.default_rng(2))
     step = equations.solve(damping=0.0, solve_shape=True)
     short = step.limited(angle=0.01, length=0.01)
-    assert np.linalg.norm(short.turns, axis=2).max() <= 0.01 + 1e-12
+    assert np.linalg.norm(short.rotvecs, axis=2).max() <= 0.01 + 1e-12
     for frame in range(T):
         share = short.transl[frame] / step.transl[frame]
         assert share == pytest.approx(np.full(3, share[0]))
-        assert short.turns[frame, [0, 2]] == pytest.approx(share[0] * step.turns[frame, [0, 2]])
+        assert short.rotvecs[frame, [0, 2]] == pytest.approx(share[0] * step.rotvecs[frame, [0, 2]])

@@ -11,11 +11,8 @@ from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.config import RegisterConfig
-from smplxpp.register.fit import register
-from smplxpp.register.landmark_file import read_landmarks, write_landmarks
-from smplxpp.register.landmarks import LandmarkModel
-from smplxpp.register.observations import Observations
+from smplxpp.register import Observations, RegisterConfig, register
+from smplxpp.register.landmarks import LandmarkModel, read_landmarks, write_landmarks
 from tests.register.people import moving, vertex_error_mm
 from tests.register.test_fit import SMALL, dressed
 
@@ -49,7 +46,7 @@ def joint_error_mm(found: BodyParams, true: BodyParams) -> float:
 def test_many_exact_landmarks_give_the_pose(person):
     fit = fitted(placed(person, MANY))
     assert joint_error_mm(fit.params, person) < 25.0
-    assert fit.residuals["landmarks_mm"][0] < 4.0 and not fit.problems
+    assert fit.residuals["landmarks_mm"][0] < 4.0 and not fit.notes
 
 
 def test_eight_landmarks_and_a_scan_need_no_parameters(person):
@@ -75,7 +72,7 @@ def test_sides_taken_for_each_other_are_exchanged_back(person):
     sides = {"left": "right", "right": "left"}
     wrong = {"_".join(sides.get(part, part) for part in name.split("_")): point for name, point in points.items()}
     fit = fitted(wrong)
-    assert any("left and right" in words and "exchanged back" in words for words in fit.problems)
+    assert any("left and right" in words and "exchanged back" in words for words in fit.notes)
     np.testing.assert_allclose(fit.params.body_pose, fitted(points).params.body_pose, atol=1e-6)
 
 
@@ -85,7 +82,7 @@ def test_one_landmark_in_the_wrong_place_is_let_go_and_named(person):
     points["left_elbow"] = points["left_elbow"] + np.array([0.0, 0.0, 0.5])
     fit = fitted(points)
     assert joint_error_mm(fit.params, person) < good + 12.0
-    (words,) = fit.problems
+    (words,) = fit.notes
     assert "frame 0" in words and "left_elbow" in words and words.count("mm") == 1
 
 
@@ -95,7 +92,7 @@ def test_landmarks_correct_a_fit(person):
     )
     fit = fitted(placed(person, MANY), initial=wrong)
     assert joint_error_mm(fit.params, person) < 5.0 < joint_error_mm(wrong, person)
-    assert fit.start["landmarks_mm"][0] > 100.0
+    assert fit.initial_residuals["landmarks_mm"][0] > 100.0
 
 
 def test_the_error_that_is_expected_is_a_choice(person):
@@ -129,7 +126,7 @@ def test_too_few_landmarks_are_refused(person, names, words):
 def test_unknown_names_are_left_out_and_said(person):
     points = {**placed(person, MANY), "tail": np.zeros(3)}
     fit = fitted(points)
-    assert any("tail" in words for words in fit.problems)
+    assert any("tail" in words for words in fit.notes)
     with pytest.raises(InputError, match="none of these frames that the body has"):
         fitted({"tail": np.zeros(3)})
 

@@ -18,7 +18,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.keypoint_faults import in_words, mirror_index
+from smplxpp.register.keypoint_faults import mirror_index, number_ranges
 from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
 
 FRAMES, SIZE = 12, 640
@@ -72,13 +72,13 @@ def errors(found: Triangulation, joints: np.ndarray) -> np.ndarray:
 
 def test_exact_sightings_give_exact_points(joints, cameras):
     found = triangulate(detected(joints, cameras, EXACT), cameras)
-    assert found.names == SMPLX_JOINTS and found.frames == tuple(range(FRAMES)) and found.problems == ()
+    assert found.names == SMPLX_JOINTS and found.frames == tuple(range(FRAMES)) and found.notes == ()
     assert errors(found, joints).max() < 1e-9
 
 
 def test_noise_outliers_and_gaps_leave_millimetres_as_stated(joints, cameras, noisy):
     found = triangulate(noisy, cameras)
-    assert found.problems == () and found.left_out == ()
+    assert found.notes == () and found.left_out == ()
     error = errors(found, joints)
     assert np.isfinite(error).all()
     # 3 px at about 3.4 m with 330 px a metre are 9 mm a view; seven views bring that to about 4 mm a coordinate.
@@ -117,7 +117,7 @@ def test_the_same_call_gives_the_same_bits(cameras, noisy, config):
 def test_a_view_with_left_and_right_exchanged_is_swapped_back(joints, cameras, noisy):
     wrong = {**noisy, "Cam003": swapped(noisy["Cam003"], list(range(FRAMES)))}
     found = triangulate(wrong, cameras)
-    assert found.problems == ("camera Cam003: left and right are swapped in the whole view; swapped back",)
+    assert found.notes == ("camera Cam003: left and right are swapped in the whole view; swapped back",)
     assert (found.keypoints["Cam003"].points == noisy["Cam003"].points).all()
     np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-4)
 
@@ -127,9 +127,9 @@ def test_frames_with_left_and_right_exchanged_are_named(joints, cameras, noisy):
     frames = {"Cam002": [4, 5, 6], "Cam004": [5, 6, 7, 8], "Cam006": [0, 6]}
     wrong = noisy | {name: swapped(noisy[name], rows) for name, rows in frames.items()}
     found = triangulate(wrong, cameras)
-    assert len(found.problems) == 3
-    for words, (name, rows) in zip(found.problems, frames.items(), strict=True):
-        assert words.startswith(f"camera {name}: left and right are swapped in frame {in_words(rows)};")
+    assert len(found.notes) == 3
+    for words, (name, rows) in zip(found.notes, frames.items(), strict=True):
+        assert words.startswith(f"camera {name}: left and right are swapped in frame {number_ranges(rows)};")
     np.testing.assert_allclose(found.points, triangulate(noisy, cameras).points, atol=1e-4)
 
 
@@ -144,9 +144,9 @@ def test_a_camera_that_is_turned_is_named_with_the_angle(joints, cameras, noisy,
     assert found.left_out == ("Cam005",) and "Cam005" not in found.keypoints
     said = re.fullmatch(
         r"camera Cam005: its calibration is off: .* turn by ([\d.]+) degrees to agree with the others; left out",
-        found.problems[0],
+        found.notes[0],
     )
-    assert said and float(said[1]) == pytest.approx(degrees, abs=0.21) and len(found.problems) == 1
+    assert said and float(said[1]) == pytest.approx(degrees, abs=0.21) and len(found.notes) == 1
     without = {name: one for name, one in noisy.items() if name != "Cam005"}
     np.testing.assert_allclose(found.points, triangulate(without, cameras).points, atol=2e-4)
 
@@ -154,7 +154,7 @@ def test_a_camera_that_is_turned_is_named_with_the_angle(joints, cameras, noisy,
 def test_another_persons_keypoints_are_left_out(joints, cameras, noisy):
     other = detected(performance(9)[::-1] + [0.4, 0.0, -0.3], cameras, seed=5)
     found = triangulate({**noisy, "Cam004": other["Cam004"]}, cameras)
-    assert found.problems == ("camera Cam004: its keypoints are of another person; left out",)
+    assert found.notes == ("camera Cam004: its keypoints are of another person; left out",)
     assert found.left_out == ("Cam004",)
     assert errors(found, joints).max() < 0.05
 
@@ -164,7 +164,7 @@ def test_another_person_in_some_frames_is_left_out_there(joints, cameras, noisy)
     points, confidence = noisy["Cam004"].points.copy(), noisy["Cam004"].confidence.copy()
     points[3:5], confidence[3:5] = other.points[3:5], other.confidence[3:5]
     found = triangulate({**noisy, "Cam004": replace(other, points=points, confidence=confidence)}, cameras)
-    assert found.problems == ("camera Cam004, frame 3 to 4: keypoints of another person; left out",)
+    assert found.notes == ("camera Cam004, frame 3 to 4: keypoints of another person; left out",)
     assert (found.keypoints["Cam004"].confidence[3:5] == 0).all() and found.left_out == ()
 
 
@@ -176,7 +176,7 @@ def test_a_frame_in_which_the_person_leaves_the_picture_is_named(joints, cameras
 
     gone = {name: one if name == "Cam001" else without(one) for name, one in noisy.items()}
     found = triangulate(gone, cameras)
-    assert found.problems == ("frame 2, 7: fewer than two cameras see the person; no points",)
+    assert found.notes == ("frame 2, 7: fewer than two cameras see the person; no points",)
     assert np.isnan(found.points[[2, 7]]).all() and np.isnan(found.sigma[[2, 7]]).all()
     assert np.isfinite(np.delete(found.points, [2, 7], axis=0)).all()
 
@@ -188,8 +188,8 @@ def test_several_faults_at_once(joints, cameras, noisy):
     other = detected(performance(9)[::-1] + [0.4, 0.0, -0.3], cameras, seed=5)["Cam004"]
     wrong = {**noisy, "Cam004": other, "Cam002": swapped(noisy["Cam002"], list(range(FRAMES)))}
     found = triangulate(wrong, off)
-    assert set(found.left_out) == {"Cam004", "Cam007"} and len(found.problems) == 3
-    assert "Cam002: left and right" in found.problems[0]
+    assert set(found.left_out) == {"Cam004", "Cam007"} and len(found.notes) == 3
+    assert "Cam002: left and right" in found.notes[0]
     assert errors(found, joints).max() < 0.06
 
 
@@ -197,7 +197,7 @@ def test_everything_mirrored_cannot_be_told(joints, cameras, noisy):
     """As the docstring says: a body has to be fitted to see it."""
     every = list(range(FRAMES))
     found = triangulate({name: swapped(one, every) for name, one in noisy.items()}, cameras)
-    assert found.problems == ()
+    assert found.notes == ()
     np.testing.assert_allclose(
         found.points[:, mirror_index(found.names)], triangulate(noisy, cameras).points, atol=1e-6
     )
@@ -211,12 +211,12 @@ def test_what_a_detector_marks_elsewhere_in_every_view_is_no_fault(joints, camer
     for k, (name, camera) in enumerate(cameras.items()):
         marked = joints + rng.normal(0, 0.012, (1, 55, 3)) + rng.normal(0, 0.006, joints.shape)
         biased[name] = detected(marked, {name: camera}, seed=k)[name]
-    assert triangulate(biased, cameras).problems == ()
+    assert triangulate(biased, cameras).notes == ()
     pose = cameras["Cam006"].cam_from_world.copy()
     pose[:3] = matrix_from_rotvec(np.radians([2.0, 0.0, 0.0])) @ pose[:3]
     off = {**cameras, "Cam006": replace(cameras["Cam006"], cam_from_world=pose)}
     found = triangulate({**biased, "Cam003": swapped(biased["Cam003"], [1, 2])}, off)
-    assert [words.partition(";")[0] for words in found.problems] == [
+    assert [words.partition(";")[0] for words in found.notes] == [
         "camera Cam003: left and right are swapped in frame 1 to 2",
         "camera Cam006: its calibration is off: it would have to turn by 2.0 degrees to agree with the others",
     ]
@@ -251,4 +251,4 @@ def test_what_cannot_be_triangulated_is_refused(cameras, noisy):
 def test_two_cameras_are_enough_for_points_but_not_to_judge(joints, cameras):
     two = {name: one for name, one in detected(joints, cameras, EXACT).items() if name in ("Cam001", "Cam003")}
     found = triangulate(two, cameras, names=("pelvis", "head"), frames=(3, 4))
-    assert found.problems == () and errors(found, joints[3:5][:, [0, 15]]).max() < 1e-8
+    assert found.notes == () and errors(found, joints[3:5][:, [0, 15]]).max() < 1e-8

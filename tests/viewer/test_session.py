@@ -9,7 +9,7 @@ from pipelines.viewer.session import LabelledScan, LabelSession, doubtful_region
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import concatenate_meshes
-from smplxpp.register.landmark_file import read_landmarks
+from smplxpp.register import read_landmarks
 from smplxpp.segment import Corrections
 from smplxpp.segment.corrected_faces import ScanSurface
 from tests.segment.test_corrections import tube

@@ -18,7 +18,7 @@ from avatar.training.refinement.evidence import Evidence, Photometer
 from avatar.training.refinement.posing import PosedTemplate
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_trust
 from avatar.training.refinement.variables import GaussianMotion, Variables
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 
 DAMPING, CALMER, WILDER, LEAST_DAMPING = 1e-2, 0.3, 10.0, 1e-4
 """Levenberg and Marquardt's damping: at first, after a good pass, after a bad one, and at least."""

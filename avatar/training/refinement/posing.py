@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState, Kinematics
+from smplxpp.register import BodyState, Kinematics
 from smplxpp.skinning.linear_blend import forward_kinematics
 from smplxpp.template.template import Template
 

@@ -23,7 +23,7 @@ from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.core.validation import require_known
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 
 
 @dataclass(frozen=True, eq=False)

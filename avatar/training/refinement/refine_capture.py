@@ -20,7 +20,7 @@ from smplxpp.capture.writers.metadata import write_plain_cameras_json
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 from smplxpp.template.template import Template
 
 PARAMS_FILE, HELD_OUT_PARAMS_FILE, CAMERAS_FILE = "params.npz", "params_held_out.npz", "cameras.json"

@@ -12,7 +12,7 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.variables import Variables
 from smplxpp.core.params import DEFAULT_FPS
 from smplxpp.core.rotations import rotvec_from_matrix
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 
 TAIL = 2.0
 """Multiples of the trusted acceleration from which an acceleration counts as motion."""

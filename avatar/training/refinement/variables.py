@@ -14,7 +14,7 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.evidence import Evidence
 from avatar.training.refinement.posing import Placed, PosedTemplate
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 
 NOTHING = 1e-3
 """Share of the mean curvature below which a Gaussian says nothing."""
@@ -102,7 +102,7 @@ class GaussianMotion:
         corners = posed.faces[gaussians.face_index]
         weight = corner_weights(gaussians.barycentric)
         skin = (weight[..., None] * posed.weights[corners]).sum(1)
-        hangs = torch.tensor(posed.kinematics.hangs_on[:, variables.joints], dtype=torch.float32)
+        hangs = torch.tensor(posed.kinematics.descends_from[:, variables.joints], dtype=torch.float32)
         self.hanging = skin @ hangs
         """(N, K): share of a Gaussian that follows each joint."""
         self.firmness = (weight * posed.firmness[corners]).sum(1)

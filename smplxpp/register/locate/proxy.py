@@ -1,4 +1,4 @@
-"""What of a body is compared with a bare surface: points, each with its normal and what usually covers it."""
+"""Sample a body for comparison with a bare surface: points with normals and the region that each belongs to."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from jaxtyping import Float64, Int64
 from smplxpp.body import BodyModel
 from smplxpp.core.mesh import normalize_rows
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
-
-_FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+from smplxpp.register.landmarks import is_finger, visible_vertices
 
 
 class Region(IntEnum):
-    """What covers a place of the body, mostly."""
+    """Regions of the body that differ in what usually covers them."""
 
     HAND = 0
     FACE = 1
@@ -30,11 +29,13 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class BodyProxy:
-    """N points of a body.
+    """N points of a body with what correspondences need.
 
     Attributes:
-        points: as the kinematics pose them. normals: at rest on the mean shape. region: of each point.
-        limb: the joint of most weight.
+        points: points that the kinematics pose.
+        normals: unit normals of the mean shape at rest.
+        region: `Region` of each point.
+        limb: index of the joint of largest skinning weight.
     """
 
     points: BodyPoints
@@ -44,7 +45,7 @@ class BodyProxy:
 
     @staticmethod
     def of(body: BodyModel, count: int, *, seed: int = 0) -> BodyProxy:
-        """About `count` vertices, evenly over the surface; none of eyes, teeth and tongue."""
+        """Draw about `count` visible vertices, evenly over the surface."""
         index = even_vertices(body, count, seed)
         mesh = body.mesh()
         return BodyProxy(
@@ -55,34 +56,29 @@ class BodyProxy:
         )
 
     def posed(self, kinematics: Kinematics, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
-        """Points and unit normals of a posture."""
-        turned = (self.points.weights @ posture.turned.reshape(-1, 9)).reshape(-1, 3, 3)
-        normals = normalize_rows(np.einsum("nxy,ny->nx", turned, self.normals))
+        """Return the points and unit normals in a posture."""
+        blended = (self.points.weights @ posture.rotations.reshape(-1, 9)).reshape(-1, 3, 3)
+        normals = normalize_rows(np.einsum("nxy,ny->nx", blended, self.normals))
         return kinematics.points(self.points, posture), normals
 
     def select(self, rows: np.ndarray) -> BodyProxy:
-        """Some of the points."""
+        """Return some of the points in the given order."""
         return BodyProxy(self.points.select(rows), self.normals[rows], self.region[rows], self.limb[rows])
 
 
-def outer_vertices(body: BodyModel) -> Int64[np.ndarray, " n"]:
-    """Vertices that a scan can show: no eyes, teeth and tongue."""
-    hidden = [k for k, name in enumerate(body.part_label_names) if any(w in name for w in ("eye", "teeth", "tongue"))]
-    return np.flatnonzero(~np.isin(body.part_labels, hidden))
-
-
 def even_vertices(body: BodyModel, count: int, seed: int) -> Int64[np.ndarray, " n"]:
-    """`count` vertices drawn by the area about them, in increasing order."""
+    """Draw `count` visible vertices with probabilities in proportion to their area; return them in ascending order."""
     mesh = body.mesh()
     area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas / 3, 3), minlength=body.vertex_count)
-    outer = outer_vertices(body)
+    outer = visible_vertices(body)
     share = area[outer] / area[outer].sum()
     drawn = np.random.default_rng(seed).choice(outer, min(count, int((share > 0).sum())), replace=False, p=share)
     return np.sort(drawn)
 
 
 def regions(body: BodyModel) -> Int64[np.ndarray, " V"]:
-    """The region of every vertex, by its joint of most weight; the face is what of the head lies before the ears."""
+    """Return the region of every vertex by its joint of largest weight; the face is the part of the head before the
+    ears, from brows to chin."""
     names = np.array(body.joint_names)
     limb = names[np.argmax(body.weights, axis=1)]
     out = np.full(body.vertex_count, Region.TRUNK, dtype=np.int64)
@@ -90,9 +86,7 @@ def regions(body: BodyModel) -> Int64[np.ndarray, " V"]:
     place = {str(name): k for k, name in enumerate(names)}
     for k, name in enumerate(limb):
         part = str(name).removeprefix("left_").removeprefix("right_")
-        if any(part.startswith(finger) for finger in _FINGERS) or part == "hand":
-            out[k] = Region.HAND
-        elif part == "wrist":
+        if is_finger(part) or part in ("hand", "wrist"):
             out[k] = Region.HAND
         elif part in ("ankle", "foot"):
             out[k] = Region.FOOT
@@ -104,9 +98,9 @@ def regions(body: BodyModel) -> Int64[np.ndarray, " V"]:
             out[k] = Region.NECK
         elif part in ("head", "jaw") or "eye" in part:
             out[k] = Region.SCALP
+    # The face, in fractions of the height from the head joint to the crown.
     head = joints[place["head"]]
     size = body.v_template[:, 1].max() - head[1]
-    # Brows to chin, before the ears.
     v = body.v_template
     front = (v[:, 2] > head[2] + 0.15 * size) & (v[:, 1] < head[1] + 0.52 * size)
     out[(out == Region.SCALP) & front] = Region.FACE

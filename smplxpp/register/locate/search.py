@@ -1,4 +1,4 @@
-"""The search: poses and directions first, then limbs, then the body within its clothes."""
+"""Search for the body in a surface: poses and directions first, then limbs, then the body within its clothes."""
 
 from __future__ import annotations
 
@@ -12,38 +12,71 @@ from smplxpp.core.errors import ProgressCallback
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.register.anatomy import Anatomy
-from smplxpp.register.config import RegisterConfig
+from smplxpp.core.validation import require_at_least
 from smplxpp.register.kinematics import BodyState, Kinematics
-from smplxpp.register.locate.config import LocateConfig
-from smplxpp.register.locate.descend import DrawnTogether, Term, descend
-from smplxpp.register.locate.dressed import Dressed, OuterBody
-from smplxpp.register.locate.hands import try_hands
-from smplxpp.register.locate.limbs import state_distance, try_limbs
-from smplxpp.register.locate.misfit import Misfit, misfit
-from smplxpp.register.locate.pinned import Pinned
+from smplxpp.register.locate.dressed import Dressed, Misfit, OuterBody, misfit
+from smplxpp.register.locate.icp import IcpTerm, PinnedLandmarks, Term, gauss_newton_step
+from smplxpp.register.locate.limbs import state_distance, try_hands, try_limbs
 from smplxpp.register.locate.proxy import BodyProxy, Region
 from smplxpp.register.locate.starts import centred, rank_starts
 from smplxpp.register.normal_equations import Columns
-from smplxpp.register.priors import Priors
+from smplxpp.register.observations import RegisterConfig
+from smplxpp.register.priors import Anatomy, Priors
 
-# How far surface and body attract each other, metres, step by step.
-_FIRST, _AFTER_LIMBS = np.geomspace(0.3, 0.15, 6), np.geomspace(0.2, 0.08, 8)
-_NEARER, _DRESSING = np.geomspace(0.1, 0.04, 6), (0.04, 0.02)
-# Millimetres that a squared deviation of the pose from the prior counts as.
-_POSE_COST = 0.05
-_LIMBS = ("wrist", "ankle", "elbow", "knee")
-# Two candidates whose limbs are within this of each other on average are one, metres.
-_SAME = 0.06
+# Joints of the SMPL body without hands and face; they come first.
+_BODY_JOINTS = 22
+_Ranked = tuple[float, str, BodyState]
+"""Distance to the surface, metres; name of the pose of the start; the body."""
+
+
+@dataclass(frozen=True)
+class LocateConfig:
+    """Options of the search for a body in a bare surface.
+
+    Attributes:
+        directions: number of directions that the person may face at the start, evenly about the vertical axis.
+        starts: number of starts (pose and direction) that ICP refines.
+        limbs_tried: number of the best of these whose arms and legs are searched on a grid.
+        candidates: number of the best of these that are fitted as dressed bodies.
+        coarse_points: points drawn from the surface for the search.
+        fine_points: points drawn from the surface for the fit.
+        dress_steps: Gauss-Newton steps of every candidate's fit.
+        finish_steps: Gauss-Newton steps of the winner's fit.
+        pose_prior: weight of the pose prior during the winner's fit; above 1 because clothes hide joints more than the
+            number of surface points suggests.
+        seed: of the drawn points.
+    """
+
+    directions: int = 12
+    starts: int = 24
+    limbs_tried: int = 8
+    candidates: int = 3
+    coarse_points: int = 600
+    fine_points: int = 6000
+    dress_steps: int = 8
+    finish_steps: int = 12
+    pose_prior: float = 3.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("directions", "starts", "limbs_tried", "candidates", "dress_steps", "finish_steps"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 1)
+        for name in ("coarse_points", "fine_points"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 100)
+        for name in ("pose_prior", "seed"):
+            require_at_least(f"search for a body: {name}", getattr(self, name), 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """One candidate.
+    """A fitted candidate of the search.
 
     Attributes:
-        name: of the pose that it began with. misfit: between body and surface. pose_cost: squared deviations.
-        landmarks: mean distance of given landmarks, metres.
+        name: of the pose of its start.
+        state: the body, one frame.
+        misfit: between body and surface.
+        pose_cost: sum of squared rotation vectors in standard deviations of the pose prior.
+        landmarks: mean distance of the given landmarks, metres; 0 without any.
     """
 
     name: str
@@ -54,20 +87,24 @@ class Found:
 
     @property
     def cost(self) -> float:
-        """About millimetres."""
-        return 1e3 * (self.misfit.total + self.landmarks) + _POSE_COST * self.pose_cost
+        """The misfit with the cost of the pose, in millimetres; a squared deviation of the pose costs 0.05 mm."""
+        return 1e3 * (self.misfit.total + self.landmarks) + 0.05 * self.pose_cost
 
     @property
     def facing(self) -> Float64[np.ndarray, " 2"]:
-        """Where the pelvis faces: x and z of its front."""
+        """The direction in which the pelvis faces, x and z."""
         return facing_of(self.state)
 
 
 class Search:
-    """A search in one surface.
+    """A search for the body in one surface, with samples of both at several densities.
 
     Args:
-        mesh: metres, +Y up, outward. pinned: landmarks, None without.
+        kinematics: of the body.
+        mesh: the surface, metres, +Y up, faces outwards.
+        config: options.
+        pinned: landmarks of known position; None without any.
+        progress: called with the work under way and its share done.
     """
 
     def __init__(
@@ -75,16 +112,16 @@ class Search:
         kinematics: Kinematics,
         mesh: TriangleMesh,
         config: LocateConfig,
-        pinned: Pinned | None,
+        pinned: PinnedLandmarks | None,
         progress: ProgressCallback,
     ) -> None:
         body = kinematics.body
         self.kinematics, self.config, self.pinned, self.progress = kinematics, config, pinned, progress
         self.outer = OuterBody(kinematics)
         names = list(body.joint_names)
-        fingers = [k for k, name in enumerate(names) if k > 21 and "eye" not in name and name != "jaw"]
-        self.columns = self._columns(list(range(22)))
-        self.columns_with_fingers = self._columns(list(range(22)) + fingers)
+        fingers = [k for k, name in enumerate(names) if k >= _BODY_JOINTS and "eye" not in name and name != "jaw"]
+        self.columns = self._columns(list(range(_BODY_JOINTS)))
+        self.columns_with_fingers = self._columns(list(range(_BODY_JOINTS)) + fingers)
         self.anatomy = Anatomy.of(body.joint_count)
         self.coarse = SurfacePoints.sample(mesh, config.coarse_points, seed=config.seed)
         self.middle = SurfacePoints.sample(mesh, 2 * config.coarse_points, seed=config.seed + 1)
@@ -95,22 +132,27 @@ class Search:
         self.many, self.bare = many, many.select(np.flatnonzero(np.isin(many.region, (Region.HAND, Region.FACE))))
 
     def candidates(self) -> list[Found]:
-        """The best candidates of both facings, dressed, best first."""
+        """Return the best candidates of both facings, fitted as dressed bodies, best first."""
+        # 1. Start poses in all directions, refined by ICP whose reach falls from 30 to 15 cm.
         starts = rank_starts(
             self.kinematics, self.few, self.coarse, directions=self.config.directions, keep=self.config.starts
         )
         followed = []
         for k, start in enumerate(starts):
-            state = self._drawn(centred(self.kinematics, self.few, start), self.few, self.coarse, _FIRST)
+            state = self._icp(
+                centred(self.kinematics, self.few, start), self.few, self.coarse, np.geomspace(0.3, 0.15, 6)
+            )
             followed.append((self._distance(state), start.name, state))
             self.progress("poses", (k + 1) / len(starts))
+        # 2. Arms and legs of the best of both facings are searched on a grid, then refined by ICP from 20 to 8 cm.
         followed.sort(key=lambda one: one[0])
         chosen, tried = _of_both_facings(followed, self.config.limbs_tried), []
         for k, (_, name, state) in enumerate(chosen):
             state = try_limbs(self.kinematics, self.few, self.coarse, state)
-            state = self._drawn(state, self.few, self.coarse, _AFTER_LIMBS)
+            state = self._icp(state, self.few, self.coarse, np.geomspace(0.2, 0.08, 8))
             tried.append((self._distance(state), name, state))
             self.progress("limbs", (k + 1) / len(chosen))
+        # 3. The best distinct ones, one of the other facing among them, are fitted as dressed bodies.
         tried.sort(key=lambda one: one[0])
         distinct = self._distinct(tried)
         out = []
@@ -120,13 +162,15 @@ class Search:
         return sorted(out, key=lambda found: found.cost)
 
     def finished(self, found: Found, skin: np.ndarray | None = None) -> Found:
-        """A candidate with its fingers, among all points.
+        """Fit a candidate with its fingers to all points.
 
         Args:
-            skin: which of the points of `fine` are bare, None: not known.
+            found: the candidate.
+            skin: whether a point of `fine` is bare skin; None if unknown.
         """
         skin = np.zeros(len(self.fine), dtype=bool) if skin is None else skin
         term = Dressed(self.outer, self.bare, self.fine, skin)
+        # Hands from a grid first, then the whole body with a reach of skin that falls from 30 to 15 mm.
         state, steps = try_hands(self.kinematics, self.many, self.fine, found.state), self.config.finish_steps
         for k, reach in enumerate(np.geomspace(0.03, 0.015, steps)):
             term.reach = float(reach)
@@ -139,46 +183,51 @@ class Search:
         return Columns(np.array(joints), body.joint_count, 0, body.num_expressions, body.num_betas)
 
     def _step(self, state: BodyState, term: Term, pose_prior: float = 1.0, *, fingers: bool = False) -> BodyState:
+        """Take one Gauss-Newton step on a term, the landmarks and the priors."""
         columns = self.columns_with_fingers if fingers else self.columns
         priors = Priors(columns, np.zeros(1, dtype=np.int64), self.anatomy, RegisterConfig(pose_prior=pose_prior))
         terms = [term] if self.pinned is None else [term, self.pinned]
-        return descend(self.kinematics, columns, state, terms, priors)
+        return gauss_newton_step(self.kinematics, columns, state, terms, priors)
 
-    def _drawn(
+    def _icp(
         self, state: BodyState, proxy: BodyProxy, surface: SurfacePoints, reaches: np.ndarray, **options: float
     ) -> BodyState:
-        term = DrawnTogether(proxy, surface, **options)
+        """Take one ICP step for each reach."""
+        term = IcpTerm(proxy, surface, **options)
         for reach in reaches:
             term.reach = float(reach)
             state = self._step(state, term)
         return state
 
     def _dressed(self, state: BodyState) -> BodyState:
-        state = self._drawn(state, self.more, self.middle, _NEARER, sigma=0.015, count=600.0)
+        """Fit the dressed body to half of the points, after ICP from 10 to 4 cm at a higher density."""
+        state = self._icp(state, self.more, self.middle, np.geomspace(0.1, 0.04, 6), sigma=0.015, count=600.0)
         half = self.fine.select(np.arange(0, len(self.fine), 2))
         term = Dressed(self.outer, self.bare, half, np.zeros(len(half), dtype=bool))
-        for reach in np.geomspace(*_DRESSING, self.config.dress_steps):
+        for reach in np.geomspace(0.04, 0.02, self.config.dress_steps):
             term.reach = float(reach)
             state = self._step(state, term)
         return state
 
     def _measured(self, name: str, state: BodyState) -> Found:
+        """Return a state as a candidate with its costs."""
         posture = self.kinematics.posture(state, 0)
         found = misfit(self.kinematics, self.outer, self.many, self.fine, posture)
-        vectors = rotvec_from_matrix(state.rotations[0, 1:22]) / self.anatomy.spread[1:22]
+        vectors = rotvec_from_matrix(state.rotations[0, 1:_BODY_JOINTS]) / self.anatomy.spread[1:_BODY_JOINTS]
         off = 0.0 if self.pinned is None else self.pinned.distance(self.kinematics, posture)
         return Found(name, state, found, float((vectors**2).sum()), off)
 
     def _distance(self, state: BodyState) -> float:
+        """Return the mean distance between body and surface, with that of the landmarks, metres."""
         off = 0.0
         if self.pinned is not None:
             off = self.pinned.distance(self.kinematics, self.kinematics.posture(state, 0))
         return state_distance(self.kinematics, self.few, self.coarse, state) + off
 
-    def _distinct(self, tried: list[tuple[float, str, BodyState]]) -> list[tuple[float, str, BodyState]]:
-        """The best, the best that faces the other way, and the next ones that stand otherwise."""
+    def _distinct(self, tried: list[_Ranked]) -> list[_Ranked]:
+        """Return the best, the best of the other facing, and the next ones whose limbs differ by 6 cm on average."""
         names = self.kinematics.body.joint_names
-        index = [k for k, name in enumerate(names) if name.split("_")[-1] in _LIMBS]
+        index = [k for k, name in enumerate(names) if name.split("_")[-1] in ("wrist", "ankle", "elbow", "knee")]
 
         def limbs(state: BodyState) -> np.ndarray:
             return self.kinematics.posture(state, 0).joints[index]
@@ -189,19 +238,19 @@ class Search:
         for one in tried[1:]:
             if len(chosen) >= max(2, self.config.candidates):
                 break
-            near = [np.linalg.norm(limbs(one[2]) - limbs(kept[2]), axis=1).mean() < _SAME for kept in chosen]
+            near = [np.linalg.norm(limbs(one[2]) - limbs(kept[2]), axis=1).mean() < 0.06 for kept in chosen]
             if not any(near):
                 chosen.append(one)
         return chosen[: max(1, self.config.candidates)]
 
 
 def facing_of(state: BodyState) -> Float64[np.ndarray, " 2"]:
-    """x and z of the pelvis' front."""
+    """Return the direction in which the pelvis of a state faces, x and z."""
     return state.rotations[0, 0][[0, 2], 2]
 
 
-def _of_both_facings(followed: list[tuple[float, str, BodyState]], count: int) -> list[tuple[float, str, BodyState]]:
-    """The best that face as the best one does, and as many that face the other way."""
+def _of_both_facings(followed: list[_Ranked], count: int) -> list[_Ranked]:
+    """Return the best of the facing of the first, and as many of the other facing."""
     first = facing_of(followed[0][2])
     same = [one for one in followed if facing_of(one[2]) @ first >= 0]
     other = [one for one in followed if facing_of(one[2]) @ first < 0]

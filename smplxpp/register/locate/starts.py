@@ -1,4 +1,4 @@
-"""Where the search begins: poses, sizes and directions that lie near a surface as they stand."""
+"""Rank the starts of the search: library poses in all directions, scaled to the height of the surface."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from smplxpp.core.surface_points import SurfacePoints, truncated_distance
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
 
-# Cost of a person half as high again as the mean one, metres.
-_STATURE_COST = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class StartPose:
-    """A body that was moved onto a surface.
+    """A pose that was moved onto a surface.
 
     Attributes:
-        name: of the pose. yaw: radians about +Y. state: one frame. cost: metres, lower is nearer.
+        name: of the pose.
+        yaw: rotation about +Y, radians.
+        state: the body, one frame.
+        cost: mean distance with the cost of the stature, metres.
     """
 
     name: str
@@ -34,10 +34,14 @@ class StartPose:
 def rank_starts(
     kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, *, directions: int, keep: int
 ) -> list[StartPose]:
-    """The best poses of every direction, best first.
+    """Rank all poses in all directions by their distance to a surface, and return the best.
 
     Args:
-        directions: about the vertical axis, evenly. keep: how many starts, spread over the directions.
+        kinematics: of the body.
+        proxy: points of the body.
+        surface: points of the scan.
+        directions: number of directions, evenly about the vertical axis.
+        keep: number of starts to return, spread over the directions.
     """
     body = kinematics.body
     low, high = _ends(surface.points[:, 1])
@@ -45,6 +49,7 @@ def rank_starts(
     found: list[StartPose] = []
     for name, vectors in standing_poses(body.joint_count):
         rotations = matrix_from_rotvec(vectors)
+        # Scale the posed points to the height of the surface, and put them on its lowest point.
         state = _standing(kinematics, rotations)
         points, normals = proxy.posed(kinematics, kinematics.posture(state, 0))
         bottom, top = points[:, 1].min(), points[:, 1].max()
@@ -55,15 +60,17 @@ def rank_starts(
         for k in range(directions):
             yaw = 2.0 * np.pi * k / directions
             turn = matrix_from_rotvec(np.array([0.0, yaw, 0.0]))
+            # Rotate about the vertical axis, over the middle of the surface.
             there, facing = points @ turn.T, normals @ turn.T
             there[:, [0, 2]] += surface.points[:, [0, 2]].mean(axis=0)
-            cost = truncated_distance(there, facing, surface) + _STATURE_COST * abs(np.log2(scale)) / np.log2(1.5)
+            # A stature of 1.5 times the mean, or of 1/1.5, costs as much as 5 cm of distance.
+            cost = truncated_distance(there, facing, surface) + 0.05 * abs(np.log2(scale)) / np.log2(1.5)
             found.append(StartPose(name, yaw, _placed(kinematics, rotations, yaw, scale, rise, there), cost))
     return _spread(found, directions, keep)
 
 
 def _spread(found: list[StartPose], directions: int, keep: int) -> list[StartPose]:
-    """The best of each direction, in turns, so that no direction is left out by a lucky other."""
+    """Return the best of each direction and then the best of all, so that every direction is represented."""
     found = sorted(found, key=lambda start: start.cost)
     by_yaw: dict[float, list[StartPose]] = {}
     for start in found:
@@ -84,7 +91,7 @@ def _standing(kinematics: Kinematics, rotations: np.ndarray) -> BodyState:
 def _placed(
     kinematics: Kinematics, rotations: np.ndarray, yaw: float, scale: float, rise: np.ndarray, there: np.ndarray
 ) -> BodyState:
-    """The same as a state: the size by the betas, the root turned, the middle where the points are."""
+    """Return the placed pose as a state: the size in betas, within +-3, and the translation at the points' mean."""
     state = _standing(kinematics, rotations)
     state.rotations[0, 0] = matrix_from_rotvec(np.array([0.0, yaw, 0.0])) @ rotations[0]
     betas = np.clip((scale - 1.0) * rise, -3.0, 3.0)
@@ -92,14 +99,14 @@ def _placed(
 
 
 def centred(kinematics: Kinematics, proxy: BodyProxy, start: StartPose) -> BodyState:
-    """The state of a start with its points' middle at the place that the start says."""
+    """Return the state of a start, moved so that the mean of its points is at the start's translation."""
     points, _ = proxy.posed(kinematics, kinematics.posture(start.state, 0))
     move = start.state.transl[0] - (points.mean(axis=0) - start.state.transl[0])
     return BodyState(start.state.rotations, move[None], start.state.betas, start.state.expression)
 
 
 def _stature_direction(kinematics: Kinematics) -> Float64[np.ndarray, " B"]:
-    """The smallest betas that make the mean body twice as high."""
+    """Return the betas of least norm that double the height of the mean body."""
     body = kinematics.body
     top, bottom = np.argmax(body.v_template[:, 1]), np.argmin(body.v_template[:, 1])
     slope = body.shapedirs[top, 1] - body.shapedirs[bottom, 1]

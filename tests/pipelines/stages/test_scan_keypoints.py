@@ -111,7 +111,7 @@ def test_mediapipe_tells_where_the_fixtures_scan_faces(colored):
     pytest.importorskip("mediapipe", exc_type=ImportError)
     from smplxpp.body import load_params
     from smplxpp.detect import load_detector
-    from smplxpp.register.landmarks import LandmarkModel
+    from smplxpp.register import LandmarkModel
 
     fixture, body = ROOT / "data" / "fixtures" / "person", load_body()
     scan = read_mesh(fixture / "scans" / "scan_000000.ply")

@@ -56,7 +56,7 @@ def _error(body, located, truth) -> float:
 def test_the_fixtures_person_is_found_under_her_clothes(body, located, truth):
     assert _error(body, located, truth) < 0.015
     assert located.confidence > 0.9
-    assert located.problems == ()
+    assert located.notes == ()
 
 
 def test_both_facings_were_followed_and_the_best_comes_first(located):
@@ -111,8 +111,8 @@ def test_labels_of_a_labeller_are_asked_for_once_the_body_stands(body, scan, tru
 def test_an_arm_that_is_cut_off_is_named_and_believed_less(body, scan, located):
     arm = scan.face_centers[:, 0] > 0.27
     found = locate_body(body, scan.submesh(~arm)[0], config=QUICK)
-    assert "left hand" in " ".join(found.problems)
-    assert "right hand" not in " ".join(found.problems)
+    assert "left hand" in " ".join(found.notes)
+    assert "right hand" not in " ".join(found.notes)
     assert found.confidence < 0.5 < located.confidence
 
 

@@ -12,7 +12,7 @@ from avatar.training.refinement.firmness import firmness
 from avatar.training.refinement.posing import FirmSkinning, PosedTemplate
 from avatar.training.refinement.variables import BODY_JOINTS, Variables
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 from smplxpp.skinning.linear_blend import skin
 from tests.dolls.gesturing import disturbed, gestures, template
 

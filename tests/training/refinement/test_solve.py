@@ -8,7 +8,7 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_trust
 from avatar.training.refinement.variables import Variables
 from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register import BodyState
 from tests.dolls.gesturing import gestures, template
 
 CONFIG = RefineConfig(jaw=False, expression=False)

@@ -1,12 +1,12 @@
-"""Distances to a mask's contour, and the gaps that are learned from them."""
+"""Distances to a mask's contour, and the gaps that are estimated from them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from smplxpp.register.gaps import Gaps
-from smplxpp.register.outline import Outline
+from smplxpp.register.clothing import Gaps
+from smplxpp.register.silhouette_term import Outline
 
 
 def disc(height, width, center, radius):
@@ -55,7 +55,7 @@ def test_gaps_are_medians_with_their_spread():
     tight, loose = rng.normal(0.012, 0.001, 200), rng.normal(0.05, 0.03, 200)
     place = np.repeat([3, 5, 6], [200, 200, 2])
     order = rng.permutation(402)
-    gaps = Gaps.learned(place[order], np.concatenate([tight, loose, [0.1, 0.1]])[order], 8, least=8, tight=0.004)
+    gaps = Gaps.estimated(place[order], np.concatenate([tight, loose, [0.1, 0.1]])[order], 8, least=8, tight=0.004)
     assert gaps.median[3] == pytest.approx(0.012, abs=5e-4)
     assert gaps.spread[3] == pytest.approx(np.hypot(0.001, 0.004), rel=0.1)
     assert gaps.spread[5] == pytest.approx(0.03, rel=0.2)
@@ -63,5 +63,5 @@ def test_gaps_are_medians_with_their_spread():
 
 
 def test_gaps_are_never_negative():
-    gaps = Gaps.learned(np.zeros(50, np.int64), np.full(50, -0.01), 1, least=8, tight=0.004)
+    gaps = Gaps.estimated(np.zeros(50, np.int64), np.full(50, -0.01), 1, least=8, tight=0.004)
     assert gaps.median[0] == 0.0
