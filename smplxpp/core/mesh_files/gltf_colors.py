@@ -1,4 +1,4 @@
-"""The colours of a glTF primitive's vertices: picture times vertex colours times base colour, in linear light."""
+"""Compute the vertex colours of a glTF primitive: texture times vertex colours times base colour, in linear light."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from smplxpp.core.mesh_files.texture import CLAMP, MIRROR, REPEAT, sample_textur
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# Values of a sampler's wrapS and wrapT.
-_REPEATED = 10497
-_WRAPS = {_REPEATED: REPEAT, 33071: CLAMP, 33648: MIRROR}
+# Wrap modes by the OpenGL codes of a sampler's wrapS and wrapT.
+_WRAPS = {10497: REPEAT, 33071: CLAMP, 33648: MIRROR}
 
 
 def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
-    """The colours of a primitive's vertices; None where it has none, or, with a warning, where they are damaged.
+    """Return the vertex colours of a primitive; None if it has none, or, with a warning, if they are damaged.
 
-    Picture, vertex colours and the base colour's factor are multiplied, as glTF 2.0 says in section 3.9.2.
+    Texture, vertex colours and the factor of the base colour are multiplied (glTF 2.0, section 3.9.2).
 
     Args:
-        document: the file.
-        primitive: of its meshes.
-        count: its vertices.
+        document: file of the primitive.
+        primitive: JSON object of the primitive.
+        count: number of its vertices.
     """
     try:
         factor = _factor(document, primitive)
@@ -43,7 +42,7 @@ def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: i
         if factor is None and not found:
             return None
         if len(found) == 1 and found[0].dtype == np.uint8 and (factor is None or (factor == 1).all()):
-            return found[0]  # the file's own bytes
+            return found[0]  # the file's own bytes, which a round trip through linear light could change
         light = np.ones((count, 3)) if factor is None else np.repeat(factor[None], count, axis=0)
         for colors in found:
             light *= _linear(colors) if colors.dtype == np.uint8 else colors
@@ -54,7 +53,7 @@ def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: i
 
 
 def _surface(document: GltfDocument, primitive: dict[str, Any]) -> tuple[dict[str, Any], str, str]:
-    """What a material says of its surface, and its names for the picture and the factor of the base colour."""
+    """Return the surface description of a material, and its keys of the base colour's texture and factor."""
     if "material" not in primitive:
         return {}, "", ""
     material = document.entry("materials", primitive["material"])
@@ -65,6 +64,7 @@ def _surface(document: GltfDocument, primitive: dict[str, Any]) -> tuple[dict[st
 
 
 def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
+    """Sample the base colour's texture at the vertices; None without texture or texture coordinates."""
     surface, name, _ = _surface(document, primitive)
     if name not in surface:
         return None
@@ -82,18 +82,18 @@ def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: in
 
 
 def _wrap(document: GltfDocument, use: dict[str, Any]) -> tuple[str, str]:
-    """What a texture shows beyond its edges, along u and v."""
+    """Return the wrap modes of a texture along u and v."""
     texture = document.entry("textures", use.get("index"))
     sampler = document.entry("samplers", texture["sampler"]) if "sampler" in texture else {}
-    modes = [_WRAPS.get(document.number(sampler, name, _REPEATED), REPEAT) for name in ("wrapS", "wrapT")]
+    modes = [_WRAPS.get(document.number(sampler, name, 10497), REPEAT) for name in ("wrapS", "wrapT")]
     return modes[0], modes[1]
 
 
 def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "H W 3"]:
-    """The decoded image of a texture.
+    """Return the decoded image of a texture.
 
     Raises:
-        InputError: it names the file that is missing, or what is wrong with the picture.
+        InputError: a missing file or a damaged image.
     """
     texture = document.entry("textures", use.get("index"))
     webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
@@ -115,7 +115,7 @@ def _decoded(document: GltfDocument, index: int) -> Image:
 
 
 def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> Float64[np.ndarray, "N 2"]:
-    """KHR_texture_transform: scale, then rotation, then offset."""
+    """Apply KHR_texture_transform: scale, then rotation, then offset."""
     if not transform:
         return uv
     scale, offset = (
@@ -129,7 +129,7 @@ def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> F
 
 
 def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> Num[np.ndarray, "N 3"] | None:
-    """The vertex colours: sRGB bytes, or else linear and float."""
+    """Return the vertex colours as sRGB bytes, or as linear floats."""
     attributes = document.part(primitive, "attributes")
     if "COLOR_0" not in attributes:
         return None
@@ -139,14 +139,14 @@ def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int
     stored = document.entry("accessors", attributes["COLOR_0"]).get("componentType")
     rgb = colors[:, :3].astype(np.float64)
     if stored == 5121:
-        # glTF's vertex colours are linear, but those of eight bits are in practice the sRGB bytes of another file.
+        # glTF defines vertex colours as linear, but 8-bit ones are in practice sRGB bytes of another file.
         return np.rint(rgb * (255.0 if colors.dtype.kind == "f" else 1.0)).astype(np.uint8)
     rgb = rgb if colors.dtype.kind == "f" else rgb / 65535.0
     return np.clip(np.nan_to_num(rgb), 0.0, 1.0)
 
 
 def _factor(document: GltfDocument, primitive: dict[str, Any]) -> Float64[np.ndarray, " 3"] | None:
-    """The base colour's factor, linear; None where the material states none."""
+    """Return the linear factor of the base colour; None if the material states none."""
     surface, _, factor = _surface(document, primitive)
     if factor not in surface:
         return None

@@ -1,4 +1,4 @@
-"""glTF 2.0's container and accessors, each offset, stride and count held against the bytes that are there.
+"""Read the container and the accessors of glTF 2.0, checking each offset, stride and count against the file.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6 (binary data) and 4.4 (GLB).
 """
@@ -15,25 +15,22 @@ import numpy as np
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, parse_json
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.texture import Pictures, beside
+from smplxpp.core.mesh_files.texture import TextureCache, file_beside
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 _DAMAGED = "the file is damaged or incomplete: copy or export it again"
-# Accessors of no bytes at all, zeros with a few sparse values, are real but small.
-_MOST_WITHOUT_BYTES = 1 << 20
 
 
 class GltfDocument:
-    """A `.gltf` or `.glb` file.
-
-    Args:
-        path: of the file.
+    """A `.gltf` or `.glb` file with its JSON document and buffers.
 
     Attributes:
-        path: of the file. subject: its name in messages. size: bytes of the file.
-        json: the document. pictures: those decoded, by the index of the image.
+        path: path of the file.
+        subject: name of the file in messages.
+        size: size of the file in bytes.
+        json: JSON document.
+        pictures: cache of decoded images, by the index of the image.
 
     Raises:
         InputError: no glTF 2.0, or a container whose lengths do not fit.
@@ -52,10 +49,11 @@ class GltfDocument:
             raise InputError(self.subject, expected="glTF 2.0", received=f"version {version or 'unknown'}")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
-        self.pictures = Pictures(self.subject)
+        self.pictures = TextureCache(self.subject)
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes | None]:
-        """The JSON chunk and the binary one of a GLB."""
+        """Return the JSON chunk and the binary chunk (None without one) of a GLB."""
+        json_chunk, binary_chunk = 0x4E4F534A, 0x004E4942  # "JSON" and "BIN\0" as little-endian integers
         found: dict[int, bytes] = {}
         place, end = 12, min(int.from_bytes(data[8:12], "little"), len(data))
         if int.from_bytes(data[4:8], "little") != 2 or int.from_bytes(data[8:12], "little") > len(data):
@@ -68,20 +66,20 @@ class GltfDocument:
                 )
             found.setdefault(kind, data[place + 8 : place + 8 + length])
             place += 8 + length
-        if _JSON_CHUNK not in found:
+        if json_chunk not in found:
             raise InputError(self.subject, expected="a JSON chunk", received="none", remedy=_DAMAGED)
-        return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+        return found[json_chunk], found.get(binary_chunk)
 
     def part(self, of: dict[str, Any], name: str) -> dict[str, Any]:
-        """An object's member that is an object; {} where it has none."""
+        """Return a member that must be an object; {} where it is missing."""
         return as_object(of.get(name, {}), subject=f"{self.subject}: {name}")
 
     def items(self, of: dict[str, Any], name: str) -> list[Any]:
-        """An object's member that is a list; [] where it has none."""
+        """Return a member that must be a list; [] where it is missing."""
         return as_list(of.get(name, []), subject=f"{self.subject}: {name}")
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
-        """The object at an index of one of the document's lists.
+        """Return the object at an index of one of the document's lists.
 
         Raises:
             InputError: no such entry.
@@ -93,11 +91,11 @@ class GltfDocument:
         return as_object(entries[place], subject=f"{self.subject}: {kind}[{place}]")
 
     def number(self, of: dict[str, Any], name: str, default: int | None = None) -> int:
-        """A count, an offset or an index of an object."""
+        """Return a member that must be a count, an offset or an index."""
         return as_integer(of.get(name, default), subject=f"{self.subject}: {name}", least=0, most=2**53)
 
     def view(self, index: Any) -> tuple[memoryview, int]:
-        """The bytes of a buffer view, and its stride (0 for none).
+        """Return the bytes of a buffer view, and its stride (0 for none).
 
         Raises:
             InputError: a view outside its buffer, or a compressed one.
@@ -105,7 +103,7 @@ class GltfDocument:
         view = self.entry("bufferViews", index)
         for name in self.part(view, "extensions"):
             if name in ("EXT_meshopt_compression", "KHR_meshopt_compression"):
-                raise compressed(self.subject, name)
+                raise compression_error(self.subject, name)
         data = self._buffer(self.number(view, "buffer"))
         start, length = self.number(view, "byteOffset", 0), self.number(view, "byteLength")
         if start + length > len(data):
@@ -118,7 +116,7 @@ class GltfDocument:
         return memoryview(data)[start : start + length], self.number(view, "byteStride", 0)
 
     def accessor(self, index: Any) -> np.ndarray:
-        """An accessor's values, (count, components): as stored, or in [-1, 1] or [0, 1] where they are normalized.
+        """Return the values of an accessor, (count, components), as stored or normalized to [-1, 1] or [0, 1].
 
         Raises:
             InputError: values outside their buffer view, or an unknown type.
@@ -135,7 +133,7 @@ class GltfDocument:
             )
         if "bufferView" in accessor:
             values = self._values(accessor, count, width, kind)
-        elif "sparse" in accessor and count <= _MOST_WITHOUT_BYTES:
+        elif "sparse" in accessor and count <= 1 << 20:  # zeros without bytes, which no small file may blow up
             values = np.zeros((count, width), kind)
         else:
             raise InputError(f"{self.subject}: accessor", expected="data", received="none", remedy=_DAMAGED)
@@ -147,7 +145,7 @@ class GltfDocument:
         return values
 
     def _values(self, of: dict[str, Any], count: int, width: int, kind: str) -> np.ndarray:
-        """The values that lie in a buffer view, not copied."""
+        """Return a view of values in a buffer view, without a copy."""
         data, stride = self.view(of["bufferView"])
         start, item = self.number(of, "byteOffset", 0), width * np.dtype(kind).itemsize
         stride = stride or item
@@ -163,7 +161,7 @@ class GltfDocument:
         return np.ndarray((count, width), kind, buffer=data, offset=start, strides=(stride, item // width))
 
     def _with_sparse(self, values: np.ndarray, sparse: dict[str, Any], kind: str) -> np.ndarray:
-        """The values with those replaced that a sparse accessor lists."""
+        """Return a copy of the values with the entries of a sparse accessor replaced."""
         count = self.number(sparse, "count")
         where, what = self.part(sparse, "indices"), self.part(sparse, "values")
         places_kind = _COMPONENTS.get(self.number(where, "componentType"), "")
@@ -179,6 +177,7 @@ class GltfDocument:
         return values
 
     def _buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer: the binary chunk, a data URI, or a file beside the document."""
         if index not in self._buffers:
             buffer = self.entry("buffers", index)
             if "uri" in buffer:
@@ -201,11 +200,11 @@ class GltfDocument:
 
     @property
     def file_bytes(self) -> int:
-        """The bytes of the other files that were read so far."""
+        """Total size in bytes of the other files that were read so far."""
         return sum(len(data) for data in self._files.values())
 
     def resource(self, uri: str) -> bytes | None:
-        """The bytes of a data URI, or of a file inside the document's folder; None where there is none.
+        """Return the bytes of a data URI or of a file inside the document's folder; None without such a file.
 
         Raises:
             InputError: a data URI that is not base64.
@@ -216,7 +215,7 @@ class GltfDocument:
                 return binascii.a2b_base64(text) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(text)
             except (binascii.Error, ValueError) as error:
                 raise InputError(f"{self.subject}: data URI", expected="base64", received=str(error)) from None
-        found = beside(self.path, urllib.parse.unquote(uri))
+        found = file_beside(self.path, urllib.parse.unquote(uri))
         if found is None:
             return None
         if found not in self._files:
@@ -224,8 +223,8 @@ class GltfDocument:
         return self._files[found]
 
 
-def compressed(subject: str, name: str) -> InputError:
-    """The refusal of a compression that is not read."""
+def compression_error(subject: str, name: str) -> InputError:
+    """Return the error for a geometry compression that is not supported."""
     return InputError(
         subject,
         expected="uncompressed geometry",

@@ -1,6 +1,6 @@
-"""glTF and GLB meshes: the scene's primitives one after the other, in world coordinates.
+"""Read glTF and GLB meshes: all primitives of the scene, concatenated in world coordinates.
 
-Vertices are those of the accessors in their order, nodes depth first; primitives of a node that share an accessor of
+Vertices keep the order of their accessors, nodes come depth first; primitives of a node that share an accessor of
 positions share its vertices.
 """
 
@@ -15,26 +15,23 @@ from jaxtyping import Float64, Int64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_numbers, as_object
 from smplxpp.core.mesh_files.gltf_colors import primitive_colors
-from smplxpp.core.mesh_files.gltf_document import GltfDocument, compressed
+from smplxpp.core.mesh_files.gltf_document import GltfDocument, compression_error
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, require_indices, warn
-from smplxpp.core.mesh_files.texture import LOST
+from smplxpp.core.mesh_files.texture import MISSING_GRAY
 
+# Modes of primitives: triangles, triangle strip, triangle fan. Lower ones are points and lines.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MOVING = {"matrix", "translation", "rotation", "scale"}
-# A file may show one mesh many times over; beyond its own bytes only this many vertices and faces are made of it.
-_MOST_SHARED = 1_000_000
-# And primitives that share vertices may look at them this often in all.
-_MOST_VISITS = 1_000_000_000
 
 
 def read_gltf(path: Path) -> RawMesh:
     """Read a `.gltf` or `.glb` file as one mesh; skinned meshes stand as the file's joints pose them.
 
-    Colours are the base colour's picture at the vertices, else `COLOR_0`, else the base colour. Lines and points are
-    left out, which a warning says; morph targets and motions too.
+    Colours are the product of the base colour's texture, `COLOR_0` and the base colour, as far as present. Lines and
+    points are left out with a warning; morph targets and animations without one.
 
     Raises:
-        InputError: no glTF 2.0, Draco or meshopt compression, data outside the file, a node below two others.
+        InputError: no glTF 2.0, Draco or meshopt compression, data outside the file, a node with two parents.
     """
     document = GltfDocument(path)
     parts = _Parts(document)
@@ -57,7 +54,7 @@ def read_gltf(path: Path) -> RawMesh:
 
 
 class _Parts:
-    """The primitives read so far."""
+    """Accumulates primitives into one mesh, with limits on its size."""
 
     def __init__(self, document: GltfDocument) -> None:
         self._document = document
@@ -75,7 +72,14 @@ class _Parts:
         joints: Float64[np.ndarray, "J 4 4"] | None,
         shared: dict[int, int],
     ) -> None:
-        """Append a primitive; `shared` has the parts of the node's earlier ones by their accessor of positions."""
+        """Append a primitive.
+
+        Args:
+            primitive: JSON object of the primitive.
+            world: transform from the node to the world, for meshes without a skin.
+            joints: joint matrices of the node's skin; None: not skinned.
+            shared: parts of the node's earlier primitives by their accessor of positions; extended here.
+        """
         document, subject = self._document, self._document.subject
         mode = as_integer(primitive.get("mode", _TRIANGLES), subject=f"{subject}: mode", least=0, most=6)
         attributes = document.part(primitive, "attributes")
@@ -87,9 +91,10 @@ class _Parts:
         if draco in document.part(primitive, "extensions") and "bufferView" not in document.entry(
             "accessors", position
         ):
-            raise compressed(subject, draco)
+            raise compression_error(subject, draco)
         if position not in shared:
             shared[position] = self._add_vertices(attributes, position, world, joints)
+        # Indices into the part's vertices; without any, the vertices follow each other.
         part = shared[position]
         count = len(self._vertices[part])
         self._visits += count
@@ -102,10 +107,12 @@ class _Parts:
             require_indices(indices, count, subject=subject, kind="indices")
         else:
             indices = np.arange(count, dtype=np.int64)
+        # A reflection turns faces inside out, so their corners are reversed.
         faces = _triangles(indices, mode)
         mirrored = joints is None and np.linalg.det(world[:3, :3]) < 0
         self._faces.append((faces[:, ::-1] if mirrored else faces) + self._starts[part])
         self._charge(len(faces))
+        # A vertex that several primitives share keeps the colour of the first one that colours it.
         used = np.zeros(count, bool)
         used[indices] = True
         used &= ~self._colored[part]
@@ -121,11 +128,12 @@ class _Parts:
         world: Float64[np.ndarray, "4 4"],
         joints: Float64[np.ndarray, "J 4 4"] | None,
     ) -> int:
+        """Append the vertices of an accessor in world coordinates; returns the index of their part."""
         points = self._document.accessor(position).astype(np.float64)
         if points.shape[1] != 3:
             raise InputError(f"{self._document.subject}: POSITION", expected="three coordinates", received="others")
         self._charge(len(points))
-        with np.errstate(all="ignore"):  # what overflows becomes infinite, which is refused where it matters
+        with np.errstate(all="ignore"):  # overflowing coordinates become infinite, and are refused by the callers
             if joints is None:
                 points = points @ world[:3, :3].T + world[:3, 3]
             else:
@@ -133,23 +141,27 @@ class _Parts:
         self._starts.append(self._count)
         self._count += len(points)
         self._vertices.append(points)
-        self._colors.append(np.full((len(points), 3), LOST, np.uint8))
+        self._colors.append(np.full((len(points), 3), MISSING_GRAY, np.uint8))
         self._colored.append(np.zeros(len(points), bool))
         return len(self._vertices) - 1
 
     def _charge(self, elements: int) -> None:
-        """Refuse a small file that repeats its meshes beyond all memory."""
+        """Refuse a small file that repeats its meshes until memory is exhausted.
+
+        A file may contain a mesh once and show it many times. Allowed are as many vertices and faces as the file has
+        bytes, or a million, and a thousand million reads of shared vertices.
+        """
         self._made += elements
-        most = max(_MOST_SHARED, self._document.size + self._document.file_bytes)
-        if self._made > most or self._visits > _MOST_VISITS:
+        most = max(1_000_000, self._document.size + self._document.file_bytes)
+        if self._made > most or self._visits > 1_000_000_000:
             raise InputError(
                 self._document.subject,
                 expected=f"at most {most} vertices and faces from a file of this size",
-                received="nodes or primitives that repeat its meshes beyond them",
+                received="nodes or primitives that repeat its meshes more often",
             )
 
     def joined(self) -> RawMesh:
-        """All parts as one mesh."""
+        """Return all parts as one mesh."""
         if self._left_out:
             warn(f"{self._document.subject}: {self._left_out} primitives of points or lines are left out")
         if not self._vertices:
@@ -159,6 +171,7 @@ class _Parts:
 
 
 def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray, "m 3"]:
+    """Convert the indices of triangles, a strip or a fan to faces; every second face of a strip is reversed."""
     if mode == _TRIANGLES:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
     k = np.arange(max(len(indices) - 2, 0))
@@ -169,7 +182,7 @@ def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray,
 
 
 def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
-    """The scene's nodes, depth first, with their transforms to the world."""
+    """Return the nodes of the scene, depth first, with their transforms to the world."""
     scenes = document.items(document.json, "scenes")
     if scenes:
         roots = document.items(document.entry("scenes", document.json.get("scene", 0)), "nodes")
@@ -194,6 +207,7 @@ def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[n
 
 
 def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform of a node to its parent: its matrix, or translation times rotation times scale."""
     subject = f"{document.subject}: node"
     if "matrix" in node:
         return as_numbers(node["matrix"], (16,), subject=f"{subject} matrix").reshape(4, 4).T
@@ -214,12 +228,12 @@ def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, 
 def _joint_matrices(
     document: GltfDocument, index: int, worlds: dict[int, Float64[np.ndarray, "4 4"]]
 ) -> Float64[np.ndarray, "J 4 4"]:
-    """A skin's joints: their transforms to the world times their inverse bind matrices.
+    """Return the joint matrices of a skin: transforms to the world times inverse bind matrices.
 
     Args:
-        document: the file.
-        index: of the skin.
-        worlds: the nodes' transforms by the identity of their JSON objects.
+        document: file of the skin.
+        index: index of the skin.
+        worlds: transforms of the nodes to the world, by the identity of their JSON objects.
     """
     skin = document.entry("skins", index)
     joints = document.items(skin, "joints")
@@ -242,6 +256,7 @@ def _skinned(
     points: Float64[np.ndarray, "n 3"],
     joints: Float64[np.ndarray, "J 4 4"],
 ) -> Float64[np.ndarray, "n 3"]:
+    """Pose vertices by linear blend skinning; weights are normalised, and vertices without weights stay."""
     out = np.zeros_like(points)
     total = np.zeros((len(points), 1))
     k = 0

@@ -1,7 +1,7 @@
-"""Mesh files: the one door to PLY, OBJ, glTF, STL, OFF and our npz; write PLY.
+"""Read mesh files (PLY, OBJ, glTF, STL, OFF, npz, pickle) and write PLY.
 
-Nothing is merged, split, reordered or repaired on reading, so labels that come in a second file keep their meaning:
-vertices are the file's own, faces too, but that a polygon becomes a fan of triangles in its place.
+Nothing is merged, split, reordered or repaired on reading, so that labels in a second file stay valid. Vertices and
+faces are those of the file, except that a polygon becomes a fan of triangles in its place.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj
 from smplxpp.core.mesh_files.ply_file import read_ply
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, require_reach
+from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, require_coordinate_range
 from smplxpp.core.mesh_files.stl_off_files import read_off, read_stl
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A checked mesh and what came with it; see `RawMesh` for the shapes."""
+    """A checked mesh with the colours and properties of its file; see `RawMesh` for the shapes."""
 
     mesh: TriangleMesh
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None
@@ -39,7 +39,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path) -> MeshFile:
-    """Read a mesh file and check it.
+    """Read a mesh file and check its mesh.
 
     Raises:
         InputError: missing, unknown or unreadable file, no faces, or what `TriangleMesh` refuses.
@@ -59,10 +59,10 @@ def read_raw_mesh(path: str | Path, *, clouds: bool = False) -> RawMesh:
 
     Args:
         path: of the file.
-        clouds: a file of points without faces is read, too (`RawMesh.is_cloud`).
+        clouds: whether to accept points without faces (`RawMesh.is_cloud`).
 
     Raises:
-        InputError: missing, unknown, damaged or compressed file, no faces, or coordinates beyond 1e12.
+        InputError: missing, unknown, damaged or compressed file, no faces, or coordinates over 1e12.
     """
     path = regular_file(path, subject="mesh file")
     reader = _READERS.get(path.suffix.lower())
@@ -76,7 +76,7 @@ def read_raw_mesh(path: str | Path, *, clouds: bool = False) -> RawMesh:
             received=f"{len(raw.vertices)} vertices, {len(raw.faces)} faces",
             remedy="export the surface, not the point cloud",
         )
-    require_reach(raw.vertices, subject=f"mesh file {path}")
+    require_coordinate_range(raw.vertices, subject=f"mesh file {path}")
     return raw
 
 
@@ -92,6 +92,7 @@ def _read_pickle(path: Path) -> RawMesh:
 
 
 def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
+    """Make a mesh from arrays by name: vertices, faces or none for a point cloud, colours and normals if present."""
     subject = f"mesh file {path}"
     names = {"vertices": ("vertices", "verts", "v", "points"), "faces": ("faces", "f"), "normals": ("normals",)}
     found = {key: next((values[k] for k in known if k in values), None) for key, known in names.items()}
@@ -141,8 +142,9 @@ def write_ply(
     vertex_properties: dict[str, np.ndarray] | None = None,
     face_properties: dict[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a binary little-endian PLY, whole or not at all; coordinates as float32."""
+    """Write a binary little-endian PLY atomically; coordinates and other floats become float32, integers int32."""
     mesh = as_mesh(mesh, subject="mesh")
+    # Columns of a vertex and of a face: name, numpy type, values.
     vertex = [(axis, "<f4", mesh.vertices[:, k]) for k, axis in enumerate("xyz")]
     if vertex_colors is not None:
         vertex += [(name, "u1", np.asarray(vertex_colors)[:, k]) for k, name in enumerate(("red", "green", "blue"))]
@@ -153,6 +155,7 @@ def write_ply(
     header += [f"property {ply_type[kind]} {name}" for name, kind, _ in vertex]
     header += [f"element face {mesh.face_count}", "property list uchar int vertex_indices"]
     header += [f"property {ply_type[kind]} {name}" for name, kind, _ in face]
+    # Header, then rows of vertices, then rows of faces, each in one structured array.
     buffer = io.BytesIO()
     buffer.write(("\n".join(header) + "\nend_header\n").encode())
     rows = np.zeros(mesh.vertex_count, dtype=[(name, kind) for name, kind, _ in vertex])

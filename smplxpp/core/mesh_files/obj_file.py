@@ -1,7 +1,7 @@
-"""Wavefront OBJ files: vertices, faces, colours; https://paulbourke.net/dataformats/obj/.
+"""Read Wavefront OBJ files: vertices, faces, colours; https://paulbourke.net/dataformats/obj/.
 
-Vertices are the file's `v` lines, all of them and in their order, whatever objects, groups, materials, texture
-coordinates and normals the file divides them by; faces are its `f` lines.
+Vertices are the file's `v` lines, all of them and in their order, regardless of objects, groups, materials, texture
+coordinates and normals; faces are its `f` lines.
 """
 
 from __future__ import annotations
@@ -28,20 +28,27 @@ from smplxpp.core.mesh_files.raw_mesh import (
     warn,
     word_starts,
 )
-from smplxpp.core.mesh_files.texture import CLAMP, LOST, REPEAT, Pictures, mean_of_corners, sample_texture
+from smplxpp.core.mesh_files.texture import (
+    CLAMP,
+    MISSING_GRAY,
+    REPEAT,
+    TextureCache,
+    average_corner_colors,
+    sample_texture,
+)
 
-# Lines that are numbers are read together up to this many bytes, so that the work space stays small.
+# Bytes of lines that are parsed at once, which bounds the work space.
 _BLOCK = 1 << 24
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Read an OBJ file.
+    """Read the vertices, faces and colours of an OBJ file.
 
-    Colours are those of the `v` lines (`v x y z r g b`); without them the material's: its picture's mean over the
-    texture coordinates that the vertex has at its corners, or its `Kd`.
+    Colours are those of the `v` lines (`v x y z r g b`), else those of the material: its texture averaged over the
+    texture coordinates of the vertex, or its `Kd`.
 
     Raises:
-        InputError: a word that is no number, a vertex of fewer than three, indices of vertices that do not exist.
+        InputError: a word that is not a number, a vertex of fewer than three numbers, indices of missing vertices.
     """
     subject = f"mesh file {path}"
     lines = _Lines.of(read_bytes(path, subject="mesh file"))
@@ -61,7 +68,7 @@ def read_obj(path: Path) -> RawMesh:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """A text's lines: (L,) where they begin, blanks skipped, where they end, and the bytes of it all."""
+    """Lines of a text: the text, (L,) the start of each line after its blanks, and (L,) its end."""
 
     text: bytes
     starts: Int64[np.ndarray, " L"]
@@ -83,10 +90,11 @@ class _Lines:
         return cls(text, starts, ends)
 
     def of_kind(self, word: bytes) -> Int64[np.ndarray, " n"]:
-        """The numbers of the lines whose first word is `word`."""
+        """Return the numbers of the lines whose first word is `word`."""
         return np.flatnonzero(self.kind_mask(word))
 
     def kind_mask(self, word: bytes) -> Bool[np.ndarray, " L"]:
+        """Tell for each line whether its first word is `word`."""
         data = as_bytes(self.text)
         mask = self.ends - self.starts > len(word)
         for k, byte in enumerate(word):
@@ -94,18 +102,22 @@ class _Lines:
         return mask & IS_SPACE[data[np.minimum(self.starts + len(word), len(data) - 1)]]
 
     def blocks(self, chosen: Int64[np.ndarray, " n"], word: bytes) -> list[tuple[bytes, np.ndarray]]:
-        """The chosen lines without first words and comments, in blocks; (m,) where each line begins in its block."""
+        """Return the chosen lines without first words and comments, in blocks that bound the work space.
+
+        Each block comes with (m,) the start of each line in it.
+        """
         out: list[tuple[bytes, np.ndarray]] = []
         if not len(chosen):
             return out
         size = np.cumsum(self.ends[chosen] - self.starts[chosen])
         for rows in np.split(chosen, np.flatnonzero(np.diff(size // _BLOCK)) + 1):
+            # Consecutive lines are copied as one run of bytes.
             breaks = np.flatnonzero(np.diff(rows) > 1)
             first, last = rows[np.concatenate([[0], breaks + 1])], rows[np.append(breaks, len(rows) - 1)]
             runs = [self.text[a:b] for a, b in zip(self.starts[first], self.ends[last], strict=True)]
             shift = np.cumsum([0] + [len(run) for run in runs[:-1]]) - self.starts[first]
             starts = self.starts[rows] + np.repeat(shift, np.diff(np.concatenate([[0], breaks + 1, [len(rows)]])))
-            # The first word becomes blanks: what is left are numbers, and every line keeps its place.
+            # Overwrite the first word by blanks, so that only numbers remain and every line keeps its place.
             data = as_bytes(b"".join(runs)).copy()
             data[starts[:, None] + np.arange(len(word))] = ord(" ")
             text = data.tobytes()
@@ -115,7 +127,7 @@ class _Lines:
         return out
 
     def words(self, keyword: bytes) -> list[tuple[int, str]]:
-        """What follows a keyword, with the number of the line, for each line that begins with it."""
+        """Return the rest of each line that begins with a keyword, with the number of the line."""
         return [
             (int(k), self.text[self.starts[k] + len(keyword) : self.ends[k]].decode("utf-8", "replace").strip())
             for k in self.of_kind(keyword)
@@ -141,7 +153,7 @@ def _read_vertices(lines: _Lines, subject: str) -> tuple[Float64[np.ndarray, "N 
 
 
 def _rows(lines: _Lines, word: bytes, subject: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The numbers (n,) of all lines of a kind, block by block, and how many are in each line (m,)."""
+    """Return the numbers (n,) of all lines of a kind, block by block, and their count in each line (m,)."""
     out = []
     for text, starts in lines.blocks(lines.of_kind(word), word):
         values = parse_numbers(text, subject=f"{subject}: {word.decode()} lines")
@@ -152,10 +164,10 @@ def _rows(lines: _Lines, word: bytes, subject: str) -> list[tuple[np.ndarray, np
 def _read_faces(
     lines: _Lines, face_lines: Int64[np.ndarray, " F"], subject: str
 ) -> tuple[Int64[np.ndarray, "C 2"], Int64[np.ndarray, " F"]]:
-    """Each corner's vertex and texture coordinate as the file counts them, 0 for none; and the corners of each line."""
+    """Return vertex and texture coordinate of each corner as the file counts them (0: none), and corners per line."""
     references, sizes = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     for text, starts in lines.blocks(face_lines, b"f"):
-        while b"//" in text:  # a reference that is left out
+        while b"//" in text:  # an omitted reference
             text = text.replace(b"//", b"/0/")
             starts = np.concatenate([[0], np.flatnonzero(as_bytes(text) == 10)[:-1] + 1])
         corners = word_starts(text)
@@ -167,6 +179,7 @@ def _read_faces(
         corner = np.searchsorted(corners, places, side="right") - 1
         if (corner < 0).any() or not np.isin(corners, places).all():
             raise InputError(f"{subject}: f lines", expected="corners that name a vertex", received="others")
+        # The slot of a number is the count of slashes before it in its corner: vertex/texture/normal.
         slashes = np.flatnonzero(as_bytes(text) == 47)
         slot = np.searchsorted(slashes, places) - np.searchsorted(slashes, corners)[corner]
         block = np.zeros((len(corners), 2), np.int64)
@@ -180,7 +193,7 @@ def _read_faces(
 def _resolve(
     references: Int64[np.ndarray, " C"], defined: Int64[np.ndarray, " n"], corner_lines: Int64[np.ndarray, " C"]
 ) -> Int64[np.ndarray, " C"]:
-    """Indices from 0; a negative reference counts back from the line in which it stands. -1 for none."""
+    """Convert references to indices from 0 (-1: none); a negative one counts back from its own line."""
     if len(references) and references.min() < 0:
         back = references < 0
         known = np.searchsorted(defined, corner_lines[back])
@@ -198,17 +211,17 @@ def _material_colors(
     *,
     vertex_count: int,
 ) -> UInt8[np.ndarray, "N 3"] | None:
-    """The colours that the materials give, the mean over a vertex's corners; None where no material has any."""
+    """Return vertex colours by the materials, averaged over the corners of a vertex; None if no material has any."""
     uses, libraries = lines.words(b"usemtl"), lines.words(b"mtllib")
     if not uses or not libraries:
         return None
     materials = read_materials(path, [name for _, name in libraries])
     names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
-    inside = (corners >= 0) & (corners < vertex_count)  # others are of faces that were left out
+    inside = (corners >= 0) & (corners < vertex_count)  # other corners belong to faces that were left out
     corners, uv_references, corner_lines = corners[inside], uv_references[inside], corner_lines[inside]
     use = np.searchsorted([line for line, _ in uses], corner_lines) - 1
     used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
-    # A vertex between two materials has the colour of its first corner's.
+    # A vertex between two materials takes the material of its first corner.
     first = np.zeros(vertex_count, np.int64)
     vertices, places = np.unique(corners, return_index=True)
     first[vertices] = used[places]
@@ -217,20 +230,21 @@ def _material_colors(
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
     index = _resolve(uv_references, lines.of_kind(b"vt"), corner_lines)
     index = np.where(index < len(uv), index, -1)
-    colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
-    pictures = Pictures(f"mesh file {path}")
+    colors, found = np.full((vertex_count, 3), MISSING_GRAY, np.uint8), False
+    pictures = TextureCache(f"mesh file {path}")
     order = np.argsort(used, kind="stable")
     bounds = np.searchsorted(used[order], np.arange(len(names) + 1))
+    # One material at a time: texture at the corners' coordinates, else the plain colour.
     for (name, _), start, end in zip(names.items(), bounds[:-1], bounds[1:], strict=True):
         material, chosen = materials.get(name, Material()), order[start:end]
         if material.picture is not None:
-            picture = pictures.beside(path, material.picture)
+            picture = pictures.load(path, material.picture)
             chosen = chosen[index[chosen] >= 0]
             if picture is not None:
                 with np.errstate(all="ignore"):
                     place = uv[index[chosen]] * material.scale + material.offset
                 wrap = (CLAMP, CLAMP) if material.clamp else (REPEAT, REPEAT)
-                at, mean = mean_of_corners(corners[chosen], sample_texture(picture, place, wrap=wrap))
+                at, mean = average_corner_colors(corners[chosen], sample_texture(picture, place, wrap=wrap))
                 colors[at] = mean
                 found = True
         elif material.color is not None:
@@ -240,7 +254,7 @@ def _material_colors(
 
 
 def _first_two(values: Float64[np.ndarray, " n"], counts: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:
-    """The first two numbers of each line; a lone one has 0 for its second."""
+    """Return the first two numbers of each line; a missing second one is 0."""
     values = np.append(values, [0.0, 0.0])
     first = np.cumsum(counts) - counts
     return np.stack([np.where(counts > k, values[first + k], 0.0) for k in range(2)], axis=1)

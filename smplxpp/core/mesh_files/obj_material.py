@@ -1,4 +1,4 @@
-"""The colours of an OBJ file's materials, from its `.mtl` files."""
+"""Read the colours and textures of an OBJ file's materials from its `.mtl` files."""
 
 from __future__ import annotations
 
@@ -10,21 +10,25 @@ from jaxtyping import UInt8
 
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.raw_mesh import warn
-from smplxpp.core.mesh_files.texture import beside
+from smplxpp.core.mesh_files.texture import file_beside
 
-# How many numbers follow an option of a picture's name.
+# Options before the name of a texture, with the number of their arguments; vectors have one to three.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}
 _VECTORS = ("-mm", "-o", "-s", "-t")
-_MOST_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A material's colour: `color` (3,) of its `Kd`, `picture` the name in its `map_Kd`; None for what it lacks.
+    """Colour of a material: a plain colour, or a texture with its placement.
 
-    Beside a picture `Kd` is left out: it should be a factor, but exporters write 0.8 or 0 there without meaning it.
-    Texture coordinates are multiplied by `scale` and moved by `offset` before the picture is looked up; `clamp`: its
-    last texels go on beyond its edges, where it would else be repeated.
+    With a texture `Kd` is ignored: it should be a factor, but exporters write 0.8 or 0 there without meaning it.
+
+    Attributes:
+        color: (3,) of `Kd`; None without it.
+        picture: name of the texture in `map_Kd`; None without it.
+        scale: factor of the texture coordinates.
+        offset: offset of the texture coordinates after scaling.
+        clamp: repeat the last texels outside the texture instead of the whole texture.
     """
 
     color: UInt8[np.ndarray, " 3"] | None = None
@@ -35,22 +39,22 @@ class Material:
 
 
 def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
-    """The materials of an OBJ file by name; a file that is missing or no text is left out with a warning.
+    """Return the materials of an OBJ file by name; missing files are left out with a warning.
 
     Args:
-        path: of the OBJ file.
-        libraries: what follows `mtllib`, a line an entry: a name with blanks in it, or several names.
+        path: path of the OBJ file.
+        libraries: text after `mtllib` of each line: a name with blanks in it, or several names.
     """
     out: dict[str, Material] = {}
     seen: set[Path] = set()
     for entry in dict.fromkeys(libraries):
-        for name in [entry] if beside(path, entry) is not None else entry.split():
-            found = beside(path, name)
+        for name in [entry] if file_beside(path, entry) is not None else entry.split():
+            found = file_beside(path, name)
             if found is None:
                 warn(f"mesh file {path}: colours of its materials are lost: {name[:200]!r} is not in its folder")
             elif found not in seen:
                 seen.add(found)
-                data = read_bytes(found, subject="material file", most=_MOST_BYTES)
+                data = read_bytes(found, subject="material file", most=1 << 24)
                 out |= _parse(data.decode("utf-8", "replace"))
     return out
 
@@ -83,13 +87,13 @@ def _kd(text: str) -> UInt8[np.ndarray, " 3"] | None:
 
 
 def _picture(text: str) -> Material:
-    """What follows `map_Kd`: options, then a name, which may hold blanks."""
+    """Parse the text after `map_Kd`: options, then a name, which may contain blanks."""
     words, given = text.split(), dict[str, list[str]]()
     while words and words[0] in (*_OPTIONS, *_VECTORS) and len(words) > 1:
         option = words.pop(0)
         given[option] = []
         for _ in range(3 if option in _VECTORS else _OPTIONS[option]):
-            # Of a vector's three numbers the last two may be left out.
+            # The last two numbers of a vector may be missing.
             if len(words) > 1 and (option not in _VECTORS or _is_number(words[0])):
                 given[option].append(words.pop(0))
     return Material(
@@ -101,7 +105,7 @@ def _picture(text: str) -> Material:
 
 
 def _pair(words: list[str], default: float) -> tuple[float, float]:
-    """The first two numbers of an option; the default for one that is left out or infinite."""
+    """Return the first two numbers of an option; missing or infinite ones have the default."""
     values = [float(word) for word in words[:2]]
     values = [value if np.isfinite(value) else default for value in values] + [default, default]
     return values[0], values[1]

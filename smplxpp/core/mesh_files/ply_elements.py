@@ -1,7 +1,7 @@
-"""PLY's elements: what a header says of them, and their values, read within the file's size.
+"""Read the elements of a PLY file by its header, within the size of the file.
 
-http://paulbourke.net/dataformats/ply/. A property is one value or a list with its own length in each row. Rows are
-read together where all lists of a property are equally long, which is the rule; otherwise row by row.
+http://paulbourke.net/dataformats/ply/. A property is one value, or a list with its own length in each row. Rows are
+read at once if all lists of a property are equally long, which is common, otherwise row by row.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an element: its name, the type of its values, and of its lengths where it is a list."""
+    """A property of an element: its name, the type of its values, and for a list the type of its lengths."""
 
     name: str
     value_type: str
@@ -40,7 +40,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """An element of a header: its name, how many rows the header claims, and its properties in their order."""
+    """An element of a header: its name, the number of rows that the header claims, and its properties in order."""
 
     name: str
     count: int
@@ -49,7 +49,7 @@ class Element:
 
 @dataclass(frozen=True, eq=False)
 class ListColumn:
-    """A list property's values: (S,) all of them in order, and (R,) how many are each row's."""
+    """Values of a list property: (S,) all values in order, and (R,) the number of values in each row."""
 
     values: np.ndarray
     lengths: Int64[np.ndarray, " R"]
@@ -60,13 +60,13 @@ Columns = dict[str, "np.ndarray | ListColumn"]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The data after a header as equal cells: bytes of a binary file, numbers of an ASCII one.
+    """The data after a header as an array of cells: bytes of a binary file, numbers of an ASCII file.
 
     Attributes:
         data: (n,) uint8 or float64.
         byte_order: "<", ">", or "" for ASCII.
-        lines: (L + 1,) where each line of an ASCII file begins, and the end, where lines and rows agree: a row may
-            then be followed by more numbers than its properties have, as VCGLIB writes them. Else None.
+        lines: (L + 1,) start of each line of an ASCII file, and the end, if lines and rows agree: then a row may
+            have more numbers than its properties, as VCGLIB writes them. Else None.
     """
 
     data: UInt8[np.ndarray, " n"] | Float64[np.ndarray, " n"]
@@ -74,18 +74,18 @@ class Cells:
     lines: Int64[np.ndarray, " l"] | None = None
 
     def rows(self, start: int, count: int) -> Int64[np.ndarray, " r"] | None:
-        """(count + 1,) where the lines of the rows from `start` on begin, and where the last ends."""
+        """Return (count + 1,) the starts of the lines of the rows from `start` on, and the end of the last."""
         if self.lines is None:
             return None
         first = int(np.searchsorted(self.lines, start))
         return self.lines[first : first + count + 1]
 
     def size(self, value_type: str) -> int:
-        """The cells that a value takes."""
+        """Return the number of cells that a value takes."""
         return np.dtype(value_type).itemsize if self.byte_order else 1
 
     def values(self, places: Int64[np.ndarray, " n"], value_type: str, *, subject: str) -> np.ndarray:
-        """(n,) the values that begin at these places, in native byte order.
+        """Return (n,) the values that begin at these places, in native byte order.
 
         Raises:
             InputError: an ASCII number that the type does not hold.
@@ -95,22 +95,23 @@ class Cells:
             return rows.view(self.byte_order + value_type).reshape(-1).astype(value_type)
         return _converted(self.data[places], value_type, subject)
 
-    def even_values(
+    def strided_values(
         self, start: int, shape: tuple[int, int], width: int, value_type: str, *, subject: str
     ) -> np.ndarray:
-        """`shape` values: rows that begin `width` cells apart, of values that follow each other.
+        """Return values of this shape: rows that begin `width` cells apart, with values that follow each other.
 
         Raises:
             InputError: an ASCII number that the type does not hold.
         """
         stored, cell = (self.byte_order + value_type, 1) if self.byte_order else ("f8", 8)
         strides = (width * cell, self.size(value_type) * cell)
-        # The buffer's constructor refuses what would lie outside of it.
+        # numpy refuses an array that would extend past the buffer.
         block = np.ndarray(shape, stored, buffer=self.data.data, offset=start * cell, strides=strides)
         return block.astype(value_type) if self.byte_order else _converted(block, value_type, subject)
 
 
 def _converted(numbers: np.ndarray, value_type: str, subject: str) -> np.ndarray:
+    """Convert ASCII numbers to a type, refusing integers that it cannot hold."""
     kind = np.dtype(value_type)
     if kind.kind == "f":
         with np.errstate(over="ignore"):
@@ -124,15 +125,15 @@ def _converted(numbers: np.ndarray, value_type: str, subject: str) -> np.ndarray
 
 
 def read_element(cells: Cells, start: int, element: Element, *, subject: str) -> tuple[Columns, int]:
-    """An element's columns, and the place after it.
+    """Return the columns of an element, and the place after it.
 
-    Nothing larger than the file is allocated: a count that the rest of the data cannot hold is refused first.
+    Nothing larger than the file is allocated, because a count that the rest of the data cannot hold is refused first.
 
     Args:
-        cells: all data.
-        start: where the element's rows begin.
-        element: from the header.
-        subject: the file, for messages.
+        cells: all data of the file.
+        start: place of the element's first row.
+        element: description in the header.
+        subject: name of the file in messages.
 
     Raises:
         InputError: data that end too early, or a list of negative length.
@@ -143,6 +144,7 @@ def read_element(cells: Cells, start: int, element: Element, *, subject: str) ->
         raise _too_short(subject, element.count, len(cells.data) - start)
     if not element.count or not element.properties:
         return {p.name: _empty(p) for p in element.properties}, start
+    # Assume that all rows are as long as the first one; lines of an ASCII file may be longer.
     lengths = _first_lengths(cells, start, element.properties, subject)
     width = sum(_cells_of(cells, p, n) for p, n in zip(element.properties, lengths, strict=True))
     lines = cells.rows(start, element.count)
@@ -152,10 +154,10 @@ def read_element(cells: Cells, start: int, element: Element, *, subject: str) ->
         even = bool((apart == apart[0]).all() and apart[0] >= width)
         width = int(apart[0])
     if even and start + element.count * width <= len(cells.data):
-        columns = _read_even(cells, start, element, lengths, width, subject=subject)
+        columns = _read_uniform(cells, start, element, lengths, width, subject=subject)
         if columns is not None:
             return columns, start + element.count * width
-    return _read_uneven(cells, start, element, lines, subject)
+    return _read_varying(cells, start, element, lines, subject)
 
 
 def _empty(p: Property) -> np.ndarray | ListColumn:
@@ -170,7 +172,7 @@ def _cells_of(cells: Cells, p: Property, length: int) -> int:
 
 
 def _first_lengths(cells: Cells, start: int, properties: Sequence[Property], subject: str) -> list[int]:
-    """The lengths of the first row's lists, 0 for a property that is none."""
+    """Return the lengths of the lists in the first row, 0 for properties that are no lists."""
     lengths, place = [], start
     for p in properties:
         lengths.append(_length_at(cells, place, p, subject) if p.length_type else 0)
@@ -185,41 +187,42 @@ def _length_at(cells: Cells, place: int, p: Property, subject: str) -> int:
     length = int(cells.values(np.array([place]), p.length_type, subject=f"{subject}: lengths of {p.name}")[0])
     if length < 0 or length > len(cells.data):
         raise InputError(
-            f"{subject}: lengths of {p.name}", expected="none below 0 or beyond the file", received=f"{length}"
+            f"{subject}: lengths of {p.name}", expected="from 0 to the size of the file", received=f"{length}"
         )
     return length
 
 
-def _read_even(
+def _read_uniform(
     cells: Cells, start: int, element: Element, lengths: Sequence[int], width: int, *, subject: str
 ) -> Columns | None:
-    """An element all of whose rows are as its first one is; None where they are not."""
+    """Read an element whose lists are all as long as those of its first row; None if they are not."""
     sizes = [_cells_of(cells, p, length) for p, length in zip(element.properties, lengths, strict=True)]
     starts = list(accumulate(sizes[:-1], initial=start))
     for p, length, at in zip(element.properties, lengths, starts, strict=True):
         if p.length_type is not None:
             stored = p.length_type if cells.byte_order else "f8"
-            if (cells.even_values(at, (element.count, 1), width, stored, subject=subject) != length).any():
+            if (cells.strided_values(at, (element.count, 1), width, stored, subject=subject) != length).any():
                 return None
     columns: Columns = {}
     for p, length, at in zip(element.properties, lengths, starts, strict=True):
         each = 1 if p.length_type is None else length
         at += 0 if p.length_type is None else cells.size(p.length_type)
         named = f"{subject}: property {p.name}"
-        values = cells.even_values(at, (element.count, each), width, p.value_type, subject=named).reshape(-1)
+        values = cells.strided_values(at, (element.count, each), width, p.value_type, subject=named).reshape(-1)
         columns[p.name] = values if p.length_type is None else ListColumn(values, np.full(element.count, length))
     return columns
 
 
-def _read_uneven(
+def _read_varying(
     cells: Cells, start: int, element: Element, lines: Int64[np.ndarray, " r"] | None, subject: str
 ) -> tuple[Columns, int]:
-    """An element whose lists differ in length: the places of all values first, row by row."""
+    """Read an element whose lists differ in length: first the places of all values row by row, then the values."""
     properties, data, end = element.properties, cells.data, len(cells.data)
     places = np.empty((len(properties), element.count), np.int64)
     lengths = np.zeros((len(properties), element.count), np.int64)
     steps = [(cells.size(p.length_type or p.value_type), cells.size(p.value_type)) for p in properties]
     bytewise = [p.length_type is not None and (p.length_type == "u1" or not cells.byte_order) for p in properties]
+    # Walk through the rows and note the place of every value or list.
     place = start
     for row in range(element.count):
         if lines is not None:
@@ -237,6 +240,7 @@ def _read_uneven(
             place += head + length * step
     if place > end:
         raise _too_short(subject, element.count, end - start)
+    # Read each property at its places; the places of list values follow from the lists' places and lengths.
     columns: Columns = {}
     for k, p in enumerate(properties):
         if p.length_type is None:

@@ -1,4 +1,4 @@
-"""PLY meshes: ASCII and both binary byte orders; vertices, faces, colours, further properties."""
+"""Read PLY meshes, ASCII and binary of both byte orders: vertices, faces, colours, other properties."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from smplxpp.core.mesh_files.raw_mesh import (
     require_indices,
     word_starts,
 )
-from smplxpp.core.mesh_files.texture import LOST, Pictures, mean_of_corners, sample_texture
+from smplxpp.core.mesh_files.texture import MISSING_GRAY, TextureCache, average_corner_colors, sample_texture
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_HEADER = 1 << 20
-# Properties that a mesh keeps elsewhere; all others stay by their names.
+# Properties that a mesh keeps in fields of their own; all others are kept by name.
 _KNOWN = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -33,14 +32,14 @@ _TEXTURE_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 
 def read_ply(path: Path) -> RawMesh:
-    """Read a PLY mesh: the vertex element's rows, the face element's rows, polygons cut into fans.
+    """Read the vertices and faces of a PLY mesh, with polygons cut into fans.
 
-    Face properties are repeated for each triangle of a polygon. Colours are those of the vertices; without them, or
-    where all are the same, the picture's (`comment TextureFile`), at the vertex's coordinates, or their mean over its
-    corners in the faces' lists.
+    Face properties are repeated for each triangle of a polygon. Colours are those of the vertices. If there are none,
+    or all are equal, they are sampled from the texture (`comment TextureFile`) at the coordinates of the vertices, or
+    averaged over their corners.
 
     Raises:
-        InputError: no PLY, a damaged header, fewer data than it announces, indices of vertices that do not exist.
+        InputError: no PLY, a damaged header, less data than it announces, indices of missing vertices.
     """
     subject = f"mesh file {path}"
     data = read_bytes(path, subject="mesh file")
@@ -49,6 +48,7 @@ def read_ply(path: Path) -> RawMesh:
         cells = Cells(np.frombuffer(data, np.uint8)[body:], byte_order)
     else:
         cells = _ascii_cells(data[body:], sum(element.count for element in elements), subject)
+    # All elements in their order, because each begins where the one before it ends.
     found: dict[str, Columns] = {}
     place = 0
     for element in elements:
@@ -61,6 +61,7 @@ def read_ply(path: Path) -> RawMesh:
             received="triangle strips",
             remedy="export triangles; MeshLab writes them when it saves the file again",
         )
+    # Vertices, polygons and their triangles.
     vertices = _vertices(vertex, subject)
     corners = next((face[name] for name in _CORNERS if name in face), None)
     if corners is None:
@@ -69,6 +70,7 @@ def read_ply(path: Path) -> RawMesh:
         raise InputError(f"{subject}: faces", expected="lists of whole numbers", received="another property")
     require_indices(corners.values, len(vertices), subject=subject)
     fans = fan_triangles(corners.values, corners.lengths, subject=subject)
+    # A texture replaces vertex colours that are all equal.
     colors = _vertex_colors(vertex, subject)
     if pictures and (colors is None or (colors == colors[:1]).all()):
         found_in_pictures = _picture_colors(path, vertex, face, corners, pictures, vertex_count=len(vertices))
@@ -85,10 +87,10 @@ def read_ply(path: Path) -> RawMesh:
 
 
 def _read_header(data: bytes, subject: str) -> tuple[str, list[Element], list[str], int]:
-    """The byte order, the elements, the names of the pictures, and where the data begin."""
+    """Return the byte order, the elements, the names of textures, and the place of the data."""
     if not data.startswith(b"ply"):
         raise InputError(subject, expected="a PLY file, which begins with `ply`", received=repr(data[:16]))
-    end = re.search(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\n|\r)", data[:_LONGEST_HEADER])
+    end = re.search(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\n|\r)", data[: 1 << 20])
     if end is None:
         raise InputError(subject, expected="a header that ends with `end_header`", received="none")
     body = end.end()
@@ -128,6 +130,7 @@ def _read_header(data: bytes, subject: str) -> tuple[str, list[Element], list[st
 
 
 def _ascii_cells(text: bytes, rows: int, subject: str) -> Cells:
+    """Parse all numbers of an ASCII file, with the starts of its lines if there is a line for each row."""
     numbers = parse_numbers(text, subject=subject)
     text = text.replace(b"\r", b"\n")
     starts = np.concatenate([[0], np.flatnonzero(as_bytes(text) == 10) + 1])
@@ -167,11 +170,12 @@ def _vertex_colors(vertex: Columns, subject: str) -> UInt8[np.ndarray, "N 3"] | 
 def _picture_colors(
     path: Path, vertex: Columns, face: Columns, corners: ListColumn, names: list[str], *, vertex_count: int
 ) -> UInt8[np.ndarray, "N 3"] | None:
-    """The colours of the pictures at the vertices' coordinates; None where coordinates or all pictures are missing."""
+    """Sample textures at the coordinates of vertices or corners; None without coordinates or without any texture."""
     scalars = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
     pairs = [(scalars[a], scalars[b]) for a, b in _TEXTURE_COORDINATES if a in scalars and b in scalars]
     coordinates = np.stack(pairs[0], axis=1) if pairs else None
     vertices, page = np.arange(vertex_count), np.zeros(vertex_count, np.int64)
+    # Without coordinates of vertices there may be a list of two for each corner in the faces.
     if coordinates is None:
         lists = face.get("texcoord")
         if not isinstance(lists, ListColumn) or not np.array_equal(lists.lengths, 2 * corners.lengths):
@@ -180,16 +184,16 @@ def _picture_colors(
         page = np.zeros(len(vertices), np.int64)
         number = face.get("texnumber")
         if isinstance(number, np.ndarray):
-            # A vertex between two pictures has the colour of its first corner's.
+            # A vertex between two textures takes that of its first corner.
             pages = np.repeat(number, corners.lengths)
             found_at, first = np.unique(vertices, return_index=True)
             page = np.where(pages == pages[first][np.searchsorted(found_at, vertices)], pages, -1)
-    colors, found = np.full((vertex_count, 3), LOST, np.uint8), False
-    pictures = Pictures(f"mesh file {path}")
+    colors, found = np.full((vertex_count, 3), MISSING_GRAY, np.uint8), False
+    pictures = TextureCache(f"mesh file {path}")
     for k in np.unique(page[(page >= 0) & (page < len(names))]):
-        picture = pictures.beside(path, names[int(k)])
+        picture = pictures.load(path, names[int(k)])
         if picture is not None:
-            at, mean = mean_of_corners(vertices[page == k], sample_texture(picture, coordinates[page == k]))
+            at, mean = average_corner_colors(vertices[page == k], sample_texture(picture, coordinates[page == k]))
             colors[at] = mean
             found = True
     return colors if found else None

@@ -1,4 +1,4 @@
-"""The arrays of a mesh file before any check, and what all readers of such files share."""
+"""Hold the arrays of a mesh file before any check, and the functions that its readers share."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from jaxtyping import Float64, Int64, Integer, Num, UInt8
 
 from smplxpp.core.errors import GeometryWarning, InputError
 
-# float64 still tells tenths of a millimetre at this distance, and no sum of squares overflows even in float32.
-LARGEST_COORDINATE = 1e12
-
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
     """The arrays of a mesh file before any check.
 
     Attributes:
-        vertices: (N, 3) float64, may hold NaN; the file's vertices, all of them, in its order.
-        faces: (M, 3) int64; the file's faces in its order, polygons cut into fans in their place.
+        vertices: (N, 3) float64, all vertices of the file in its order; may contain NaN.
+        faces: (M, 3) int64, the faces of the file in its order, polygons cut into fans.
         vertex_colors: (N, 3) uint8 or None.
-        vertex_properties, face_properties: other per-element arrays by name (PLY); (N,) and (M,).
-        source_faces: (M,) int64, the file's face that each triangle comes from; None where all are triangles.
-        vertex_normals: (N, 3) float64 of a file without faces (PLY, npz), as it has them; else None.
+        vertex_properties: other arrays (N,) of vertices by name (PLY).
+        face_properties: other arrays (M,) of faces by name (PLY).
+        source_faces: (M,) int64, the file's face of each triangle; None if all are triangles.
+        vertex_normals: (N, 3) float64 of a file without faces (PLY, npz); else None.
     """
 
     vertices: Float64[np.ndarray, "N 3"]
@@ -37,19 +35,19 @@ class RawMesh:
 
     @property
     def is_cloud(self) -> bool:
-        """Points without faces."""
+        """Whether the file has points but no faces."""
         return not len(self.faces)
 
 
 @dataclass(frozen=True, eq=False)
 class Fans:
-    """Polygons as triangles.
+    """Polygons that are cut into fans of triangles.
 
     Attributes:
         faces: (M, 3) vertex indices; polygon (a, b, c, d) gives (a, b, c), (a, c, d).
         corners: (M, 3) places of the same corners in the flat list of all corners.
-        polygons: (M,) the polygon that each triangle comes from.
-        count: of polygons.
+        polygons: (M,) polygon of each triangle.
+        count: number of polygons.
     """
 
     faces: Int64[np.ndarray, "M 3"]
@@ -59,17 +57,17 @@ class Fans:
 
     @property
     def source_faces(self) -> Int64[np.ndarray, " M"] | None:
-        """The polygons, None where each is one triangle."""
+        """Polygon of each triangle, None if every polygon is one triangle."""
         return None if np.array_equal(self.polygons, np.arange(self.count)) else self.polygons
 
 
 def fan_triangles(corners: Integer[np.ndarray, " C"], sizes: Integer[np.ndarray, " F"], *, subject: str) -> Fans:
-    """Cut polygons into fans, in their order; those of fewer than three corners give none, which a warning says.
+    """Cut polygons into fans, in their order; polygons of fewer than three corners are left out with a warning.
 
     Args:
-        corners: (C,) vertex indices of all polygons, one after the other.
-        sizes: (F,) corners of each polygon, which sum to C.
-        subject: the file, for the warning.
+        corners: (C,) vertex indices of all polygons, concatenated.
+        sizes: (F,) number of corners of each polygon, which sum to C.
+        subject: name of the file in the warning.
     """
     few = int((sizes < 3).sum())
     if few:
@@ -84,10 +82,10 @@ def fan_triangles(corners: Integer[np.ndarray, " C"], sizes: Integer[np.ndarray,
 
 
 def require_indices(faces: Integer[np.ndarray, "*n"], count: int, *, subject: str, kind: str = "faces") -> None:
-    """Refuse indices outside [0, count).
+    """Refuse indices of vertices outside [0, count).
 
     Raises:
-        InputError: it names the range that was found.
+        InputError: an index outside; the message names the range found.
     """
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         raise InputError(
@@ -98,33 +96,35 @@ def require_indices(faces: Integer[np.ndarray, "*n"], count: int, *, subject: st
         )
 
 
-def require_reach(vertices: Num[np.ndarray, "N 3"], *, subject: str) -> None:
+def require_coordinate_range(vertices: Num[np.ndarray, "N 3"], *, subject: str) -> None:
     """Refuse finite coordinates that are too large to compute with; NaN and infinity are left to the repair.
 
     Raises:
-        InputError: a coordinate beyond 1e12.
+        InputError: a coordinate over 1e12.
     """
-    far = (np.isfinite(vertices) & (np.abs(vertices) > LARGEST_COORDINATE)).any(axis=1)
+    # float64 still resolves tenths of a millimetre here, and sums of squares do not overflow even in float32.
+    largest = 1e12
+    far = (np.isfinite(vertices) & (np.abs(vertices) > largest)).any(axis=1)
     if far.any():
         row = int(np.argmax(far))
         place = ", ".join(f"{value:g}" for value in vertices[row])
         raise InputError(
             f"{subject}: vertices",
-            expected=f"coordinates within {LARGEST_COORDINATE:g}",
-            received=f"{int(far.sum())} vertices beyond, first at index {row}: ({place})",
+            expected=f"coordinates within {largest:g}",
+            received=f"{int(far.sum())} vertices outside, first at index {row}: ({place})",
             remedy="delete stray vertices and move the surface to the origin",
         )
 
 
 def color_bytes(colors: Num[np.ndarray, "N C"], *, subject: str) -> UInt8[np.ndarray, "N 3"] | None:
-    """Colours as 8-bit RGB: unsigned integers by their range, floats in [0, 1] or, where one is larger, in [0, 255].
+    """Convert colours to bytes: unsigned integers by their range, floats from [0, 1] or, if any is larger, [0, 255].
 
     Args:
         colors: (N, C >= 3).
-        subject: the file, for the warning.
+        subject: name of the file in the warning.
 
     Returns:
-        (N, 3) uint8; None, with a warning, where a colour is NaN or infinite.
+        (N, 3) uint8; None, with a warning, if a colour is NaN or infinite.
     """
     rgb = np.asarray(colors)[:, :3]
     if rgb.dtype.kind == "u":
@@ -139,22 +139,22 @@ def color_bytes(colors: Num[np.ndarray, "N C"], *, subject: str) -> UInt8[np.nda
 
 
 def warn(message: str) -> None:
-    """State a repair or a loss."""
+    """Warn of a repair or a loss with a GeometryWarning."""
     warnings.warn(message, GeometryWarning, stacklevel=3)
 
 
-# By byte: tab, line feed, vertical tab, form feed, carriage return, space.
 IS_SPACE = np.isin(np.arange(256), (9, 10, 11, 12, 13, 32))
+"""Whether a byte is white space: tab, line feed, vertical tab, form feed, carriage return, space."""
 
 
 def parse_numbers(text: bytes, *, subject: str) -> Float64[np.ndarray, " n"]:
-    """The numbers of a text that holds nothing else, separated by blanks and line ends.
+    """Parse a text that consists of numbers, separated by blanks and line ends.
 
     Raises:
-        InputError: a word that is no number; it is named.
+        InputError: a word that is not a number; the message names it.
     """
     count = len(word_starts(text))
-    # numpy only warns where a text goes wrong, and takes "1-2" for two numbers: their count tells both.
+    # numpy only warns of a bad word, and reads "1-2" as two numbers; comparing counts finds both.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
@@ -167,18 +167,18 @@ def parse_numbers(text: bytes, *, subject: str) -> Float64[np.ndarray, " n"]:
 
 
 def word_starts(text: bytes) -> Int64[np.ndarray, " n"]:
-    """Where the words of a text begin."""
+    """Return the start of each word of a text."""
     space = IS_SPACE[as_bytes(text)]
     return np.flatnonzero(~space & np.concatenate([[True], space[:-1]]))
 
 
 def count_between(places: Int64[np.ndarray, " n"], starts: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    """How many of the increasing places lie between each start and the next."""
+    """Count the increasing places between each start and the next."""
     return np.diff(np.append(np.searchsorted(places, starts), len(places)))
 
 
 def as_bytes(text: bytes) -> UInt8[np.ndarray, " n"]:
-    """A text as an array, not copied."""
+    """View a text as an array of bytes, without a copy."""
     return np.frombuffer(text, dtype=np.uint8)
 
 

@@ -1,6 +1,6 @@
-"""STL and OFF meshes.
+"""Read STL and OFF meshes.
 
-An STL file has no vertices of its own but three corners a face: they are kept as they are, 3 M vertices for M faces.
+An STL file has no shared vertices but three corners per face. They are kept: 3 M vertices for M faces.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from smplxpp.core.mesh_files.raw_mesh import (
 )
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_HEADER = 84
 
 
 def read_stl(path: Path) -> RawMesh:
     """Read a binary or ASCII STL file.
 
     Raises:
-        InputError: a file that ends before the faces that it announces, or words that are no numbers.
+        InputError: a file that ends before the faces that it announces, or words that are not numbers.
     """
+    header = 84  # bytes of a binary file before the faces, the last four of them their number
     subject = f"mesh file {path}"
     data = read_bytes(path, subject="mesh file")
-    count = int.from_bytes(data[80:_HEADER], "little") if len(data) >= _HEADER else -1
-    # Binary files may begin with `solid` too: their length tells, and the word `facet` of the others.
-    if data[:512].lstrip()[:5].lower() == b"solid" and len(data) != _HEADER + count * _RECORD.itemsize:
+    count = int.from_bytes(data[80:header], "little") if len(data) >= header else -1
+    # Binary files may begin with `solid` too. Their size fits their number of faces, and ASCII files contain `facet`.
+    if data[:512].lstrip()[:5].lower() == b"solid" and len(data) != header + count * _RECORD.itemsize:
         if b"facet" in data[:4096].lower() or not count > 0:
-            return _soup(_ascii_corners(data, subject))
-    if count < 0 or len(data) < _HEADER + count * _RECORD.itemsize:
+            return _triangle_soup(_ascii_corners(data, subject))
+    if count < 0 or len(data) < header + count * _RECORD.itemsize:
         raise InputError(
             subject,
             expected="an STL file: `solid`, or 80 bytes, a number of faces and 50 bytes a face",
             received=f"{len(data)} bytes" + (f" for {count} faces" if count >= 0 else ""),
             remedy="the file is damaged or incomplete: copy or export it again",
         )
-    return _soup(np.frombuffer(data, _RECORD, count, _HEADER)["corners"].reshape(-1, 3))
+    return _triangle_soup(np.frombuffer(data, _RECORD, count, header)["corners"].reshape(-1, 3))
 
 
 def _ascii_corners(data: bytes, subject: str) -> Float64[np.ndarray, "C 3"]:
@@ -61,15 +61,15 @@ def _ascii_corners(data: bytes, subject: str) -> Float64[np.ndarray, "C 3"]:
     return numbers.reshape(-1, 3)
 
 
-def _soup(corners: Float[np.ndarray, "C 3"]) -> RawMesh:
+def _triangle_soup(corners: Float[np.ndarray, "C 3"]) -> RawMesh:
     return RawMesh(corners.astype(np.float64), np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
 def read_off(path: Path) -> RawMesh:
-    """Read an ASCII OFF file; of what follows the coordinates, colours of the vertices are kept (COFF).
+    """Read the vertices, faces and vertex colours (COFF) of an ASCII OFF file.
 
     Raises:
-        InputError: no OFF file, one that ends too early, or indices of vertices that do not exist.
+        InputError: no OFF file, a file that ends too early, or indices of missing vertices.
     """
     subject = f"mesh file {path}"
     text = re.sub(rb"#[^\r\n]*", b"", read_bytes(path, subject="mesh file")).replace(b"\r", b"\n")
@@ -81,6 +81,7 @@ def read_off(path: Path) -> RawMesh:
             received=repr(text[:16]),
             remedy="save it as PLY",
         )
+    # All numbers at once, with their count in each line that has any.
     text = text[head.end() :]
     values = parse_numbers(text, subject=subject)
     per_line = count_between(word_starts(text), np.concatenate([[0], np.flatnonzero(as_bytes(text) == 10) + 1]))
@@ -97,10 +98,12 @@ def read_off(path: Path) -> RawMesh:
     end_vertices, end_faces = 1 + int(counts[0]), 1 + int(counts[0]) + int(counts[1])
     if (per_line[1:end_vertices] < 3).any():
         raise InputError(f"{subject}: vertices", expected="three numbers a line", received="fewer")
+    # Vertices, with colours after the coordinates (COFF) or after the normals (CNOFF).
     at = first[1:end_vertices, None] + np.arange(3)
     colors = None
     if head.group(1) and (per_line[1:end_vertices] >= (9 if head.group(2) else 6)).all():
         colors = color_bytes(values[at + (6 if head.group(2) else 3)], subject=subject)
+    # Polygons: the number of corners, then their vertices.
     sizes = _whole(values[first[end_vertices:end_faces]], subject)
     if (per_line[end_vertices:end_faces] <= sizes).any():
         raise InputError(f"{subject}: faces", expected="as many corners as a line announces", received="fewer")

@@ -1,4 +1,4 @@
-"""Pictures that mesh files name: found inside the file's folder, decoded within bounds, sampled at the vertices."""
+"""Find textures inside the folder of a mesh file, decode them within bounds, and sample them at the vertices."""
 
 from __future__ import annotations
 
@@ -17,19 +17,17 @@ from smplxpp.core.mesh_files.raw_mesh import warn
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# The colour of a vertex that has none in a file of which others have.
-LOST = 128
-# What a picture shows beyond its edges.
+MISSING_GRAY = 128
+"""Gray of a vertex without a colour in a file in which other vertices have colours."""
+# Wrap modes outside of [0, 1].
 REPEAT, MIRROR, CLAMP = "repeat", "mirror", "clamp"
-# A hundred pictures of 4096 x 4096 are fewer.
-_MOST_DECODED = 2_000_000_000
 
 
-def beside(path: Path, name: str) -> Path | None:
-    """The file that a mesh file names: inside the mesh file's folder, or None.
+def file_beside(path: Path, name: str) -> Path | None:
+    """Return the file that a mesh file names, if it is inside the mesh file's folder, else None.
 
-    Names as Windows writes them are understood. One that leads out of the folder, as of another machine's disk, is
-    looked for beside the mesh file under its last part; nothing outside the folder is ever opened.
+    Windows paths are understood. A name that leads out of the folder, such as a path of another machine, is looked up
+    beside the mesh file by its last part; nothing outside the folder is ever opened.
     """
     name = name.strip().strip('"')
     for candidate in (name, name.replace("\\", "/").rpartition("/")[2]):
@@ -40,11 +38,11 @@ def beside(path: Path, name: str) -> Path | None:
     return None
 
 
-class Pictures:
-    """The pictures of a mesh file, one in memory at a time, and in all no more pixels than real files have.
+class TextureCache:
+    """Decodes the textures of a mesh file, keeps the last one, and bounds the total number of pixels.
 
     Args:
-        subject: the mesh file, for messages.
+        subject: name of the mesh file in messages.
     """
 
     def __init__(self, subject: str) -> None:
@@ -53,22 +51,23 @@ class Pictures:
         self._last = np.empty((0, 0, 3), np.uint8)
 
     def get(self, key: object, decode: Callable[[], Image]) -> UInt8[np.ndarray, "H W 3"]:
-        """The picture of a key: the last one again, or decoded.
+        """Return the texture of a key, decoding it if it is not the last one.
 
         Raises:
-            InputError: what `decode` raises, or a file that asks for more pixels than it may.
+            InputError: what `decode` raises, or a file with too many pixels in all.
         """
         if self._key is None or key != self._key:
-            if self._pixels > _MOST_DECODED:
-                raise InputError(self._subject, expected=f"at most {_MOST_DECODED} pixels of pictures", received="more")
+            max_pixels = 2_000_000_000  # more than a hundred textures of 4096 x 4096
+            if self._pixels > max_pixels:
+                raise InputError(self._subject, expected=f"at most {max_pixels} pixels of pictures", received="more")
             picture = np.array(decode().convert("RGB"))
             self._key, self._last = key, picture
             self._pixels += picture.shape[0] * picture.shape[1]
         return self._last
 
-    def beside(self, path: Path, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The picture that a mesh file names; None, with a warning, where it is missing or cannot be used."""
-        found = beside(path, name)
+    def load(self, path: Path, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        """Return the texture that a mesh file names; None, with a warning, if it is missing or unusable."""
+        found = file_beside(path, name)
         if found is None:
             warn(f"{self._subject}: its colours are lost: the picture {name[:200]!r} is not in its folder")
             return None
@@ -86,13 +85,13 @@ def sample_texture(
     top_down: bool = False,
     wrap: tuple[str, str] = (REPEAT, REPEAT),
 ) -> UInt8[np.ndarray, "N 3"]:
-    """The colours of the texels that hold the coordinates.
+    """Return the colour of the texel at each coordinate (nearest neighbour).
 
     Args:
-        picture: rows from the top.
-        uv: texture coordinates; v is 0 at the bottom row's lower edge. NaN and infinity count as 0.
-        top_down: v is 0 at the top row's upper edge, as in glTF.
-        wrap: what lies beyond [0, 1] along u and v: the picture again, its mirror image and so on, or its last texel.
+        picture: texture, rows from the top.
+        uv: texture coordinates; v is 0 at the lower edge of the bottom row. NaN and infinity count as 0.
+        top_down: whether v is 0 at the upper edge of the top row, as in glTF.
+        wrap: wrap modes outside [0, 1] along u and v: repeat, mirror, or clamp to the last texel.
     """
     uv = np.where(np.isfinite(uv), uv, 0.0)
     u, v = (_within(uv[:, k], wrap[k]) for k in range(2))
@@ -103,7 +102,7 @@ def sample_texture(
 
 
 def _within(x: Float[np.ndarray, " N"], wrap: str) -> Float[np.ndarray, " N"]:
-    """Coordinates brought into [0, 1]; those that are there stay, 1 among them."""
+    """Wrap coordinates into [0, 1]; those inside stay, including 1."""
     if wrap == CLAMP:
         return np.clip(x, 0.0, 1.0)
     inside = (x >= 0) & (x <= 1)
@@ -112,13 +111,12 @@ def _within(x: Float[np.ndarray, " N"], wrap: str) -> Float[np.ndarray, " N"]:
     return np.where(inside, x, x % 1.0)
 
 
-def mean_of_corners(
+def average_corner_colors(
     vertices: Int64[np.ndarray, " C"], colors: UInt8[np.ndarray, "C 3"]
 ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n 3"]]:
-    """The vertices that occur, and each one's mean of the colours of its corners.
+    """Return the vertices that occur, and the mean colour of the corners of each.
 
-    A vertex on a seam of the texture has several places in the picture, whose colours differ where the picture was
-    packed or painted loosely.
+    A vertex on a seam of the texture has several texture coordinates, whose colours may differ.
     """
     found, place = np.unique(vertices, return_inverse=True)
     corners = np.bincount(place, minlength=len(found))
