@@ -49,7 +49,7 @@ def main() -> None:
     frame = capture.splits.novel_pose_frames[0]
     (view,) = avatar.read_views(capture, frame, capture.splits.novel_view_cameras[:1])
     with torch.no_grad():
-        posed = player(player.rig.motion(capture.params(frame)), view.position[None])
+        posed = player(player.rig.pose(capture.params(frame)), view.position[None])
         drawn = avatar.render_view(posed, 0, view, torch.zeros(3)).image.clamp(0, 1)
     pair = np.hstack([view.photograph((0.0, 0.0, 0.0)), (255 * drawn).round().byte().numpy()])
     Image.fromarray(pair).save(out / "new_pose.png")

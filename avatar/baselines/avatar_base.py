@@ -16,7 +16,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FrameCodes
 from avatar.models.networks.teacher import local_offsets
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from avatar.training.engine.optimization_task import ParameterGroup
 
 POSITION_SCALE = 0.05
@@ -36,7 +36,7 @@ class Baseline(nn.Module, ABC):
     gaussians: LearnedGaussians
 
     @abstractmethod
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar as cameras with these centres, metres, see it."""
 
     @abstractmethod
@@ -70,13 +70,13 @@ class ResidualBaseline(Baseline):
         self.register_buffer("points", points, persistent=False)
 
     @abstractmethod
-    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+    def residuals(self, pose: Pose, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
         """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar as cameras with these centres, metres, see it."""
-        code = self.codes([motion.frame if motion.frame in self.codes.row else None])[0]
-        position, log_scales, quats, colour = self.residuals(motion, code).split((3, 2, 4, 3), dim=-1)
+        code = self.codes([pose.frame if pose.frame in self.codes.row else None])[0]
+        position, log_scales, quats, colour = self.residuals(pose, code).split((3, 2, 4, 3), dim=-1)
         bound = self.gaussians()
         bound = replace(
             bound,
@@ -85,7 +85,7 @@ class ResidualBaseline(Baseline):
             quats=bound.quats + quats,
             dc=bound.dc + colour,
         )
-        vertices = self.rig.pose(motion)
+        vertices = self.rig.skin(pose)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
         return PosedAvatar(vertices, world, view_colors(bound, frames, world.means.detach(), camera_centers), bound)

@@ -49,8 +49,8 @@ class PhotographTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame, and its terms as numbers."""
         views = self.views(item)
-        motion = self.sequence.motion(item.frame)
+        pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
-            motion = motion.without_code()
-        total, terms, _ = self.compared(self.model(motion, camera_centers_of(views)), views)
+            pose = pose.without_code()
+        total, terms, _ = self.compared(self.model(pose, camera_centers_of(views)), views)
         return total, {"loss": float(total.detach()), **terms}

@@ -19,7 +19,7 @@ from torch import Tensor, cat, nn
 from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.gaussians.binding import BoundGaussians
 from avatar.models.networks.deformation_field import positional_encoding
-from avatar.rig.rig import THETA, Motion, Rig
+from avatar.rig.rig import THETA, Pose, Rig
 from smplxpp.core.validation import require_at_least
 
 
@@ -68,9 +68,9 @@ class PointMLPAvatar(ResidualBaseline):
         nn.init.zeros_(self.last.bias)
         self.to(rig.device)
 
-    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+    def residuals(self, pose: Pose, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
         """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
-        x = F.relu(self.of_point(self.encodings) + self.of_frame(cat([motion.pose, code])))
+        x = F.relu(self.of_point(self.encodings) + self.of_frame(cat([pose.body_pose, code])))
         for layer in self.hidden:
             x = F.relu(layer(x))
         return self.last(x)

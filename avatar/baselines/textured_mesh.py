@@ -26,7 +26,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.optimization_task import ParameterGroup
 
@@ -66,9 +66,9 @@ class TexturedMeshAvatar(Baseline):
         """The texels."""
         return self.student.gaussians
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the mesh as cameras with these centres, metres, see it."""
-        return self.student(motion, camera_centers)
+        return self.student(pose, camera_centers)
 
     def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
         """Return field, codes and texture as a group each."""

@@ -21,7 +21,7 @@ from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.baselines.uv_atlas import cylinder_atlas
 from avatar.gaussians.binding import BoundGaussians
 from avatar.models.networks.stylegan2_layers import ConvLayer
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.core.validation import require_at_least
 
 
@@ -104,17 +104,17 @@ class UVUNetAvatar(ResidualBaseline):
         self.network = UNet(3 + config.features + config.code_size, config.channels, RESIDUALS)
         self.to(rig.device)
 
-    def position_map(self, motion: Motion) -> Float[Tensor, "1 3 S S"]:
+    def position_map(self, pose: Pose) -> Float[Tensor, "1 3 S S"]:
         """Return posed points without the root's motion, metres, 0 between the charts; a constant for gradients."""
         with torch.no_grad():
-            to_root = motion.root_from_world
-            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
+            to_root = pose.root_from_world
+            vertices = self.rig.skin(pose) @ to_root[:3, :3].T + to_root[:3, 3]
             seen = (self.texel_weights[..., None] * vertices[self.texel_corners]).sum(1)
             out = vertices.new_zeros(self.config.size**2, 3).index_copy(0, self.texels, seen)
             return out.T.reshape(1, 3, self.config.size, self.config.size)
 
-    def residuals(self, motion: Motion, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
+    def residuals(self, pose: Pose, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
         """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
         of_frame = code[None, :, None, None].expand(-1, -1, self.config.size, self.config.size)
-        maps = self.network(torch.cat([self.position_map(motion), self.person, of_frame], dim=1))
+        maps = self.network(torch.cat([self.position_map(pose), self.person, of_frame], dim=1))
         return F.grid_sample(maps, self.grid, align_corners=False)[0, :, 0].T

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.data.sequence import Item, MeasuredView
 from avatar.data.views import View
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
@@ -51,14 +51,14 @@ class OneFrame:
         self.train_cameras = tuple(view.name for view in train)
         self._check_names([view.name for view in (*train, *held_out)])
         self._center = vertices.mean(0)
-        self._motion = self.rig.motion_to(vertices)
+        self._pose = self.rig.pose_from_vertices(vertices)
         self._whole = {view.name: view for view in (*train, *held_out)}
         self._cropped = {view.name: view.cropped(margin).to(device) for view in train}
         self._measured = [view.name for view in held_out or train]
 
-    def motion(self, frame: int) -> Motion:
+    def pose(self, frame: int) -> Pose:
         """Return the pose, which leaves the given vertices where they are."""
-        return self._motion
+        return self._pose
 
     def view(self, camera: str, frame: int) -> View:
         """Return a training view, cut to the silhouette."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
 from avatar.data.views import View, read_view
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.capture import Capture
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
@@ -33,16 +33,16 @@ class SequenceConfig:
     Attributes:
         margin: pixels kept around the silhouette of a training view.
         normals: read the capture's normal maps where it has them.
-        motions: poses kept in memory, the latest used; one is about 1.3 MB for 22k vertices. Images are kept by the
-            capture, which has a bound of its own.
+        kept_poses: number of poses kept in memory, the latest used; one has about 1.3 MB for 22k vertices. The
+            capture keeps the images, within its own bound.
     """
 
     margin: int = 12
     normals: bool = True
-    motions: int = 256
+    kept_poses: int = 256
 
     def __post_init__(self) -> None:
-        for name, least in (("margin", 0), ("motions", 1)):
+        for name, least in (("margin", 0), ("kept_poses", 1)):
             require_at_least(f"sequence: {name}", getattr(self, name), least)
 
 
@@ -85,7 +85,7 @@ class FrameSequence(Protocol):
     train_cameras: tuple[str, ...]
     train_frames: tuple[int, ...]
 
-    def motion(self, frame: int) -> Motion:
+    def pose(self, frame: int) -> Pose:
         """Return the pose of a frame."""
 
     def view(self, camera: str, frame: int) -> View:
@@ -136,7 +136,7 @@ class AvatarSequence:
         behind = capture.recording.background or (0.0, 0.0, 0.0)
         self.background = torch.tensor(behind, dtype=torch.float32, device=device)
         self.cloth = cloth
-        self._motions: OrderedDict[int, Motion] = OrderedDict()
+        self._poses: OrderedDict[int, Pose] = OrderedDict()
         self._expected: dict[tuple[str, int], Future[View]] = {}
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
 
@@ -153,7 +153,7 @@ class AvatarSequence:
         views = rows[:, None] & np.isin(self.capture.frames, self.train_frames) & self.capture.presence()
         return int((views & self.capture.presence("normal")).sum())
 
-    def motion(self, frame: int) -> Motion:
+    def pose(self, frame: int) -> Pose:
         """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.
 
         Frames that training does not see have their clothes simulated, where there are some to simulate.
@@ -161,23 +161,23 @@ class AvatarSequence:
         Raises:
             InputError: no parameters of it.
         """
-        if frame not in self._motions:
-            self._motions[frame] = self._read_motion(frame)
-            if len(self._motions) > self.config.motions:
-                self._motions.popitem(last=False)
-        self._motions.move_to_end(frame)
-        return self._motions[frame]
+        if frame not in self._poses:
+            self._poses[frame] = self._read_pose(frame)
+            if len(self._poses) > self.config.kept_poses:
+                self._poses.popitem(last=False)
+        self._poses.move_to_end(frame)
+        return self._poses[frame]
 
-    def as_new_motion(self, frame: int) -> Motion:
+    def as_new_pose(self, frame: int) -> Pose:
         """Return the pose of a training frame as if it were new: without its code, its clothes simulated.
 
         All training frames are simulated when the first one is asked for, in order and from one cold start.
         """
-        motion = self.motion(frame).as_new()
+        pose = self.pose(frame).as_new()
         if self.cloth is None:
-            return motion
+            return pose
         self.cloth.simulate(self.train_frames)
-        return self.rig.with_cloth(motion, self.cloth.shape(frame), time=self.cloth.time(frame))
+        return self.rig.with_cloth(pose, self.cloth.shape(frame), time=self.cloth.time(frame))
 
     def view(self, camera: str, frame: int) -> View:
         """Return a training view, cut to the silhouette."""
@@ -210,7 +210,7 @@ class AvatarSequence:
 
     def person_center(self) -> Float[np.ndarray, " 3"]:
         """Return the mean of the posed vertices in the first training frame, metres."""
-        return self.rig.pose(self.motion(self.train_frames[0])).mean(0).cpu().numpy()
+        return self.rig.skin(self.pose(self.train_frames[0])).mean(0).cpu().numpy()
 
     def expect(self, items: Sequence[Item]) -> None:
         """Read the views of items in the background: they will be asked for soon."""
@@ -262,14 +262,14 @@ class AvatarSequence:
             )
         return params
 
-    def _read_motion(self, frame: int) -> Motion:
+    def _read_pose(self, frame: int) -> Pose:
         if frame in self.train_frames:
-            return self.rig.motion(self.params(frame), frame=frame)
-        motion = self.rig.motion(self.params(frame))
+            return self.rig.pose(self.params(frame), frame=frame)
+        pose = self.rig.pose(self.params(frame))
         if self.cloth is None:
-            return motion
+            return pose
         self.cloth.simulate(self._run_of(frame))
-        return self.rig.with_cloth(motion, self.cloth.shape(frame), time=self.cloth.time(frame))
+        return self.rig.with_cloth(pose, self.cloth.shape(frame), time=self.cloth.time(frame))
 
     def _run_of(self, frame: int) -> list[int]:
         """Return the frames about one that training does not see either and that have parameters."""

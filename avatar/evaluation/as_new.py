@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from avatar.data.sequence import AvatarSequence
 from avatar.rig.posed import AvatarModel, PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 
 
 class AsNew(nn.Module):
@@ -25,13 +25,13 @@ class AsNew(nn.Module):
         super().__init__()
         self.model, self.rig = model, model.rig
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar without the code of a frame."""
-        return self.model(motion.without_code(), camera_centers)
+        return self.model(pose.without_code(), camera_centers)
 
 
-def new_motion(sequence: AvatarSequence, frame: int) -> Motion:
+def new_pose(sequence: AvatarSequence, frame: int) -> Pose:
     """Return the pose of any frame as whoever plays it live has it, its clothes simulated."""
     if frame not in sequence.train_frames:
-        return sequence.motion(frame)
-    return replace(sequence.as_new_motion(frame), known=None)
+        return sequence.pose(frame)
+    return replace(sequence.as_new_pose(frame), known=None)

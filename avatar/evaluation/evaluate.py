@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
-from avatar.evaluation.as_new import AsNew, new_motion
+from avatar.evaluation.as_new import AsNew, new_pose
 from avatar.evaluation.gallery import Gallery, ShownSurface, ShownView
 from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
@@ -39,7 +39,7 @@ from avatar.metrics.view_quality import (
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -146,7 +146,7 @@ class _Run:
         sequence = self.sequence
         cameras = list(dict.fromkeys(c for one in self.sets.values() for c, f in one.views if f == frame))
         views = [sequence.whole_view(camera, frame) for camera in cameras]
-        skinned = sequence.rig.pose(sequence.motion(frame).without_cloth())
+        skinned = sequence.rig.skin(sequence.pose(frame).without_cloth())
         corners = skinned[self._head].double().cpu().numpy()
         heads = [head_box(corners, view.camera) for view in views]
         shown = [self._head_shown(skinned, view) for view in views]
@@ -164,7 +164,7 @@ class _Run:
         pictures: list[dict[str, UInt8[np.ndarray, "H W 3"]]] = [{} for _ in views]
         for name, model in self.models.items():
             with at_rest(model):
-                posed = model(_motion(model, sequence, frame), camera_centers)
+                posed = model(_pose(model, sequence, frame), camera_centers)
                 for index, view in enumerate(views):
                     pictures[index][name] = self._see(name, posed, index, view, frame, (heads[index], shown[index]))
             if truth is not None and alone is not None:
@@ -291,12 +291,12 @@ def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
     return TriangleMesh(vertices.double().cpu().numpy(), rig.template.faces)
 
 
-def _motion(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Motion:
+def _pose(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Pose:
     """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
-    motion = new_motion(sequence, frame) if isinstance(model, AsNew) else sequence.motion(frame)
+    pose = new_pose(sequence, frame) if isinstance(model, AsNew) else sequence.pose(frame)
     if model.rig.template is sequence.rig.template:
-        return motion if simulates(model) else motion.without_cloth()
-    return model.rig.motion(_params(sequence, frame), frame=motion.frame)
+        return pose if simulates(model) else pose.without_cloth()
+    return model.rig.pose(_params(sequence, frame), frame=pose.frame)
 
 
 def simulates(model: AvatarModel) -> bool:

@@ -79,9 +79,9 @@ def measure_speed(
     with at_rest(model):
         for k in range(warmup + pictures):
             begin = now()
-            motion = model.rig.motion(params[k % len(params)])
+            pose = model.rig.pose(params[k % len(params)])
             placed = now()
-            posed = model(motion, view.position[None])
+            posed = model(pose, view.position[None])
             deformed = now()
             render_view(posed, 0, view, background, eps2d=eps2d).image.clamp(0.0, 1.0)
             times.append((placed - begin, deformed - placed, now() - deformed))

@@ -22,7 +22,7 @@ from avatar.models.networks.local_pose import seen_joints
 from avatar.models.networks.pose_gate import PoseGate
 from avatar.models.networks.pose_regression import PoseRegression
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 
@@ -100,48 +100,48 @@ class Student(nn.Module):
         """The frames that have a code."""
         return () if self.codes is None else self.codes.frames
 
-    def displacements(self, motion: Motion) -> Float[Tensor, "V 3"] | None:
+    def displacements(self, pose: Pose) -> Float[Tensor, "V 3"] | None:
         """Return the field's displacements in a pose, metres, the regression's in a new one; None without a field."""
         if self.field is None or self.codes is None:
             return None
-        frame = motion.frame if motion.frame in self.codes.row else None
+        frame = pose.frame if pose.frame in self.codes.row else None
         if frame is None and self.regression is not None:
-            return self.field.spread(self.regression(motion.pose[None]))[0]
-        return self.field(motion.pose[None], self.codes([frame]))[0]
+            return self.field.spread(self.regression(pose.body_pose[None]))[0]
+        return self.field(pose.body_pose[None], self.codes([frame]))[0]
 
-    def compensated(self, motion: Motion) -> BoundGaussians:
+    def compensated(self, pose: Pose) -> BoundGaussians:
         """Return the Gaussians with their blend shapes of a pose added."""
         bound = self.gaussians()
         if self.blend_shapes is None:
             return bound
-        jaw = motion.jaw[None] if self.blend_shapes.config.jaw else None
-        z = self.blend_shapes.coefficients(motion.expression[None], motion.pose[None], jaw)
+        jaw = pose.jaw[None] if self.blend_shapes.config.jaw else None
+        z = self.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)
         head = self.blend_shapes.config.head_shapes
-        of_head, of_body = z.clone(), self._known(motion) * z
+        of_head, of_body = z.clone(), self._known(pose) * z
         of_head[..., head:], of_body[..., :head] = 0.0, 0.0
-        if motion.cloth is None:
+        if pose.cloth is None:
             du, dc = self.blend_shapes(of_head + of_body)
         else:  # what was learned from a followed surface says nothing of one that is simulated
-            still = (1.0 - motion.cloth.share[self.rig.faces[bound.face_index]].mean(dim=1))[None]
+            still = (1.0 - pose.cloth.share[self.rig.faces[bound.face_index]].mean(dim=1))[None]
             du, dc = (
                 a + still * b for a, b in zip(self.blend_shapes(of_head), self.blend_shapes(of_body), strict=True)
             )
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
-    def _known(self, motion: Motion) -> float | Tensor:
+    def _known(self, pose: Pose) -> float | Tensor:
         """Return how much a pose counts as one that training saw."""
-        if motion.known is not None:
-            return motion.known
-        if self.pose_gate is None or motion.frame in self.frames:
+        if pose.known is not None:
+            return pose.known
+        if self.pose_gate is None or pose.frame in self.frames:
             return 1.0
-        return self.pose_gate(motion.pose)
+        return self.pose_gate(pose.body_pose)
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the student as cameras with these centres, metres, see it."""
-        displacements = self.rig.displaced(motion, self.displacements(motion))
-        vertices = self.rig.pose(motion.without_cloth(), displacements)
+        displacements = self.rig.displaced(pose, self.displacements(pose))
+        vertices = self.rig.skin(pose.without_cloth(), displacements)
         frames = triangle_frames(vertices, self.rig.faces)
-        bound = self.compensated(motion)
+        bound = self.compensated(pose)
         world = world_from_frames(bound, frames)
         # Directions count as constants: a colour must not pull its Gaussian to the side.
         colors = view_colors(bound, frames, world.means.detach(), camera_centers)

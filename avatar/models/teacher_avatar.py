@@ -22,7 +22,7 @@ from avatar.models.tracked_surface import Track
 from avatar.rendering.map_frame import MapFrame
 from avatar.rendering.mesh_maps import front_back_maps, vertex_normals
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 
 TOLD = ("sigma", "drift")
 """What a track may tell of its errors."""
@@ -98,15 +98,15 @@ class TeacherAvatar(nn.Module):
         for name in TOLD:
             self.register_buffer(f"track_{name}", told.get(name))
 
-    def centre(self, motions: Iterable[Motion]) -> None:
+    def centre(self, poses: Iterable[Pose]) -> None:
         """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""
         if not self.config.centred:
             return
         count = 0
         total = torch.zeros_like(self.mean_positions, dtype=torch.float64)
         squares = torch.zeros_like(total)
-        for motion in motions:
-            _, positions = self._root_positions(motion)
+        for pose in poses:
+            _, positions = self._root_positions(pose)
             count, total, squares = count + 1, total + positions.double(), squares + positions.double().square()
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0.0)[self.maps.mask].mean()
@@ -119,25 +119,25 @@ class TeacherAvatar(nn.Module):
         with torch.no_grad(), torch.autocast(self.rig.device.type, enabled=False):
             yield
 
-    def _root_positions(self, motion: Motion) -> tuple[Tensor, Tensor]:
+    def _root_positions(self, pose: Pose) -> tuple[Tensor, Tensor]:
         """Return the skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
         with self._exact():
-            to_root = motion.root_from_world
-            vertices = self.rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3]
+            to_root = pose.root_from_world
+            vertices = self.rig.skin(pose) @ to_root[:3, :3].T + to_root[:3, 3]
             return vertices, self.maps.interpolate(vertices)
 
-    def position_input(self, motion: Motion) -> Float[Tensor, "1 2 S S 3"]:
+    def position_input(self, pose: Pose) -> Float[Tensor, "1 2 S S 3"]:
         """Return the maps of a pose as the networks are shown them; a constant for gradients."""
-        return self._shown(self._root_positions(motion)[1])
+        return self._shown(self._root_positions(pose)[1])
 
     def _shown(self, positions: Tensor) -> Tensor:
         return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
-    def inputs(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
+    def inputs(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
         """Return the maps of a pose and of cameras with these centres, metres; constants for gradients."""
         with self._exact():
-            to_root = motion.root_from_world
-            vertices, positions = self._root_positions(motion)
+            to_root = pose.root_from_world
+            vertices, positions = self._root_positions(pose)
             if not self.config.sees_view:
                 return TeacherMaps(self._shown(positions), None)
             normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
@@ -146,21 +146,21 @@ class TeacherAvatar(nn.Module):
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
             return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
 
-    def residual_maps(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> Residuals:
+    def residual_maps(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> Residuals:
         """Return the maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""
-        maps = self.inputs(motion, camera_centers)
+        maps = self.inputs(pose, camera_centers)
         return self.networks(maps.positions, self.semantics, maps.cosines)
 
-    def displacement_maps(self, motions: Sequence[Motion]) -> Float[Tensor, "B 2 R R 3"]:
+    def displacement_maps(self, poses: Sequence[Pose]) -> Float[Tensor, "B 2 R R 3"]:
         """Return dU in B poses, metres; the networks of other residuals do not run if they are apart."""
-        inputs = torch.cat([self.position_input(motion) for motion in motions])
+        inputs = torch.cat([self.position_input(pose) for pose in poses])
         return self.config.position_scale * self.networks.positions(inputs, self.semantics)
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the teacher as cameras with these centres, metres, see it."""
-        return self.posed(motion, camera_centers, self.residual_maps(motion, camera_centers))
+        return self.posed(pose, camera_centers, self.residual_maps(pose, camera_centers))
 
-    def posed(self, motion: Motion, camera_centers: Float[Tensor, "C 3"], maps: Residuals) -> PosedAvatar:
+    def posed(self, pose: Pose, camera_centers: Float[Tensor, "C 3"], maps: Residuals) -> PosedAvatar:
         """Do what `forward` does, from residual maps at hand."""
         residuals = maps.sampled(self.sampler)
         bound = self.gaussians()
@@ -171,7 +171,7 @@ class TeacherAvatar(nn.Module):
             log_scales=bound.log_scales + residuals.log_scales[0],
             quats=bound.quats + residuals.quats[0],
         )
-        vertices = self.rig.pose(motion)
+        vertices = self.rig.skin(pose)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
         means = world.means.detach()

@@ -17,7 +17,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 from smplxpp.template.template import Template
 
 HALF = 1e-2
@@ -111,10 +111,10 @@ class TrackedAvatar(nn.Module):
         self.register_buffer("moves", moves[self.cage.vertices, None].float(), persistent=False)
         self.to(rig.device)
 
-    def forward(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar, displaced by the control points as they stand."""
         displacements = self.cage(self.moves * self.controls)
-        vertices = self.rig.pose(motion, displacements)
+        vertices = self.rig.skin(pose, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.gaussians()
         world = world_from_frames(bound, frames)

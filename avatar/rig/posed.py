@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, WorldGaussians
-from avatar.rig.rig import Motion, Rig
+from avatar.rig.rig import Pose, Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class AvatarModel(Protocol):
     rig: Rig
     training: bool
 
-    def __call__(self, motion: Motion, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+    def __call__(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Return the avatar in a pose.
 
         Args:

@@ -1,4 +1,4 @@
-"""A template that torch can pose: what drives it in one frame, and its skinning with displaced vertices."""
+"""The rig: a template that torch skins, `Pose` (the inputs of one frame) and simulated cloth displacements."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 
 THETA = 63
-"""Length of theta: 21 body joints, axis-angle."""
+"""Length of the body pose theta: 21 joints of SMPL-X, an axis-angle each."""
 
 
 @dataclass(frozen=True, eq=False)
-class ClothMotion:
-    """Where simulated cloth is in one pose.
+class SimulatedCloth:
+    """Displacements of simulated cloth in one pose.
 
     Attributes:
         displacements: metres along the axes of the T-pose, to be added before skinning.
-        share: in [0, 1]: how much of a vertex's displacement this is; a model's own is the rest.
+        share: in [0, 1], weight of the simulated displacement; the model's own has the rest.
     """
 
     displacements: Float32[Tensor, "V 3"]
@@ -36,41 +36,43 @@ class ClothMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """One pose of a template, ready for the networks and for skinning; float32.
+class Pose:
+    """One posed frame of a template, ready for the networks and for skinning; float32.
 
     Attributes:
         frame: number of the training frame whose code the student takes; None for a new pose.
-        pose: theta, radians. expression: coefficients. jaw: axis-angle, radians.
+        body_pose: theta, axis-angles of 21 joints, radians.
+        expression: coefficients of the expression.
+        jaw: axis-angle, radians.
         rest: T-pose with this frame's expression and pose correctives, metres.
         world_from_rest: blended transforms of the vertices.
-        root_from_world: takes the root's motion away.
-        cloth: where the loose clothes are, if they are simulated.
-        time: seconds since the motion began; None where nobody knows.
-        known: in [0, 1]: how much the pose counts as one that training saw; None: models judge it.
+        root_from_world: inverse of the root's transform.
+        cloth: simulated displacements of the loose clothes; None where they are not simulated.
+        time: seconds since the motion began; None where that is unknown.
+        known: in [0, 1], weight of the pose as one of the training's; None: the model's pose gate decides.
     """
 
     frame: int | None
-    pose: Float32[Tensor, " 63"]
+    body_pose: Float32[Tensor, " 63"]
     expression: Float32[Tensor, " E"]
     jaw: Float32[Tensor, " 3"]
     rest: Float32[Tensor, "V 3"]
     world_from_rest: Float32[Tensor, "V 3 4"]
     root_from_world: Float32[Tensor, "4 4"]
-    cloth: ClothMotion | None = None
+    cloth: SimulatedCloth | None = None
     time: float | None = None
     known: float | None = None
 
-    def without_cloth(self) -> Motion:
-        """Return the same pose, its clothes moved by nothing but the model."""
+    def without_cloth(self) -> Pose:
+        """Return the same pose without simulated clothes, so that the model alone moves them."""
         return replace(self, cloth=None)
 
-    def without_code(self) -> Motion:
-        """Return the same pose without a frame's code, as models show new ones."""
+    def without_code(self) -> Pose:
+        """Return the same pose without a frame number, so that models use no frame code."""
         return replace(self, frame=None)
 
-    def as_new(self) -> Motion:
-        """Return the same pose as if training had not seen it."""
+    def as_new(self) -> Pose:
+        """Return the same pose marked as unseen by training: no frame code, `known` 0."""
         return replace(self, frame=None, known=0.0)
 
 
@@ -98,18 +100,19 @@ class Rig:
         """Number of the template's expression coefficients."""
         return self.template.body.num_expressions
 
-    def motion(self, params: BodyParams, *, frame: int | None = None) -> Motion:
-        """Return what one pose does to the template.
+    def pose(self, params: BodyParams, *, frame: int | None = None) -> Pose:
+        """Return one frame's parameters as a pose of the template: rest shape and blended transforms.
 
         Args:
-            params: one frame. frame: its number, where the student has a code for it.
+            params: parameters of one frame.
+            frame: its number, where the student has a code for it.
 
         Raises:
             InputError: several frames, or parameters that the body refuses.
         """
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
-        # A BLAS thread that has done its part spins on; torch's threads, which come next, would wait for its core.
+        # One BLAS thread: idle BLAS threads spin and would take the cores from torch's threads, which run next.
         with _thread_pools().limit(limits=1, user_api="blas"):
             posed = self.template.posed_body(params)
             transforms = posed.posed_from_rest[0]
@@ -118,9 +121,9 @@ class Rig:
         rest[: self.template.body.vertex_count] = posed.rest_vertices[0]
         expression = np.zeros(self.expression_size)
         expression[: params.expression.shape[1]] = params.expression[0]
-        return Motion(
+        return Pose(
             frame,
-            pose=self._tensor(params.body_pose[0]),
+            body_pose=self._tensor(params.body_pose[0]),
             expression=self._tensor(expression),
             jaw=self._tensor(params.jaw_pose[0]),
             rest=self._tensor(rest),
@@ -128,8 +131,10 @@ class Rig:
             root_from_world=self._tensor(np.linalg.inv(transforms[0])),
         )
 
-    def motion_to(self, vertices: Float[np.ndarray, "V 3"]) -> Motion:
-        """Make the motion whose posed mesh is `vertices`, metres, to the bit: its T-pose, which skinning leaves alone.
+    def pose_from_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> Pose:
+        """Return the pose whose skinned mesh equals `vertices`, metres, to the bit.
+
+        The vertices are its rest shape, and all its transforms are the identity.
 
         Raises:
             InputError: vertices of another number than the template's.
@@ -138,9 +143,9 @@ class Rig:
             raise InputError(
                 "posed vertices", expected=f"shape {tuple(self.vertices.shape)}", received=str(vertices.shape)
             )
-        return Motion(
+        return Pose(
             None,
-            pose=torch.zeros(THETA, device=self.device),
+            body_pose=torch.zeros(THETA, device=self.device),
             expression=torch.zeros(self.expression_size, device=self.device),
             jaw=torch.zeros(3, device=self.device),
             rest=self._tensor(vertices),
@@ -148,39 +153,39 @@ class Rig:
             root_from_world=torch.eye(4, device=self.device),
         )
 
-    def with_cloth(self, motion: Motion, shape: ClothShape, *, time: float | None = None) -> Motion:
-        """Return a pose with the clothes where a simulation has them."""
+    def with_cloth(self, pose: Pose, shape: ClothShape, *, time: float | None = None) -> Pose:
+        """Return the pose with a simulation's cloth displacements, scattered to all vertices."""
         at = torch.as_tensor(shape.vertices, device=self.device)
         displacements = torch.zeros(len(self.vertices), 3, device=self.device)
         share = torch.zeros(len(self.vertices), 1, device=self.device)
         displacements[at] = self._tensor(shape.displacements)
         share[at, 0] = self._tensor(shape.share)
-        return replace(motion, cloth=ClothMotion(displacements, share), time=time)
+        return replace(pose, cloth=SimulatedCloth(displacements, share), time=time)
 
-    def displaced(
-        self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None
-    ) -> Float[Tensor, "V 3"] | None:
-        """Return a model's displacements, metres, with those of simulated clothes in their place; None for none."""
-        if motion.cloth is None:
+    def displaced(self, pose: Pose, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"] | None:
+        """Return a model's displacements, metres, blended with the simulated ones by their share; None for none."""
+        if pose.cloth is None:
             return displacements
-        simulated = motion.cloth.share * motion.cloth.displacements
-        return simulated if displacements is None else simulated + (1.0 - motion.cloth.share) * displacements
+        simulated = pose.cloth.share * pose.cloth.displacements
+        return simulated if displacements is None else simulated + (1.0 - pose.cloth.share) * displacements
 
-    def pose(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"]:
+    def skin(self, pose: Pose, displacements: Float[Tensor, "V 3"] | None = None) -> Float[Tensor, "V 3"]:
         """Return the vertices in the world, metres, `x = (sum_j w_j G_j) (v + dv)`.
 
         Args:
-            displacements: dv, metres along the axes of the T-pose; gradients reach them. Where the motion has
-                simulated clothes, theirs take over.
+            displacements: dv, metres along the axes of the T-pose; gradients reach them. Where the pose has
+                simulated clothes, theirs replace them.
         """
-        displacements = self.displaced(motion, displacements)
-        rest = motion.rest if displacements is None else motion.rest + displacements
-        return _Skinning.apply(rest, motion.world_from_rest)
+        displacements = self.displaced(pose, displacements)
+        rest = pose.rest if displacements is None else pose.rest + displacements
+        return _Skinning.apply(rest, pose.world_from_rest)
 
     @torch.no_grad()
-    def places(self, motion: Motion, displacements: Float[Tensor, "V 3"] | None = None) -> Float64[np.ndarray, "V 3"]:
-        """Return what `pose` does, as numbers."""
-        return self.pose(motion, displacements).double().cpu().numpy()
+    def skin_to_numpy(
+        self, pose: Pose, displacements: Float[Tensor, "V 3"] | None = None
+    ) -> Float64[np.ndarray, "V 3"]:
+        """Return the vertices of `skin` as a numpy array, without gradients."""
+        return self.skin(pose, displacements).double().cpu().numpy()
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=self.device)
@@ -188,12 +193,12 @@ class Rig:
 
 @cache
 def _thread_pools() -> ThreadpoolController:
-    """Looks through all loaded libraries: once, not for every pose."""
+    """Return the controller of BLAS threads, made once because it searches all loaded libraries."""
     return ThreadpoolController()
 
 
 class _Skinning(torch.autograd.Function):
-    """(V, 3) rest positions, (V, 3, 4) transforms -> (V, 3); gradients reach the positions.
+    """Apply (V, 3, 4) transforms to (V, 3) rest positions; gradients reach the positions alone.
 
     Written as sums of columns: a batched product of (3, 3) matrices, or a sum over an axis of three, is several times
     slower on a CPU.

@@ -184,8 +184,8 @@ def measure_outlines(
     clothed = with_simulated(sequence, [garment])
     wrong: dict[bool, list[float]] = {False: [], True: []}
     for turn, frame in enumerate(spread(sequence.train_frames, frames)):
-        for simulated, motion in ((False, sequence.motion(frame)), (True, clothed.as_new_motion(frame))):
-            mesh = TriangleMesh(rig.pose(motion).double().cpu().numpy(), rig.template.faces)
+        for simulated, pose in ((False, sequence.pose(frame)), (True, clothed.as_new_pose(frame))):
+            mesh = TriangleMesh(rig.skin(pose).double().cpu().numpy(), rig.template.faces)
             for camera in sequence.cameras(frame, turn, cameras, 0):
                 image = capture.mask(camera, frame)
                 if image is None:
@@ -204,7 +204,7 @@ def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment,
     for k, frame in enumerate(frames.tolist()):
         params = sequence.capture.params(frame)
         if frame in track.row and params is not None:
-            world[k] = rig.places(sequence.motion(frame), track.displacements(frame))[garment.particles]
+            world[k] = rig.skin_to_numpy(sequence.pose(frame), track.displacements(frame))[garment.particles]
             confidence[k] = track.confidence(frame).cpu().numpy()[garment.particles]
         last = params if params is not None else last
         assert last is not None  # the first frame is a training frame, which has parameters

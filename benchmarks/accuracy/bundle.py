@@ -122,7 +122,7 @@ def measure(
     frame = item.frame if item.kind == "novel_view" else None
     background = sequence.background
     params, camera = sequence.params(item.frame), item.view.camera
-    posed = student(sequence.rig.motion(params, frame=frame), item.view.position[None])
+    posed = student(sequence.rig.pose(params, frame=frame), item.view.position[None])
     rendering = render_view(posed, 0, item.view, background)
     quality = view_quality(item.view, rendering.image, rendering.alpha, background, head=None)
     rows["full student, torch"].add(item.kind, quality.psnr)

@@ -153,7 +153,7 @@ class Bench:
             truth = self.capture.truth_mesh(frame)
             if truth is None:
                 continue
-            vertices = rig.places(sequence.motion(frame), track.displacements(frame))
+            vertices = rig.skin_to_numpy(sequence.pose(frame), track.displacements(frame))
             wrong = 1e3 * np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1)
             true.append(wrong)
             expected.append(1e3 * track.expected_error(frame).numpy()[self.same.own])
@@ -192,7 +192,7 @@ class Bench:
             avatar.controls.copy_(track.controls[track.row[frame]])
             for camera in self.capture.splits.novel_view_cameras:
                 view = sequence.whole_view(camera, frame)
-                posed = avatar(sequence.motion(frame), camera_centers_of([view]))
+                posed = avatar(sequence.pose(frame), camera_centers_of([view]))
                 seen = render_view(posed, 0, view, sequence.background)
                 quality = view_quality(view, seen.image, seen.alpha, sequence.background, head=None)
                 found.append(quality.psnr)

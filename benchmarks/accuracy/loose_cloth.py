@@ -29,7 +29,7 @@ from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality
 from avatar.models.model_file import load_avatar
-from avatar.rig.rig import Motion
+from avatar.rig.rig import Pose
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT
@@ -136,12 +136,12 @@ class _Bench:
         self.label = max(self.garments, key=lambda g: len(g.vertices)).part
         self.same = _same_points(self.sequence, load_params_of_run(run).frame(0), self.garments, scene.built_frame)
 
-    def rows(self) -> Iterator[tuple[str, Mapping[int, Motion]]]:
+    def rows(self) -> Iterator[tuple[str, Mapping[int, Pose]]]:
         """Motions of the measured frames, row by row."""
-        plain = {frame: self.sequence.motion(frame) for frame in self.truths}
+        plain = {frame: self.sequence.pose(frame) for frame in self.truths}
         yield "skinning", plain
         with torch.no_grad():
-            field = {f: self.student.displacements(motion) for f, motion in plain.items()}  # type: ignore[union-attr]
+            field = {f: self.student.displacements(pose) for f, pose in plain.items()}  # type: ignore[union-attr]
         yield "student's field", {f: _moved(plain[f], field[f]) for f in plain}
         for name, config in (
             ("simulated, cold start 0.7 s before", ClothMotionConfig()),
@@ -152,11 +152,11 @@ class _Bench:
             yield name, self._simulated(config)
         yield "online: causal filter, from 0.7 s before", self._online()
 
-    def measured(self, motions: Mapping[int, Motion]) -> dict[str, float | None]:
+    def measured(self, poses: Mapping[int, Pose]) -> dict[str, float | None]:
         """Distances of the loose part to the truth, mm, means over the frames."""
         rig, found, apart = self.sequence.rig, [], []
         for frame, truth in self.truths.items():
-            vertices = rig.pose(motions[frame]).double().numpy()
+            vertices = rig.skin(poses[frame]).double().numpy()
             mesh = TriangleMesh(vertices, self.template.faces)
             parts = surface_quality(mesh, self.template.vertex_labels, truth, samples=SAMPLES).labels
             found.append(parts[self.label])
@@ -170,7 +170,7 @@ class _Bench:
         surfaces = []
         for _ in range(STARTS):
             shapes = self._rolled(None, rng)
-            at = [self.sequence.rig.pose(self._with(frame, shapes[frame])).numpy() for frame in self.truths]
+            at = [self.sequence.rig.skin(self._with(frame, shapes[frame])).numpy() for frame in self.truths]
             surfaces.append(np.stack(at)[:, self.garments[0].vertices])
         stacked = np.stack(surfaces)
         spread = np.linalg.norm(stacked - stacked.mean(axis=0), axis=-1).mean()
@@ -192,7 +192,7 @@ class _Bench:
             out[name] = round(1e3 * median(took[1:]), 2)
         return out
 
-    def _simulated(self, config: ClothMotionConfig) -> dict[int, Motion]:
+    def _simulated(self, config: ClothMotionConfig) -> dict[int, Pose]:
         capture = self.sequence.capture
         clothes = ClothMotions(
             self.template, self.garments, params=capture.params, frames=capture.frames, fps=self.fps, config=config
@@ -200,7 +200,7 @@ class _Bench:
         clothes.simulate(self.held_out)
         return {frame: self._with(frame, clothes.shape(frame)) for frame in self.truths}
 
-    def _online(self) -> dict[int, Motion]:
+    def _online(self) -> dict[int, Pose]:
         shapes = self._rolled(CausalSmoother(), None)
         return {frame: self._with(frame, shapes[frame]) for frame in self.truths}
 
@@ -220,8 +220,8 @@ class _Bench:
             last = frame
         return shapes
 
-    def _with(self, frame: int, shape: ClothShape) -> Motion:
-        return self.sequence.rig.with_cloth(self.sequence.motion(frame), shape)
+    def _with(self, frame: int, shape: ClothShape) -> Pose:
+        return self.sequence.rig.with_cloth(self.sequence.pose(frame), shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,8 +254,8 @@ def _same_points(
     return _SamePoints(own[close], corners, weights, len(truth.vertices)) if close.any() else None
 
 
-def _moved(motion: Motion, displacements: torch.Tensor | None) -> Motion:
-    return motion if displacements is None else replace(motion, rest=motion.rest + displacements)
+def _moved(pose: Pose, displacements: torch.Tensor | None) -> Pose:
+    return pose if displacements is None else replace(pose, rest=pose.rest + displacements)
 
 
 def _over(rows: Sequence[Mapping[str, float | None]], of: Callable[[list[float]], float]) -> dict[str, float | None]:

@@ -159,7 +159,7 @@ def student(job: Job, note: Note) -> None:
     _shake(model)
     capture = open_capture(job.capture)
     params = [found for frame in capture.frames[:16] if (found := capture.params(frame)) is not None]
-    motions = [rig.motion(each, frame=0) for each in params]
+    poses = [rig.pose(each, frame=0) for each in params]
     camera = next(iter(capture.cameras.values()))
     center = torch.tensor(camera.position[None], dtype=torch.float32, device=job.device)
     note(gaussians=count, vertices=len(rig.vertices), trained=False, rows={})
@@ -167,20 +167,20 @@ def student(job: Job, note: Note) -> None:
     for name, dtype in (("float32", torch.float32), ("half", torch.float16)):
         deform = Deformer(model, dtype)
         with torch.no_grad():
-            truth = model(motions[-1], center).gaussians
-        rows[name] = {"difference_mm": largest_difference_mm(deform(motions[-1], center), truth)}
+            truth = model(poses[-1], center).gaussians
+        rows[name] = {"difference_mm": largest_difference_mm(deform(poses[-1], center), truth)}
         note(rows=rows)
         variants: dict[str, Callable] = {"eager": deform}
         if not job.toy:
             try:
-                variants["graph"] = Replayed(deform, motions[0], center)
-                rows[name]["graph_difference_mm"] = largest_difference_mm(variants["graph"](motions[-1], center), truth)
+                variants["graph"] = Replayed(deform, poses[0], center)
+                rows[name]["graph_difference_mm"] = largest_difference_mm(variants["graph"](poses[-1], center), truth)
             except RuntimeError as error:
                 rows[name]["graph_error"] = str(error)[:500]
         for variant, work in variants.items():
             for width, height in sizes:
                 seen = fitted(camera, width, height)
-                rows[name][f"{variant} {width}x{height}"] = frames_a_second(work, motions, seen, pictures=pictures)
+                rows[name][f"{variant} {width}x{height}"] = frames_a_second(work, poses, seen, pictures=pictures)
                 note(rows=rows)
     note(rows=rows, **_memory(job))
 

@@ -23,11 +23,11 @@ from avatar.gaussians.quaternions import quat_from_matrix
 from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.student import Student
 from avatar.rendering import rasterize
-from avatar.rig.rig import Motion
+from avatar.rig.rig import Pose
 from smplxpp.core.camera import Camera
 
-MOVING = ("pose", "expression", "jaw", "rest", "world_from_rest", "root_from_world")
-"""Fields of a `Motion` that change from frame to frame."""
+MOVING = ("body_pose", "expression", "jaw", "rest", "world_from_rest", "root_from_world")
+"""Fields of a `Pose` that change from frame to frame."""
 WARM_UP = 3
 
 
@@ -71,13 +71,13 @@ class Deformer:
         self.code = student.codes.codes[:1].detach().to(dtype)
 
     @torch.no_grad()
-    def __call__(self, motion: Motion, camera_center: Tensor) -> Drawable:
+    def __call__(self, pose: Pose, camera_center: Tensor) -> Drawable:
         """The Gaussians of a pose as a camera at (1, 3) metres sees them."""
-        pose = motion.pose[None].to(self.dtype)
-        vertices = self.rig.pose(motion, self.field(pose, self.code)[0].float())
+        body_pose = pose.body_pose[None].to(self.dtype)
+        vertices = self.rig.skin(pose, self.field(body_pose, self.code)[0].float())
         frames = plain_frames(vertices, self.rig.faces)
-        jaw = motion.jaw[None].to(self.dtype) if self.shapes.config.jaw else None
-        z = self.shapes.coefficients(motion.expression[None].to(self.dtype), pose, jaw)
+        jaw = pose.jaw[None].to(self.dtype) if self.shapes.config.jaw else None
+        z = self.shapes.coefficients(pose.expression[None].to(self.dtype), body_pose, jaw)
         du, dc = self.shapes(z)
         bound = replace(self.bound, offset=self.bound.offset + du[0].float(), dc=self.bound.dc + dc[0].float())
         world = world_from_frames_reference(bound, frames)
@@ -88,22 +88,22 @@ class Deformer:
 class Replayed:
     """A deformer recorded once as a CUDA graph, and replayed for every frame."""
 
-    def __init__(self, deformer: Deformer, motion: Motion, camera_center: Tensor) -> None:
-        self.motion = replace(motion, **{name: getattr(motion, name).clone() for name in MOVING})
+    def __init__(self, deformer: Deformer, pose: Pose, camera_center: Tensor) -> None:
+        self.pose = replace(pose, **{name: getattr(pose, name).clone() for name in MOVING})
         self.center = camera_center.clone()
         aside = torch.cuda.Stream()
         aside.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(aside):  # what is set up at a first call must not be part of the graph
             for _ in range(WARM_UP):
-                deformer(self.motion, self.center)
+                deformer(self.pose, self.center)
         torch.cuda.current_stream().wait_stream(aside)
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph):
-            self.out = deformer(self.motion, self.center)
+            self.out = deformer(self.pose, self.center)
 
-    def __call__(self, motion: Motion, camera_center: Tensor) -> Drawable:
+    def __call__(self, pose: Pose, camera_center: Tensor) -> Drawable:
         for name in MOVING:
-            getattr(self.motion, name).copy_(getattr(motion, name))
+            getattr(self.pose, name).copy_(getattr(pose, name))
         self.center.copy_(camera_center)
         self.graph.replay()
         return self.out
@@ -129,10 +129,10 @@ def draw(frame: Drawable, camera: Camera, device: torch.device) -> Tensor:
 
 
 def frames_a_second(
-    deform: Callable[[Motion, Tensor], Drawable], motions: Sequence[Motion], camera: Camera, *, pictures: int
+    deform: Callable[[Pose, Tensor], Drawable], poses: Sequence[Pose], camera: Camera, *, pictures: int
 ) -> dict[str, float]:
     """Median milliseconds of deformation and drawing, and of both as frames a second; poses are at hand."""
-    device = motions[0].pose.device
+    device = poses[0].body_pose.device
     center = torch.tensor(camera.position[None], dtype=torch.float32, device=device)
 
     def now() -> float:
@@ -142,9 +142,9 @@ def frames_a_second(
 
     times = []
     with torch.no_grad():
-        for motion in itertools.islice(itertools.cycle(motions), WARM_UP + pictures):
+        for pose in itertools.islice(itertools.cycle(poses), WARM_UP + pictures):
             begin = now()
-            frame = deform(motion, center)
+            frame = deform(pose, center)
             deformed = now()
             draw(frame, camera, device)
             times.append((deformed - begin, now() - deformed))

@@ -106,7 +106,7 @@ def _parts(scene: FitScene, config: FitConfig) -> dict[str, float]:
         times.setdefault(name, []).append(1e3 * (time.perf_counter() - begin))
         return out
 
-    rest = task.sequence.motion(FRAME).rest
+    rest = task.sequence.pose(FRAME).rest
     parameters = list(task.learned.values())
     for k in range(WARM_UP + TIMED):
         views = task.views(task.micro_batches(k)[0])

@@ -117,13 +117,13 @@ def torch_pictures(student: Student, camera: Camera) -> Callable[[BodyParams], d
     @torch.no_grad()
     def picture(params: BodyParams) -> dict[str, float]:
         times = [time.process_time()]
-        motion = rig.motion(params)
+        pose = rig.pose(params)
         times.append(time.process_time())
-        moved = student.displacements(motion)
+        moved = student.displacements(pose)
         times.append(time.process_time())
-        bound = student.compensated(motion)
+        bound = student.compensated(pose)
         times.append(time.process_time())
-        vertices = rig.pose(motion, moved)
+        vertices = rig.skin(pose, moved)
         frames = triangle_frames(vertices, rig.faces)
         world = world_from_frames(bound, frames)
         colors = view_colors(bound, frames, world.means, view.position[None])

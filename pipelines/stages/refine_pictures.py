@@ -35,7 +35,7 @@ def write_pictures(folder: Path, sequence: AvatarSequence, found: Refinement) ->
         rendered = []
         for params in (found.start, found.params):
             with at_rest(avatar):
-                posed = avatar(sequence.rig.motion(params.frame(int(row))), view.position[None])
+                posed = avatar(sequence.rig.pose(params.frame(int(row))), view.position[None])
                 rendered.append(eight_bit(render_view(posed, 0, view, sequence.background).image).numpy())
         file = f"pictures/{view.name}_{frame:06d}.png"
         write_tiles(folder / file, view.photograph(sequence.background.tolist()), rendered)

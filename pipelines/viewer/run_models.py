@@ -222,7 +222,7 @@ def tracked_surface(run: Path, template: Template) -> Surface | None:
         rig, track = read()
         if track is None or frame not in track.row:
             return None
-        return rig.places(rig.motion(params), track.displacements(frame))
+        return rig.skin_to_numpy(rig.pose(params), track.displacements(frame))
 
     return at
 

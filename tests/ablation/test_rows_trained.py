@@ -78,12 +78,10 @@ def test_trained_rows_are_what_they_claim(finished, capture):
     run, outcome = finished
     assert list(outcome.results["rows"]) == list(PAPER_ROWS) and outcome.waiting == []
     trainer, stages = opened(run, capture)
-    camera_centers, motion = torch.tensor([[0.0, 0.5, 2.0]]), trainer.sequence("clothed").motion(1)
+    camera_centers, pose = torch.tensor([[0.0, 0.5, 2.0]]), trainer.sequence("clothed").pose(1)
     models = {name: trainer.model(stages[row.model]) for name, row in PAPER_ROWS.items()}
     with torch.no_grad():
-        posed = {
-            name: models[name](motion, camera_centers) for name in ("no-mesh", "no-gaussians", "full", "no-teacher")
-        }
+        posed = {name: models[name](pose, camera_centers) for name in ("no-mesh", "no-gaussians", "full", "no-teacher")}
     assert posed["no-mesh"].displacements is None
     assert models["no-mesh"].blend_shapes is not None
     assert models["no-gaussians"].blend_shapes is None and posed["no-gaussians"].displacements is not None
@@ -175,12 +173,12 @@ def test_a_pruned_student_is_smaller_and_the_null_codes_row_is_full_told_nothing
     reports = {name: EvalReport.load(own / "ablation" / "rows" / name / "report.json") for name in (*rows, "full")}
     bytes_of = {name: report.models[{**PAPER_ROWS, **rows}[name].title].bytes for name, report in reports.items()}
     assert bytes_of["pruned"] < bytes_of["null-code"] == bytes_of["full"]
-    full, motion = trainer.model(stages["full"]), trainer.sequence("clothed").motion(1)
+    full, pose = trainer.model(stages["full"]), trainer.sequence("clothed").pose(1)
     camera_centers = torch.tensor([[0.0, 0.5, 2.0]])
     with torch.no_grad():
         full.codes.codes += 1.0  # three steps leave most of them at zero
-        null, known = AsNew(full)(motion, camera_centers), full(motion, camera_centers)
-        assert torch.equal(null.vertices, full(motion.without_code(), camera_centers).vertices)
+        null, known = AsNew(full)(pose, camera_centers), full(pose, camera_centers)
+        assert torch.equal(null.vertices, full(pose.without_code(), camera_centers).vertices)
     assert not torch.equal(null.vertices, known.vertices)
 
 

@@ -73,8 +73,8 @@ def trained(kind: str, sequence: AvatarSequence):
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_an_avatar(kind, sequence):
     model, camera_centers = made(kind, sequence.rig), torch.tensor([[0.0, 0.5, 2.0], [2.0, 0.5, 0.0]])
-    for motion in (sequence.motion(1), sequence.motion(4)):  # a frame with a code, and one without
-        posed = model(motion, camera_centers)
+    for pose in (sequence.pose(1), sequence.pose(4)):  # a frame with a code, and one without
+        posed = model(pose, camera_centers)
         assert posed.vertices.shape == (template().vertex_count, 3)
         assert posed.colors.shape == (2, len(posed.gaussians.means), 3)
         assert torch.isfinite(posed.colors).all() and torch.isfinite(posed.gaussians.means).all()
@@ -85,8 +85,8 @@ def test_it_is_an_avatar(kind, sequence):
 def test_residuals_start_at_zero(kind, sequence):
     gaussians = sample_on_mesh(template(), SAMPLING)
     plain = Student(StudentConfig(field=None), sequence.rig, gaussians, ())
-    motion, camera_centers = sequence.motion(2), torch.tensor([[0.0, 0.5, 2.0]])
-    a, b = made(kind, sequence.rig)(motion, camera_centers), plain(motion, camera_centers)
+    pose, camera_centers = sequence.pose(2), torch.tensor([[0.0, 0.5, 2.0]])
+    a, b = made(kind, sequence.rig)(pose, camera_centers), plain(pose, camera_centers)
     torch.testing.assert_close(a.gaussians.means, b.gaussians.means)
     torch.testing.assert_close(a.colors, b.colors)
 
@@ -103,10 +103,10 @@ def test_it_learns_and_repeats_bit_for_bit(kind, sequence):
 def test_a_networks_residuals_depend_on_pose_and_code(sequence):
     for kind in ("mlp", "uv"):
         model, _, _ = trained(kind, sequence)
-        motion = sequence.motion(1)
+        pose = sequence.pose(1)
         code = model.codes([1])[0]
-        assert not torch.equal(model.residuals(motion, code), model.residuals(sequence.motion(2), code))
-        assert not torch.equal(model.residuals(motion, code), model.residuals(motion, code + 1.0))
+        assert not torch.equal(model.residuals(pose, code), model.residuals(sequence.pose(2), code))
+        assert not torch.equal(model.residuals(pose, code), model.residuals(pose, code + 1.0))
 
 
 def test_texels_stay_on_the_surface_while_the_mesh_moves(sequence):
@@ -115,7 +115,7 @@ def test_texels_stay_on_the_surface_while_the_mesh_moves(sequence):
     for name in ("offset", "normal_offset", "log_scales", "quats", "opacity_logits"):
         assert torch.equal(getattr(model.gaussians, name), getattr(start, name)), name
     assert not torch.equal(model.gaussians.dc, start.dc)
-    posed = model(sequence.motion(1), torch.tensor([[0.0, 0.5, 2.0]]))
+    posed = model(sequence.pose(1), torch.tensor([[0.0, 0.5, 2.0]]))
     assert posed.displacements.abs().max() > 0
     corners = posed.vertices[sequence.rig.faces[posed.bound.face_index]]
     u, v = posed.bound.barycentric.unbind(-1)
@@ -126,7 +126,7 @@ def test_texels_stay_on_the_surface_while_the_mesh_moves(sequence):
 def test_the_naked_body_carries_them_too(capture):
     naked = AvatarSequence(capture, template().naked())
     for kind in KINDS:
-        posed = made(kind, naked.rig)(naked.motion(1), torch.tensor([[0.0, 0.5, 2.0]]))
+        posed = made(kind, naked.rig)(naked.pose(1), torch.tensor([[0.0, 0.5, 2.0]]))
         assert len(posed.vertices) == template().body.vertex_count
 
 

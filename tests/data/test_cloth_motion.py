@@ -188,27 +188,27 @@ def test_a_sequence_simulates_what_training_does_not_see_and_nothing_else(captur
     told = Told()
     sequence = AvatarSequence(capture, template(), cloth=told)
     for frame in sequence.train_frames:
-        motion = sequence.motion(frame)
-        assert motion.cloth is None and motion.frame == frame
+        new = sequence.pose(frame)
+        assert new.cloth is None and new.frame == frame
     assert told.asked == []
     for frame in NOVEL_POSES:
-        motion = sequence.motion(frame)
-        assert motion.frame is None and motion.time == frame / 10.0
-        np.testing.assert_allclose(motion.cloth.displacements[template().cloth_mask].numpy(), 0.01 * frame)
+        new = sequence.pose(frame)
+        assert new.frame is None and new.time == frame / 10.0
+        np.testing.assert_allclose(new.cloth.displacements[template().cloth_mask].numpy(), 0.01 * frame)
     assert told.asked[0] == list(NOVEL_POSES)  # the whole run at once, in order
     plain = AvatarSequence(capture, template())
-    assert plain.motion(NOVEL_POSES[0]).cloth is None
-    assert plain.with_cloth(told).motion(NOVEL_POSES[0]).cloth is not None
+    assert plain.pose(NOVEL_POSES[0]).cloth is None
+    assert plain.with_cloth(told).pose(NOVEL_POSES[0]).cloth is not None
 
 
 def test_training_frames_as_new_ones_are_simulated_in_order_from_one_start(capture):
     told = Told()
     sequence = AvatarSequence(capture, template(), cloth=told)
-    motion = sequence.as_new_motion(2)
-    assert motion.frame is None and motion.known == 0.0 and motion.cloth is not None
+    new = sequence.as_new_pose(2)
+    assert new.frame is None and new.known == 0.0 and new.cloth is not None
     assert told.asked == [list(sequence.train_frames)]
-    assert sequence.motion(2).cloth is None
-    without = AvatarSequence(capture, template()).as_new_motion(2)
+    assert sequence.pose(2).cloth is None
+    without = AvatarSequence(capture, template()).as_new_pose(2)
     assert without.frame is None and without.cloth is None
 
 

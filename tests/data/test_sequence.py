@@ -77,19 +77,19 @@ def test_a_frame_that_a_camera_lacks_is_seen_by_the_others(root, tmp_path):
 
 
 def test_motions_have_the_code_of_training_frames_alone(made):
-    assert [made.motion(frame).frame for frame in range(6)] == [0, 1, 2, 3, None, None]
-    posed = made.rig.pose(made.motion(NOVEL_POSES[0]))
+    assert [made.pose(frame).frame for frame in range(6)] == [0, 1, 2, 3, None, None]
+    posed = made.rig.skin(made.pose(NOVEL_POSES[0]))
     np.testing.assert_allclose(posed.numpy(), template().pose(dance().frame(NOVEL_POSES[0]))[0], atol=1e-6)
-    assert made.motion(2) is made.motion(2)
+    assert made.pose(2) is made.pose(2)
 
 
 def test_few_motions_are_kept(root):
-    made = sequence(root, motions=2)
-    first = made.motion(0)
-    made.motion(1)
-    assert made.motion(0) is first
-    made.motion(2)  # drops 1, which was used longest ago
-    assert made.motion(0) is first and len(made._motions) == 2
+    made = sequence(root, kept_poses=2)
+    first = made.pose(0)
+    made.pose(1)
+    assert made.pose(0) is first
+    made.pose(2)  # drops 1, which was used longest ago
+    assert made.pose(0) is first and len(made._poses) == 2
 
 
 def test_training_views_are_cut_to_the_person_and_whole_ones_are_not(root):
@@ -136,13 +136,13 @@ def test_what_is_missing_is_said(root, tmp_path):
     copy = shutil.copytree(root, tmp_path / "capture")
     (copy / "params" / "000002.npz").unlink()
     with pytest.raises(InputError, match="parameters of frame 2"):
-        sequence(copy).motion(2)
+        sequence(copy).pose(2)
     for camera in TRAIN:
         shutil.rmtree(copy / "rgbs" / camera)
     with pytest.raises(InputError, match="training cameras with images"):
         sequence(copy)
     capture = open_capture(root)
     assert set(HELD_OUT) <= set(capture.cameras)
-    for change in ({"margin": -1}, {"motions": 0}):
+    for change in ({"margin": -1}, {"kept_poses": 0}):
         with pytest.raises(InputError, match=next(iter(change))):
             SequenceConfig(**change)

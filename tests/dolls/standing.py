@@ -114,5 +114,5 @@ class Grown(Student):
         config = StudentConfig(field=FieldConfig(width=8, hidden_layers=1))
         super().__init__(config, own, sample_on_mesh(own.template, SamplingConfig(count=800)), (0, 1, 2, 3))
 
-    def displacements(self, motion):
+    def displacements(self, pose):
         return torch.tensor(OUT * self.rig.template.mesh.vertex_normals, dtype=torch.float32)

@@ -28,8 +28,8 @@ def rig() -> Rig:
 
 
 @pytest.fixture
-def motion(rig):
-    return rig.motion(dance().frame(3), frame=3)
+def pose(rig):
+    return rig.pose(dance().frame(3), frame=3)
 
 
 def student(rig, **config) -> Student:
@@ -45,31 +45,31 @@ def disturb(module) -> None:
             value.add_(0.05 * torch.randn(value.shape, generator=random))
 
 
-def test_a_teacher_without_residuals_is_skinning(rig, motion):
+def test_a_teacher_without_residuals_is_skinning(rig, pose):
     teacher = TeacherAvatar(TINY_TEACHER, rig, varied(gaussians()))
-    posed = teacher(motion, EYES)
+    posed = teacher(pose, EYES)
     bound = varied(gaussians())
-    expected = world_from_local(bound, rig.pose(motion), rig.faces)
+    expected = world_from_local(bound, rig.skin(pose), rig.faces)
     for name in ("means", "scales", "opacities"):
         torch.testing.assert_close(getattr(posed.gaussians, name), getattr(expected, name), rtol=0, atol=1e-6)
     quats = expected.quats / expected.quats.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(posed.gaussians.quats, quats, rtol=0, atol=1e-6)
-    torch.testing.assert_close(posed.vertices, rig.pose(motion))
+    torch.testing.assert_close(posed.vertices, rig.skin(pose))
     assert posed.displacements is None and posed.colors.shape == (2, len(bound), 3)
 
 
-def test_a_student_is_skinning_before_it_learns(rig, motion):
+def test_a_student_is_skinning_before_it_learns(rig, pose):
     for model in (student(rig), student(rig, blend_shapes=SHAPES), student(rig, field=None)):
-        posed = model(motion, EYES)
-        expected = world_from_local(varied(gaussians()), rig.pose(motion), rig.faces)
+        posed = model(pose, EYES)
+        expected = world_from_local(varied(gaussians()), rig.skin(pose), rig.faces)
         torch.testing.assert_close(posed.gaussians.means, expected.means, rtol=0, atol=1e-6)
-        torch.testing.assert_close(posed.vertices, rig.pose(motion), rtol=0, atol=1e-6)
+        torch.testing.assert_close(posed.vertices, rig.skin(pose), rtol=0, atol=1e-6)
 
 
-def test_teacher_and_student_agree_where_neither_has_learned(rig, motion):
+def test_teacher_and_student_agree_where_neither_has_learned(rig, pose):
     teacher = TeacherAvatar(TINY_TEACHER, rig, varied(gaussians()))
     own = Student(StudentConfig(field=TINY_FIELD), rig, teacher.gaussians.snapshot(), (3,))
-    a, b = teacher(motion, EYES), own(motion, EYES)
+    a, b = teacher(pose, EYES), own(pose, EYES)
     torch.testing.assert_close(a.colors, b.colors, rtol=0, atol=1e-5)
     torch.testing.assert_close(a.gaussians.means, b.gaussians.means, rtol=0, atol=1e-6)
 
@@ -77,13 +77,13 @@ def test_teacher_and_student_agree_where_neither_has_learned(rig, motion):
 def test_a_position_residual_moves_gaussians_along_the_axes_of_the_t_pose(rig):
     """At rest a map that is constant moves every Gaussian it reaches by the same vector, whatever its triangle."""
     teacher = TeacherAvatar(TINY_TEACHER, rig, gaussians())
-    motion = rig.motion(replace(dance().frame(0), **_rest(dance().frame(0))))
-    maps = teacher.residual_maps(motion, EYES)
+    pose = rig.pose(replace(dance().frame(0), **_rest(dance().frame(0))))
+    maps = teacher.residual_maps(pose, EYES)
     moved = maps.shape.clone()
     moved[..., 0] += 0.02 / maps.position_scale
-    before = teacher.posed(motion, EYES, maps).gaussians.means
-    after = teacher.posed(motion, EYES, replace(maps, shape=moved)).gaussians.means
-    root = motion.world_from_rest[0, :, :3]
+    before = teacher.posed(pose, EYES, maps).gaussians.means
+    after = teacher.posed(pose, EYES, replace(maps, shape=moved)).gaussians.means
+    root = pose.world_from_rest[0, :, :3]
     torch.testing.assert_close(
         after - before, (root @ torch.tensor([0.02, 0.0, 0.0])).expand_as(before), rtol=0, atol=2e-5
     )
@@ -99,8 +99,8 @@ def test_the_teachers_inputs_do_not_know_where_the_person_stands(rig):
     params = dance().frame(2)
     away = replace(params, transl=params.transl + [[0.7, -0.2, 1.3]])
     shift = torch.tensor([0.7, -0.2, 1.3])
-    one = teacher.inputs(rig.motion(params), EYES)
-    two = teacher.inputs(rig.motion(away), EYES + shift)
+    one = teacher.inputs(rig.pose(params), EYES)
+    two = teacher.inputs(rig.pose(away), EYES + shift)
     torch.testing.assert_close(one.positions, two.positions, rtol=0, atol=1e-5)
     assert one.positions.shape == (1, 2, 16, 16, 3)
     if one.cosines is not None:
@@ -112,7 +112,7 @@ CENTRED = replace(TINY_TEACHER, centred=True)
 
 def test_centred_inputs_have_mean_zero_and_deviation_one(rig):
     teacher, plain = (TeacherAvatar(config, rig, gaussians()) for config in (CENTRED, TINY_TEACHER))
-    poses = [rig.motion(dance().frame(frame)) for frame in range(6)]
+    poses = [rig.pose(dance().frame(frame)) for frame in range(6)]
     teacher.centre(poses)
     shown = torch.cat([teacher.inputs(pose, EYES).positions for pose in poses])[:, teacher.maps.mask]
     torch.testing.assert_close(shown.mean(0), torch.zeros(shown.shape[1:]), rtol=0, atol=1e-4)
@@ -129,7 +129,7 @@ def test_centred_inputs_have_mean_zero_and_deviation_one(rig):
 
 def test_poses_that_do_not_differ_are_not_told_apart(rig):
     teacher = TeacherAvatar(CENTRED, rig, gaussians())
-    pose = rig.motion(dance().frame(1))
+    pose = rig.pose(dance().frame(1))
     teacher.centre([pose, pose])
     assert teacher.position_input(pose).abs().max() < 1e-2 and teacher.deviation > 0
 
@@ -138,7 +138,7 @@ def test_poses_that_do_not_differ_are_not_told_apart(rig):
 def test_displacement_maps_of_poses_are_those_of_all_residuals(rig, config):
     torch.manual_seed(0)
     teacher = TeacherAvatar(replace(config, zero_output=False), rig, gaussians())
-    poses = [rig.motion(dance().frame(frame)) for frame in (1, 3)]
+    poses = [rig.pose(dance().frame(frame)) for frame in (1, 3)]
     teacher.centre(poses)
     with torch.no_grad():
         together = teacher.displacement_maps(poses)
@@ -155,31 +155,31 @@ def test_the_maps_frame_holds_a_tall_body():
     assert inside.all() and frame.half_extent > HALF_EXTENT
 
 
-def test_codes_and_pose_move_the_mesh_of_a_disturbed_field(rig, motion):
+def test_codes_and_pose_move_the_mesh_of_a_disturbed_field(rig, pose):
     model = student(rig)
     disturb(model.field)
     with torch.no_grad():
         model.codes.codes[3] = 1.0
-    known, null = model.displacements(motion), model.displacements(motion.without_code())
-    other = model.displacements(rig.motion(dance().frame(1)))
+    known, null = model.displacements(pose), model.displacements(pose.without_code())
+    other = model.displacements(rig.pose(dance().frame(1)))
     assert known.shape == (template().vertex_count, 3)
     for different in (null, other):
         assert (known - different).abs().max() > 1e-4
-    unknown = model.displacements(rig.motion(dance().frame(3), frame=99))
+    unknown = model.displacements(rig.pose(dance().frame(3), frame=99))
     torch.testing.assert_close(unknown, null)
-    posed = model(motion, EYES)
-    torch.testing.assert_close(posed.vertices, rig.pose(motion, known))
+    posed = model(pose, EYES)
+    torch.testing.assert_close(posed.vertices, rig.skin(pose, known))
     frames = triangle_frames(posed.vertices, rig.faces)
     assert posed.gaussians.means.shape[0] == len(model.gaussians) and torch.isfinite(frames.rotations).all()
 
 
 @pytest.mark.parametrize("change", [{}, {"gated": True}, {"parts": 5}, {"gated": True, "parts": 3}])
-def test_blend_shapes_of_every_kind_add_to_offset_and_colour(rig, motion, change):
+def test_blend_shapes_of_every_kind_add_to_offset_and_colour(rig, pose, change):
     model = student(rig, blend_shapes=replace(SHAPES, **change))
     disturb(model.blend_shapes)
-    moved, plain = model.compensated(motion), model.gaussians()
-    jaw, expression, pose = motion.jaw[None], motion.expression[None], motion.pose[None]
-    du, dc = model.blend_shapes(model.blend_shapes.coefficients(expression, pose, jaw))
+    moved, plain = model.compensated(pose), model.gaussians()
+    jaw, expression, body_pose = pose.jaw[None], pose.expression[None], pose.body_pose[None]
+    du, dc = model.blend_shapes(model.blend_shapes.coefficients(expression, body_pose, jaw))
     torch.testing.assert_close(moved.offset - plain.offset, du[0], rtol=0, atol=1e-6)
     torch.testing.assert_close(moved.dc - plain.dc, dc[0], rtol=0, atol=1e-6)
     assert du.abs().min(dim=-1).values.max() > 0 and torch.equal(moved.log_scales, plain.log_scales)
@@ -192,31 +192,31 @@ def test_gated_head_shapes_answer_to_expression_on_the_head_alone(rig):
     model = student(rig, blend_shapes=replace(SHAPES, gated=True))
     disturb(model.blend_shapes)
     params = dance().frame(3)
-    calm, smiling = (rig.motion(replace(params, expression=params.expression + e)) for e in (0.0, 1.0))
+    calm, smiling = (rig.pose(replace(params, expression=params.expression + e)) for e in (0.0, 1.0))
     moved = (model.compensated(smiling).offset - model.compensated(calm).offset).norm(dim=-1)
     head = model.blend_shapes.head_weight > 0
     assert moved[head].min() > 0 and moved[~head].max() == 0
 
 
-def test_pruned_blend_shapes_leave_the_others_as_they_are(rig, motion):
+def test_pruned_blend_shapes_leave_the_others_as_they_are(rig, pose):
     model = student(rig, blend_shapes=SHAPES)
     disturb(model.blend_shapes)
     small = model.with_blend_shapes(model.blend_shapes.pruned(torch.ones(1, 5), keep=0.25))
     active = small.blend_shapes.active
     assert len(active) == len(model.gaussians) // 4
-    a, b, plain = model.compensated(motion).offset, small.compensated(motion).offset, model.gaussians().offset
+    a, b, plain = model.compensated(pose).offset, small.compensated(pose).offset, model.gaussians().offset
     torch.testing.assert_close(a[active], b[active])
     rest = torch.ones(len(plain), dtype=torch.bool)
     rest[active] = False
     assert torch.equal(b[rest], plain[rest])
 
 
-def test_new_blend_shapes_keep_field_codes_and_gaussians(rig, motion):
+def test_new_blend_shapes_keep_field_codes_and_gaussians(rig, pose):
     model = student(rig)
     disturb(model)
     other = model.with_blend_shapes(SHAPES)
-    torch.testing.assert_close(model(motion, EYES).gaussians.means, other(motion, EYES).gaussians.means)
-    torch.testing.assert_close(model(motion, EYES).colors, other(motion, EYES).colors)
+    torch.testing.assert_close(model(pose, EYES).gaussians.means, other(pose, EYES).gaussians.means)
+    torch.testing.assert_close(model(pose, EYES).colors, other(pose, EYES).colors)
     with torch.no_grad():
         other.gaussians.dc.add_(1.0)
         next(other.field.parameters()).add_(1.0)
@@ -224,27 +224,27 @@ def test_new_blend_shapes_keep_field_codes_and_gaussians(rig, motion):
     assert other.with_blend_shapes(None).blend_shapes is None
 
 
-def test_gradients_reach_every_part_and_colours_do_not_pull_positions(rig, motion):
+def test_gradients_reach_every_part_and_colours_do_not_pull_positions(rig, pose):
     model = student(rig, blend_shapes=SHAPES)
     disturb(model)
-    model(motion, EYES).gaussians.means.square().sum().backward()
+    model(pose, EYES).gaussians.means.square().sum().backward()
     parts = (model.field, model.codes, model.blend_shapes.head, model.blend_shapes.body)
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.codes.parameters())
     assert all(any(p.grad is not None and p.grad.abs().sum() > 0 for p in part.parameters()) for part in parts)
     model.zero_grad()
-    model(motion, EYES).colors.sum().backward()
+    model(pose, EYES).colors.sum().backward()
     assert model.gaussians.offset.grad is None or not model.gaussians.offset.grad.any()
     assert model.gaussians.sh.grad.abs().sum() > 0
 
 
-def test_a_fields_gradient_is_that_of_finite_differences(rig, motion):
+def test_a_fields_gradient_is_that_of_finite_differences(rig, pose):
     model = student(rig)
     disturb(model)
     last = model.field.body.last.bias
     weight = torch.randn(len(model.gaussians), 3, generator=torch.Generator().manual_seed(2))
 
     def loss() -> torch.Tensor:
-        return (model(motion, EYES).gaussians.means * weight).sum()
+        return (model(pose, EYES).gaussians.means * weight).sum()
 
     loss().backward()
     gradient, step = last.grad.clone(), 1e-2
@@ -258,27 +258,27 @@ def test_a_fields_gradient_is_that_of_finite_differences(rig, motion):
         assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(gradient[axis]), rel=2e-2, abs=0.05)
 
 
-def test_a_field_on_control_points_and_a_template_without_clothes(motion):
+def test_a_field_on_control_points_and_a_template_without_clothes(pose):
     naked = replace(template(), vertex_labels=0 * template().vertex_labels)
     rig = Rig(naked)
     model = student(rig, control_points=40)
     disturb(model)
     assert not rig.cloth_mask.any()
-    posed = model(rig.motion(dance().frame(3), frame=3), EYES)
+    posed = model(rig.pose(dance().frame(3), frame=3), EYES)
     posed.gaussians.means.sum().backward()
     assert torch.isfinite(posed.gaussians.means).all() and posed.displacements.abs().max() > 0
 
 
-def test_a_still_body_follows_its_joints_alone(rig, motion):
+def test_a_still_body_follows_its_joints_alone(rig, pose):
     model = student(rig, still_body=True, control_points=40)
     disturb(model)
-    moved = model.displacements(motion)
+    moved = model.displacements(pose)
     assert not moved[rig.body_mask].any() and moved[~rig.body_mask].abs().max() > 0
     naked = Rig(template().naked())
     bound = sample_on_mesh(naked.template, SamplingConfig(count=300, sh_degree=1))
     alone = Student(StudentConfig(field=TINY_FIELD, still_body=True), naked, bound, (0,))
     disturb(alone)
-    assert alone.displacements(naked.motion(dance().frame(3))).abs().max() > 0
+    assert alone.displacements(naked.pose(dance().frame(3))).abs().max() > 0
 
 
 def test_gaussians_of_another_mesh_are_refused(rig):

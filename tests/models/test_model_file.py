@@ -55,7 +55,7 @@ def make(kind: str, rig: Rig):
         model = TeacherAvatar(
             replace(TINY_TEACHER, bottleneck=2, position_size=16, centred=True), rig, varied(gaussians())
         )
-        model.centre(rig.motion(dance().frame(frame)) for frame in range(4))
+        model.centre(rig.pose(dance().frame(frame)) for frame in range(4))
     else:
         shapes = {
             "shapes": SHAPES,
@@ -92,7 +92,7 @@ def random_regression(points: int) -> PoseRegression:
 def look(model, rig) -> list[torch.Tensor]:
     """What a frame of the training and a new pose show."""
     with torch.no_grad():
-        seen = [model(rig.motion(dance().frame(k), frame=code), EYES) for k, code in ((3, 3), (4, None))]
+        seen = [model(rig.pose(dance().frame(k), frame=code), EYES) for k, code in ((3, 3), (4, None))]
     return [
         value
         for posed in seen

@@ -31,7 +31,7 @@ def posed() -> PosedAvatar:
     rig = Rig(template())
     model = Student(StudentConfig(field=None), rig, varied(gaussians()), ())
     with torch.no_grad():
-        return model(rig.motion(dance().frame(2)), camera_centers_of(views()))
+        return model(rig.pose(dance().frame(2)), camera_centers_of(views()))
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -116,7 +116,7 @@ def test_a_halved_view_shows_the_same_at_half_the_size(posed):
 def test_gradients_go_through(posed):
     rig = Rig(template())
     model = Student(StudentConfig(field=None), rig, varied(gaussians()), ())
-    own = model(rig.motion(dance().frame(2)), camera_centers_of(views()))
+    own = model(rig.pose(dance().frame(2)), camera_centers_of(views()))
     seen = render_view(own, 1, views()[1], GREY, normals=True, extra=torch.ones(len(model.gaussians), 1))
     (seen.image.sum() + seen.normals.square().sum() + seen.extra.sum()).backward()
     for name in ("offset", "log_scales", "quats", "opacity_logits", "dc", "sh"):

@@ -22,42 +22,42 @@ MOTION = random_motion(3, expressions=3)
 @pytest.mark.parametrize("frame", range(FRAMES))
 def test_pose_is_the_templates(frame):
     rig = Rig(template())
-    posed = rig.pose(rig.motion(dance().frame(frame)))
+    posed = rig.skin(rig.pose(dance().frame(frame)))
     np.testing.assert_allclose(posed.numpy(), template().pose(dance().frame(frame))[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("frame", range(3))
 def test_expression_and_pose_correctives_are_in_it(frame):
     rig, params = Rig(RANDOM), MOTION.frame(frame)
-    motion = rig.motion(params)
-    np.testing.assert_allclose(rig.pose(motion).numpy(), RANDOM.pose(params)[0], atol=2e-5)
-    assert np.abs(motion.rest.numpy() - RANDOM.vertices).max() > 1e-3
+    pose = rig.pose(params)
+    np.testing.assert_allclose(rig.skin(pose).numpy(), RANDOM.pose(params)[0], atol=2e-5)
+    assert np.abs(pose.rest.numpy() - RANDOM.vertices).max() > 1e-3
 
 
 def test_the_open_body_with_parameters_of_fewer_expressions():
     body = open_body_template()
     rig = Rig(body)
     params = random_motion(1, expressions=4)
-    motion = rig.motion(params)
-    assert motion.expression.shape == (rig.expression_size,) and rig.expression_size > 4
-    np.testing.assert_array_equal(motion.expression[:4].numpy(), params.expression[0].astype(np.float32))
-    assert not motion.expression[4:].any()
-    np.testing.assert_allclose(rig.pose(motion).numpy(), body.pose(params)[0], atol=1e-5)
+    pose = rig.pose(params)
+    assert pose.expression.shape == (rig.expression_size,) and rig.expression_size > 4
+    np.testing.assert_array_equal(pose.expression[:4].numpy(), params.expression[0].astype(np.float32))
+    assert not pose.expression[4:].any()
+    np.testing.assert_allclose(rig.skin(pose).numpy(), body.pose(params)[0], atol=1e-5)
 
 
 def test_displacements_move_with_their_vertices_and_gradients_are_the_skinnings():
     rig = Rig(RANDOM)
-    motion = rig.motion(MOTION.frame(1))
+    pose = rig.pose(MOTION.frame(1))
     random = torch.Generator().manual_seed(0)
     moved = 0.1 * torch.randn(RANDOM.vertex_count, 3, generator=random)
     weight = torch.randn(RANDOM.vertex_count, 3, generator=random)
     displacements = moved.clone().requires_grad_()
-    (rig.pose(motion, displacements) * weight).sum().backward()
-    A = motion.world_from_rest[..., :3]
+    (rig.skin(pose, displacements) * weight).sum().backward()
+    A = pose.world_from_rest[..., :3]
     # In float64, as numpy multiplies matrices.
     linear = A.double().numpy()
-    expected = rig.pose(motion).numpy() + np.einsum("vij,vj->vi", linear, moved.double().numpy())
-    np.testing.assert_allclose(rig.pose(motion, moved).numpy(), expected, atol=1e-5)
+    expected = rig.skin(pose).numpy() + np.einsum("vij,vj->vi", linear, moved.double().numpy())
+    np.testing.assert_allclose(rig.skin(pose, moved).numpy(), expected, atol=1e-5)
     np.testing.assert_allclose(
         displacements.grad.numpy(), np.einsum("vij,vi->vj", linear, weight.double().numpy()), atol=1e-5
     )
@@ -70,17 +70,17 @@ def test_root_from_world_takes_the_roots_motion_away():
     other = replace(params, global_orient=turned[None], transl=params.transl + [[1.0, 2.0, 3.0]])
     local = []
     for each in (params, other):
-        motion = rig.motion(each)
-        to_root = motion.root_from_world
-        local.append(rig.pose(motion) @ to_root[:3, :3].T + to_root[:3, 3])
+        pose = rig.pose(each)
+        to_root = pose.root_from_world
+        local.append(rig.skin(pose) @ to_root[:3, :3].T + to_root[:3, 3])
     np.testing.assert_allclose(local[0].numpy(), local[1].numpy(), atol=2e-5)
 
 
 def test_the_null_code_changes_the_frame_alone():
-    motion = Rig(template()).motion(dance().frame(2), frame=2)
-    null = motion.without_code()
-    assert (motion.frame, null.frame) == (2, None)
-    assert replace(null, frame=2).pose is motion.pose and null.rest is motion.rest
+    pose = Rig(template()).pose(dance().frame(2), frame=2)
+    null = pose.without_code()
+    assert (pose.frame, null.frame) == (2, None)
+    assert replace(null, frame=2).body_pose is pose.body_pose and null.rest is pose.rest
 
 
 def test_blas_works_on_one_thread_and_has_the_others_back(monkeypatch):
@@ -90,13 +90,13 @@ def test_blas_works_on_one_thread_and_has_the_others_back(monkeypatch):
     it, within, before = template(), [], threads()
     posed_body = type(it).posed_body
     monkeypatch.setattr(type(it), "posed_body", lambda *given: within.append(threads()) or posed_body(*given))
-    Rig(it).motion(dance().frame(0))
+    Rig(it).pose(dance().frame(0))
     assert within == [{1}] and threads() == before
 
 
 def test_several_frames_are_refused():
     with pytest.raises(InputError, match="one frame"):
-        Rig(template()).motion(dance())
+        Rig(template()).pose(dance())
 
 
 def test_semantic_colours_and_cloth_are_the_templates():

@@ -27,7 +27,7 @@ def ordered(it) -> torch.Tensor:
 
 def posed(it, params: BodyParams, frame: int | None = None):
     with torch.no_grad():
-        return it(it.rig.motion(params, frame=frame), torch.tensor(EYE)[None])
+        return it(it.rig.pose(params, frame=frame), torch.tensor(EYE)[None])
 
 
 def compare(splats, truth, order, *, places: float, colors: float) -> None:
@@ -66,7 +66,7 @@ def test_pictures_are_those_of_the_torch_student(tmp_path):
     player.pose(dance().frame(4))
     image, alpha = player.draw(camera, background=(0.2, 0.4, 0.6))
     with torch.no_grad():
-        truth = it(it.rig.motion(dance().frame(4)), torch.tensor(camera.position, dtype=torch.float32)[None])
+        truth = it(it.rig.pose(dance().frame(4)), torch.tensor(camera.position, dtype=torch.float32)[None])
         world = truth.gaussians
         expected, its_alpha, _ = rasterize(
             *(world.means, world.quats, world.scales, world.opacities, truth.colors),
@@ -132,7 +132,7 @@ def test_loose_clothes_are_simulated_as_in_torch(tmp_path):
         shape = driver.step(frame, 0.05)
         splats = player.step(frame, 0.05)
     with torch.no_grad():
-        truth = it(it.rig.with_cloth(it.rig.motion(frame), shape), torch.tensor(EYE)[None])
+        truth = it(it.rig.with_cloth(it.rig.pose(frame), shape), torch.tensor(EYE)[None])
     assert player.said == driver.said
     off = np.abs(splats.means - truth.gaussians.means[ordered(it)].numpy())
     assert off.max() < 2e-3 and off.mean() < 5e-5  # float32 places of particles come apart a little
@@ -148,7 +148,7 @@ def test_clothes_without_field_or_simulation_follow_the_joints(tmp_path):
     by_joints = player.pose(frame, cloth=player.skinned_clothes).means
     zero = ClothShape(garment().vertices, np.zeros((len(garment().vertices), 3), np.float32), garment().share())
     with torch.no_grad():
-        truth = it(it.rig.with_cloth(it.rig.motion(frame), zero), torch.tensor(EYE)[None])
+        truth = it(it.rig.with_cloth(it.rig.pose(frame), zero), torch.tensor(EYE)[None])
     np.testing.assert_allclose(by_joints, truth.gaussians.means[ordered(it)].numpy(), atol=2e-5)
 
 

@@ -55,7 +55,7 @@ def make_teacher(frames, config=APART, *, moved: float = 0.0) -> TeacherAvatar:
     """A teacher from the same start every time; `moved`: with something to say."""
     torch.manual_seed(0)
     teacher = TeacherAvatar(config, frames.rig, gaussians())
-    teacher.centre(frames.motion(frame) for frame in frames.train_frames)
+    teacher.centre(frames.pose(frame) for frame in frames.train_frames)
     with torch.no_grad():
         for value in teacher.networks.parameters():
             value.add_(moved * torch.randn(value.shape))
@@ -133,7 +133,7 @@ def test_one_network_for_all_keeps_its_other_residuals_at_zero(frames, track):
     teacher = make_teacher(frames, TINY_TEACHER)
     steps(PretrainTeacherTask(frames, teacher, CONFIG, 0, track), 3)
     with torch.no_grad():
-        maps = teacher.residual_maps(frames.motion(1), torch.zeros(1, 3))
+        maps = teacher.residual_maps(frames.pose(1), torch.zeros(1, 3))
     assert maps.position.abs().max() > 0 and maps.shape[..., 3:].abs().max() == 0 and maps.colour.abs().max() == 0
 
 
@@ -142,7 +142,7 @@ def test_the_teacher_comes_to_what_is_known(frames, track):
     steps(PretrainTeacherTask(frames, teacher, replace(CONFIG, batch=4), 0, track), 40)
     with torch.no_grad():
         for frame in frames.train_frames:
-            found = teacher.sampler(teacher.displacement_maps([frames.motion(frame)]))[0]
+            found = teacher.sampler(teacher.displacement_maps([frames.pose(frame)]))[0]
             known = track.displacements(frame)[0]  # the same everywhere
             assert (found - known).norm(dim=-1).mean() < 0.5 * known.norm()
 
@@ -154,9 +154,9 @@ def test_the_field_comes_to_the_teachers_displacements_at_its_points(frames, tra
     def error() -> float:
         with torch.no_grad():
             differences = [
-                task.student.displacements(motion)[task.student.field.points]
-                - lookup(task.teacher.displacement_maps([motion]))[0]
-                for motion in map(frames.motion, frames.train_frames)
+                task.student.displacements(pose)[task.student.field.points]
+                - lookup(task.teacher.displacement_maps([pose]))[0]
+                for pose in map(frames.pose, frames.train_frames)
             ]
         return float(torch.stack(differences).norm(dim=-1).mean())
 
@@ -258,12 +258,12 @@ def test_new_poses_of_a_bake_have_the_regression_and_its_frames_their_codes(fram
     labels = np.unique(frames.rig.template.vertex_labels[student.field.points.numpy()])
     assert len(caplog.records) == 2 * len(labels)  # when the bake begins and when it ends
     assert "mm off in training frames that are left out" in caplog.text
-    seen = frames.motion(2)
+    seen = frames.pose(2)
     with torch.no_grad():
         own, new = student.displacements(seen), student.displacements(seen.without_code())
-        coded = student.field(seen.pose[None], student.codes([2]))[0]
-        regressed = student.field.spread(student.regression(seen.pose[None]))[0]
-        mean = torch.stack([student.displacements(frames.motion(frame)) for frame in frames.train_frames]).mean(0)
+        coded = student.field(seen.body_pose[None], student.codes([2]))[0]
+        regressed = student.field.spread(student.regression(seen.body_pose[None]))[0]
+        mean = torch.stack([student.displacements(frames.pose(frame)) for frame in frames.train_frames]).mean(0)
     assert torch.equal(own, coded) and torch.equal(new, regressed) and not torch.allclose(own, new, atol=1e-6)
     still = student.regression(student.regression.center[None])
     torch.testing.assert_close(student.field.spread(still)[0], mean, atol=1e-5, rtol=1e-3)

@@ -259,7 +259,7 @@ class PhotometricTask(OptimizationTask[Item]):
     def measure(self, view: View, frame: int) -> tuple[ViewQuality, UInt8[np.ndarray, "H W 3"]]:
         """Return figures and the rendered image of a whole view."""
         with torch.no_grad():
-            posed = self.model(self.sequence.motion(frame), camera_centers_of([view]))
+            posed = self.model(self.sequence.pose(frame), camera_centers_of([view]))
             seen = render_view(posed, 0, view, self.sequence.background, eps2d=self.config.eps2d)
             quality = view_quality(view, seen.image, seen.alpha, self.sequence.background, head=self.head_box_of(view))
         return quality, eight_bit(seen.image).numpy()

@@ -44,7 +44,7 @@ def _faces_of_shut_mouth(sequence: FrameSequence) -> Bool[np.ndarray, " F"]:
     shown = np.zeros_like(inside)
     if inside.any():
         for frame in spread_inside(sequence.train_frames, LOOKED_INTO):
-            shown |= shown_mouth(rig.template, inside, rig.places(sequence.motion(frame).without_cloth()))
+            shown |= shown_mouth(rig.template, inside, rig.skin_to_numpy(sequence.pose(frame).without_cloth()))
     faces = rig.template.faces
     return np.asarray(inside[faces].all(axis=1) & ~shown[faces].any(axis=1))
 
@@ -58,7 +58,7 @@ def _hidden_clothes(sequence: FrameSequence) -> Bool[np.ndarray, " V"]:
     hidden = rig.template.vertex_part > 0
     cameras = [sequence.camera(name) for name in spread_inside(sequence.train_cameras, CAMERAS)]
     for frame in spread_inside(sequence.train_frames, LOOKED_AT // max(1, len(cameras))):
-        places = rig.places(sequence.motion(frame).without_cloth())
+        places = rig.skin_to_numpy(sequence.pose(frame).without_cloth())
         mesh = rig.template.mesh.with_vertices(places)
         for camera in cameras:
             todo = np.flatnonzero(hidden)

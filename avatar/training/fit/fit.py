@@ -166,7 +166,7 @@ class FitTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a view, rendered, and its terms."""
         views = self.views(item)
-        total, terms, _ = self.compared(self.student(self.sequence.motion(item.frame), camera_centers_of(views)), views)
+        total, terms, _ = self.compared(self.student(self.sequence.pose(item.frame), camera_centers_of(views)), views)
         return total, {"loss": float(total.detach()), **terms}
 
     def head_box_of(self, view: View) -> Box | None:

@@ -56,7 +56,7 @@ def _shown(
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
     """Colours of Gaussians on a template at `vertices` as views show them, and which of them any view shows."""
     gaussians = gaussians.to(device=rig.device)
-    placed = world_from_frames(gaussians, triangle_frames(rig.motion_to(vertices).rest, rig.faces))
+    placed = world_from_frames(gaussians, triangle_frames(rig.pose_from_vertices(vertices).rest, rig.faces))
     return colors_from_views(
         placed.means.double().cpu().numpy(),
         placed.normals.double().cpu().numpy(),

@@ -19,7 +19,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.avatar_view import Rendering
 from avatar.rendering.mesh_maps import mesh_maps
 from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Motion
+from avatar.rig.rig import Pose
 from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
@@ -125,9 +125,9 @@ class BakeTask(PhotometricTask):
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame and its terms."""
-        motion = self._seen(self.sequence.motion(item.frame), item.frame)
+        pose = self._seen(self.sequence.pose(item.frame), item.frame)
         views = self.views(item)
-        posed = self.student(motion, camera_centers_of(views))
+        posed = self.student(pose, camera_centers_of(views))
         if self.targets is None:
             total, terms, _ = self.compared(posed, views)
             return total, {"loss": float(total.detach()), **terms}
@@ -154,15 +154,15 @@ class BakeTask(PhotometricTask):
             maps = mesh_maps(posed.vertices, self.sequence.rig.faces, view.camera)
             yield maps.interpolate(self.labels)
 
-    def _seen(self, motion: Motion, frame: int) -> Motion:
+    def _seen(self, pose: Pose, frame: int) -> Pose:
         """Return the pose as the field is shown it."""
         noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
-            motion = self.sequence.as_new_motion(frame)
+            pose = self.sequence.as_new_pose(frame)
         if self.config.pose_noise:
-            moved = torch.tensor(noise.normal(size=len(motion.pose)) * self.config.pose_noise)
-            motion = replace(motion, pose=motion.pose + moved.to(motion.pose))
-        return motion
+            moved = torch.tensor(noise.normal(size=len(pose.body_pose)) * self.config.pose_noise)
+            pose = replace(pose, body_pose=pose.body_pose + moved.to(pose.body_pose))
+        return pose
 
 
 def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:

@@ -95,10 +95,10 @@ class CompensateTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame and its terms."""
         views = self.views(item)
-        motion = self.sequence.motion(item.frame)
+        pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
-            motion = self.sequence.as_new_motion(item.frame)
-        posed = self.student(motion, camera_centers_of(views))
+            pose = self.sequence.as_new_pose(item.frame)
+        posed = self.student(pose, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         if self.coherence is not None:
             apart = self.coherence(self.shapes.U, self.generator(item.frame, 1))
@@ -123,7 +123,7 @@ def compensate(
             gives normals where the capture has no maps.
     """
     with fixed_seed(config.seed):
-        known = torch.stack([sequence.motion(frame).pose for frame in sequence.train_frames])
+        known = torch.stack([sequence.pose(frame).body_pose for frame in sequence.train_frames])
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)

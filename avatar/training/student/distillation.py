@@ -67,7 +67,7 @@ class DistillationTargets:
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
                 return (self._maps.interpolate(self.teacher.track.displacements(frame)).half(),)
-            return (self.teacher.displacement_maps([self.sequence.motion(frame)])[0].half(),)
+            return (self.teacher.displacement_maps([self.sequence.pose(frame)])[0].half(),)
 
         return self._kept.get(("maps", frame), make)[0].float()
 
@@ -86,7 +86,7 @@ class DistillationTargets:
         if missing:
             with torch.no_grad():
                 camera_centers = camera_centers_of([views[k] for k in missing])
-                posed = self.teacher(self.sequence.motion(frame), camera_centers)
+                posed = self.teacher(self.sequence.pose(frame), camera_centers)
                 for index, k in enumerate(missing):
                     draw = partial(self._draw, posed, index, views[k])
                     found[k] = self._kept.get(keys[k], draw)

@@ -34,17 +34,17 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     residuals, poses = [], []
     with torch.no_grad():
         for frame in spread_inside(sequence.train_frames, FRAMES):
-            motion = sequence.motion(frame)
+            pose = sequence.pose(frame)
             left = track.displacements(frame)
-            moved = student.displacements(motion)
+            moved = student.displacements(pose)
             if moved is not None:
                 left = left - moved
             at_gaussians = on_triangles(left[rig.faces[bound.face_index]], bound.barycentric)
             residuals.append(torch.einsum("nij,ni->nj", local, at_gaussians)[shapes.active])
-            poses.append(motion.pose)
-        r, pose = torch.stack(residuals), torch.stack(poses)
+            poses.append(pose.body_pose)
+        r, body_poses = torch.stack(residuals), torch.stack(poses)
         targets = _components(shapes, r)
-    _fit(shapes, pose, targets)
+    _fit(shapes, body_poses, targets)
 
 
 def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float[Tensor, "T parts n_b"]:

@@ -86,12 +86,12 @@ class PretrainFieldTask(PretrainTask):
 
         def make() -> tuple[Tensor, ...]:
             frame, track = self.sequence.train_frames[number], self.teacher.track
-            motion = self.sequence.motion(frame)
+            pose = self.sequence.pose(frame)
             if track is not None:
                 found, counts = track.displacements(frame), track.confidence(frame)
-                return motion.pose, found[self.field.points], counts[self.field.points]
-            found = self._lookup(self.teacher.displacement_maps([motion]))[0]
-            return motion.pose, found, found.new_ones(len(found))
+                return pose.body_pose, found[self.field.points], counts[self.field.points]
+            found = self._lookup(self.teacher.displacement_maps([pose]))[0]
+            return pose.body_pose, found, found.new_ones(len(found))
 
         return self._known.get(number, make)
 

@@ -28,9 +28,9 @@ def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor,
     rows = []
     with torch.no_grad():
         for frame in sequence.train_frames:
-            motion = sequence.motion(frame)
-            jaw = motion.jaw[None] if shapes.config.jaw else None
-            rows.append(shapes.coefficients(motion.expression[None], motion.pose[None], jaw)[0])
+            pose = sequence.pose(frame)
+            jaw = pose.jaw[None] if shapes.config.jaw else None
+            rows.append(shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)[0])
     return torch.stack(rows).std(dim=0, correction=0)
 
 

@@ -61,7 +61,7 @@ def regress_poses(student: Student, sequence: AvatarSequence) -> PoseRegression:
     field, codes, template = student.field, student.codes, student.rig.template
     assert field is not None and codes is not None, "a student with a field"
     frames = spread_inside(sequence.train_frames, FRAMES)
-    poses = torch.stack([sequence.motion(frame).pose for frame in frames])
+    poses = torch.stack([sequence.pose(frame).body_pose for frame in frames])
     surfaces = [field.at_points(pose[None], codes([frame]))[0] for frame, pose in zip(frames, poses, strict=True)]
     points = field.points.cpu().numpy()
     made, chosen = fit_pose_regression(

@@ -73,9 +73,9 @@ class TeacherTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame, whose networks run once for all its cameras."""
         views = self.views(item)
-        motion, camera_centers = self.sequence.motion(item.frame), camera_centers_of(views)
+        pose, camera_centers = self.sequence.pose(item.frame), camera_centers_of(views)
         maps = self._maps(item, camera_centers)
-        posed = self.teacher.posed(motion, camera_centers, maps)
+        posed = self.teacher.posed(pose, camera_centers, maps)
         total, terms, _ = self.compared(posed, views)
         if self.config.displacement:
             moved = maps.shape[..., :3].square().mean()
@@ -83,13 +83,13 @@ class TeacherTask(PhotometricTask):
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
 
     def _maps(self, item: Item, camera_centers: Tensor) -> Residuals:
-        motion = self.sequence.motion(item.frame)
+        pose = self.sequence.pose(item.frame)
         noise = self.generator(item.frame).normal(size=camera_centers.shape) * self.config.view_jitter
-        center = motion.root_from_world.inverse()[:3, 3]
+        center = pose.root_from_world.inverse()[:3, 3]
         away = (camera_centers - center).norm(dim=-1, keepdim=True)
         jittered = camera_centers + away * torch.tensor(noise, dtype=camera_centers.dtype, device=camera_centers.device)
         with self.autocast():
-            maps = self.teacher.residual_maps(motion, jittered)
+            maps = self.teacher.residual_maps(pose, jittered)
         return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)
 
 
@@ -113,7 +113,7 @@ def fit_teacher(
     """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
     with fixed_seed(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
-    teacher.centre(sequence.motion(frame) for frame in spread_inside(sequence.train_frames, CENTRED_ON))
+    teacher.centre(sequence.pose(frame) for frame in spread_inside(sequence.train_frames, CENTRED_ON))
     track = None
     if config.track is not None:
         track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))

@@ -68,7 +68,7 @@ class PretrainTeacherTask(PretrainTask):
             known = torch.cat([track.displacements(frame), track.confidence(frame)[:, None]], dim=1)
             corners = known[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
             at_gaussians = on_triangles(corners, self.teacher.gaussians.barycentric)
-            inputs = self.teacher.position_input(self.sequence.motion(frame))
+            inputs = self.teacher.position_input(self.sequence.pose(frame))
             return inputs, at_gaussians[:, :3].contiguous(), at_gaussians[:, 3].contiguous()
 
         return self._known.get(frame, make)
@@ -78,4 +78,4 @@ class PretrainTeacherTask(PretrainTask):
         positions = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
         camera_centers = torch.tensor(positions, dtype=torch.float32, device=self.sequence.device)
         with self.autocast():
-            return self.teacher.residual_maps(self.sequence.motion(frame), camera_centers)
+            return self.teacher.residual_maps(self.sequence.pose(frame), camera_centers)

@@ -13,7 +13,7 @@ from avatar.gaussians.binding import on_triangles
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.gather import gather_rows
 from avatar.models.tracked_surface import TrackedAvatar
-from avatar.rig.rig import Motion
+from avatar.rig.rig import Pose
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.evidence import Photometer
 
@@ -26,7 +26,7 @@ FEW = 16.0
 def picture_structure(
     avatar: TrackedAvatar,
     controls: Float[Tensor, "K 3"],
-    motion: Motion,
+    pose: Pose,
     views: Sequence[View],
     background: Float[Tensor, " 3"],
     *,
@@ -45,7 +45,7 @@ def picture_structure(
     """
     rig = avatar.rig
     with torch.no_grad():
-        vertices = rig.pose(motion, avatar.cage(avatar.moves * controls))
+        vertices = rig.skin(pose, avatar.cage(avatar.moves * controls))
         bound = avatar.gaussians.snapshot().to(device=rig.device)
     with torch.enable_grad():
         seen = Photometer(rig.faces, background, PLAIN_SUMS).evidence(bound, vertices, views, halvings=halvings)

@@ -67,7 +67,7 @@ class SurfaceNormals:
         if frame not in self._meshes:
             rig = self.sequence.rig
             with torch.no_grad():
-                vertices = rig.pose(self.sequence.motion(frame), self.track.displacements(frame))
+                vertices = rig.skin(self.sequence.pose(frame), self.track.displacements(frame))
             self._meshes = {frame: TriangleMesh(vertices.double().cpu().numpy(), rig.template.faces)}
         return self._meshes[frame]
 

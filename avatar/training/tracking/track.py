@@ -151,7 +151,7 @@ class TrackTask(PhotometricTask):
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return `L_rec` with the roughness of what is not foreseen and how far the body moves, and its terms."""
         views = self.views(item)
-        posed = self.avatar(self.sequence.motion(item.frame), camera_centers_of(views))
+        posed = self.avatar(self.sequence.pose(item.frame), camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         cage, controls = self.avatar.cage, self.avatar.controls
         begin = self.begin(item.frame)
@@ -202,8 +202,8 @@ class TrackTask(PhotometricTask):
         halvings = min((level.halvings for level in self.track_config.levels), key=lambda size: abs(size - SEEN))
         names = self.sequence.cameras(frame, 0, len(self.sequence.train_cameras), self.track_config.seed)
         views = [self._halved(self.sequence.view(name, frame), frame, halvings) for name in names]
-        motion, background = self.sequence.motion(frame), self.sequence.background
-        return picture_structure(self.avatar, controls, motion, views, background, halvings=halvings)
+        pose, background = self.sequence.pose(frame), self.sequence.background
+        return picture_structure(self.avatar, controls, pose, views, background, halvings=halvings)
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         """Return nothing: the control points are those of one frame."""

@@ -131,7 +131,7 @@ def test_the_semantic_term_of_the_mesh_pulls_the_field_alone(frames):
         values.append(task.loss(item)[1]["semantic"])
     assert values[1] > 1.2 * values[0]
     views = task.views(item)
-    posed = task.student(frames.motion(item.frame), camera_centers_of(views))
+    posed = task.student(frames.pose(item.frame), camera_centers_of(views))
     sum(labels.square().sum() for labels in task._mesh_labels(posed, views)).backward()
     touched = {name for name, value in task.student.named_parameters() if value.grad is not None and value.grad.any()}
     assert "field.body.last.weight" in touched and not any(name.startswith("gaussians") for name in touched)
@@ -364,11 +364,11 @@ def test_a_held_out_view_of_nobody_measures_nothing(frames, monkeypatch):
 
 
 def test_half_precision_is_the_networks_alone(frames):
-    teacher, motion = taught(frames), frames.motion(1)
+    teacher, pose = taught(frames), frames.pose(1)
     camera_centers = torch.tensor([[0.3, 0.7, 2.2]])
-    exact, centre = teacher.inputs(motion, camera_centers), teacher.position_input(motion)
+    exact, centre = teacher.inputs(pose, camera_centers), teacher.position_input(pose)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        half, half_centre = teacher.inputs(motion, camera_centers), teacher.position_input(motion)
+        half, half_centre = teacher.inputs(pose, camera_centers), teacher.position_input(pose)
     assert torch.equal(half.positions, exact.positions) and torch.equal(half_centre, centre)
     assert (half.cosines is None) == (exact.cosines is None)
     assert exact.cosines is None or torch.equal(half.cosines, exact.cosines)

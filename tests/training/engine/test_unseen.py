@@ -33,8 +33,8 @@ class Posing:
         }
         self.train_cameras = tuple(self._cameras)
 
-    def motion(self, frame: int):
-        return self.rig.motion(self._poses[frame])
+    def pose(self, frame: int):
+        return self.rig.pose(self._poses[frame])
 
     def camera(self, name: str):
         return self._cameras[name]

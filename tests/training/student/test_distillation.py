@@ -26,7 +26,7 @@ def test_targets_show_what_the_teacher_renders(frames):
     own, views = source(frames), [frames.view(name, 1) for name in ("Ring0", "Ring2")]
     targets = own.of_views(1, views)
     with torch.no_grad():
-        posed = own.teacher(frames.motion(1), camera_centers_of(views))
+        posed = own.teacher(frames.pose(1), camera_centers_of(views))
     for index, (view, target) in enumerate(zip(views, targets, strict=True)):
         seen = render_view(posed, index, view, frames.background, normals=True, extra=own.labels)
         torch.testing.assert_close(target.target.image, seen.image, rtol=1e-3, atol=1e-3)
@@ -40,7 +40,7 @@ def test_targets_show_what_the_teacher_renders(frames):
 def test_maps_are_the_teachers(frames):
     own = source(frames)
     with torch.no_grad():
-        maps = own.teacher.residual_maps(frames.motion(2), torch.zeros(1, 3))
+        maps = own.teacher.residual_maps(frames.pose(2), torch.zeros(1, 3))
     torch.testing.assert_close(own.displacements(2), maps.position[0], rtol=1e-3, atol=1e-6)
 
 

@@ -35,7 +35,7 @@ def followed(frames: AvatarSequence, rank: int = 2, *, size: float = 0.02) -> Tr
     cage = ControlCage(frames.rig, 24)
     fields = size * torch.randn(rank, 24, 3, generator=random)
     directions = torch.randn(rank, 63, generator=random)
-    pose = torch.stack([frames.motion(frame).pose for frame in frames.train_frames])
+    pose = torch.stack([frames.pose(frame).body_pose for frame in frames.train_frames])
     controls = torch.einsum("tr,rkc->tkc", torch.cos(3.0 * pose @ directions.T), fields)
     return Track({frame: row for row, frame in enumerate(frames.train_frames)}, controls, cage)
 
@@ -61,10 +61,10 @@ def error(frames: AvatarSequence, made: Student, track: Track) -> float:
     distances = []
     with torch.no_grad():
         for frame in frames.train_frames:
-            motion = frames.motion(frame)
-            surface = frames.rig.pose(motion, track.displacements(frame))
+            pose = frames.pose(frame)
+            surface = frames.rig.skin(pose, track.displacements(frame))
             known = world_from_local(made.gaussians(), surface, frames.rig.faces).means
-            distances.append((made(motion, EYE).gaussians.means - known).norm(dim=-1).mean())
+            distances.append((made(pose, EYE).gaussians.means - known).norm(dim=-1).mean())
     return float(torch.stack(distances).mean())
 
 
@@ -103,7 +103,7 @@ def test_what_is_left_over_is_the_way_from_the_students_mesh_to_the_surface(fram
 
     with torch.no_grad():
         for frame, left in zip(frames.train_frames, seen[0], strict=True):
-            way = at(track.displacements(frame)) - at(made.displacements(frames.motion(frame)))
+            way = at(track.displacements(frame)) - at(made.displacements(frames.pose(frame)))
             torch.testing.assert_close(left, local_offsets(way, rotations), rtol=0, atol=1e-6)
 
 
@@ -118,7 +118,7 @@ def test_what_follows_the_field_alone_leaves_the_gaussians_where_they_are(frames
     """A surface that the field has found already: nothing is left over."""
     made = student(frames, control_points=24)
     with torch.no_grad():
-        found = [made.displacements(frames.motion(frame)) for frame in frames.train_frames]
+        found = [made.displacements(frames.pose(frame)) for frame in frames.train_frames]
     controls = torch.stack([moved[made.field.points] for moved in found])
     cage = ControlCage(frames.rig, 24)
     track = Track({frame: row for row, frame in enumerate(frames.train_frames)}, controls, cage)
@@ -126,7 +126,7 @@ def test_what_follows_the_field_alone_leaves_the_gaussians_where_they_are(frames
     assert max(float(moved.abs().max()) for moved in found) > 0.005
     with torch.no_grad():
         for frame in frames.train_frames:
-            moved = made.compensated(frames.motion(frame)).offset - made.gaussians().offset
+            moved = made.compensated(frames.pose(frame)).offset - made.gaussians().offset
             assert moved.abs().max() < 1e-6
 
 
@@ -201,8 +201,8 @@ def test_poses_between_those_of_the_frames_have_displacements_between(frames):
     track = Track({frame: row for row, frame in enumerate(frames.train_frames)}, controls, cage)
     init_blend_shapes(made, frames, track)
     one, two = dance().frame(a), dance().frame(b)
-    middle = frames.rig.motion(replace(one, body_pose=0.5 * (one.body_pose + two.body_pose)))
-    at = [made.blend_shapes.body(m.pose).item() for m in (frames.motion(a), middle, frames.motion(b))]
+    middle = frames.rig.pose(replace(one, body_pose=0.5 * (one.body_pose + two.body_pose)))
+    at = [made.blend_shapes.body(m.body_pose).item() for m in (frames.pose(a), middle, frames.pose(b))]
     assert at[0] * at[2] < 0 and abs(at[1]) < 0.6 * min(abs(at[0]), abs(at[2]))
 
 

@@ -46,13 +46,13 @@ def trained(frames, folder, null_share: float) -> Student:
 
 def displaced(student: Student, frames, code: torch.Tensor) -> torch.Tensor:
     """The field's displacements of a pose, driven by a code."""
-    return student.field(frames.motion(2).pose[None], code[None])[0]
+    return student.field(frames.pose(2).body_pose[None], code[None])[0]
 
 
 @pytest.mark.parametrize("null_share", [0.0, 0.5])
 def test_a_new_pose_is_driven_by_a_code_that_training_showed(frames, tmp_path, null_share):
     student = trained(frames, tmp_path / "bake", null_share)
-    new = frames.motion(2).without_code()
+    new = frames.pose(2).without_code()
     with torch.no_grad():
         first = displaced(student, frames, student.codes.codes[0])
         zero = displaced(student, frames, torch.zeros(TINY_FIELD.code_size))

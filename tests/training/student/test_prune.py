@@ -61,8 +61,8 @@ def test_standard_deviations_are_over_the_training_frames(frames):
     found = coefficient_std(model, frames)
     rows = []
     for frame in frames.train_frames:
-        motion = frames.motion(frame)
-        rows.append(model.blend_shapes.coefficients(motion.expression[None], motion.pose[None], motion.jaw[None])[0])
+        pose = frames.pose(frame)
+        rows.append(model.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], pose.jaw[None])[0])
     stacked = torch.stack(rows).double()
     expected = (stacked - stacked.mean(0)).square().mean(0).sqrt()
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-7)

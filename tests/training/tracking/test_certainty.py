@@ -64,7 +64,7 @@ def structure(frames: AvatarSequence, stripes: float, cameras: tuple[str, ...]) 
     avatar = TrackedAvatar(frames.rig, painted(stripes), 48)
     views = [frames.view(camera, 0) for camera in cameras]
     still = torch.zeros_like(avatar.controls)
-    return picture_structure(avatar, still, frames.motion(0), views, frames.background, halvings=0), avatar
+    return picture_structure(avatar, still, frames.pose(0), views, frames.background, halvings=0), avatar
 
 
 def test_what_has_contrast_is_let_go_and_what_has_none_is_held():
@@ -109,7 +109,7 @@ def test_what_no_camera_sees_is_not_told_of(dances):
     (camera,) = (name for name in dances[STRIPED].train_cameras if name == "Ring0")
     told, avatar = structure(dances[STRIPED], STRIPED, (camera,))
     rig, towards = dances[STRIPED].rig, dances[STRIPED].capture.cameras[camera].position
-    posed = rig.pose(dances[STRIPED].motion(0))[avatar.cage.vertices]
+    posed = rig.skin(dances[STRIPED].pose(0))[avatar.cage.vertices]
     side = (posed - posed.mean(0)) @ torch.tensor(towards / np.linalg.norm(towards), dtype=torch.float32)
     size = told.diagonal(dim1=1, dim2=2).sum(-1)
     hidden, shown = size[side < side.quantile(0.2)], size[side > side.quantile(0.8)]

@@ -93,7 +93,7 @@ class Still(PhotometricTask):
 
     def loss(self, item):
         views = self.views(item)
-        posed = self.model(self.sequence.motion(item.frame), torch.stack([view.position for view in views]))
+        posed = self.model(self.sequence.pose(item.frame), torch.stack([view.position for view in views]))
         total, terms, _ = self.compared(posed, views)
         return total, terms
 

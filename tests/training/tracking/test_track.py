@@ -63,7 +63,7 @@ def error(frames, frame: int, displacements=None) -> float:
     """Mean distance of the dress from where it is, metres."""
     dress = template().cloth_mask
     with torch.no_grad():
-        posed = frames.rig.pose(frames.motion(frame), displacements).numpy()
+        posed = frames.rig.skin(frames.pose(frame), displacements).numpy()
     return float(np.linalg.norm((posed - true_vertices(frame))[dress], axis=1).mean())
 
 
