@@ -1,0 +1,105 @@
+"""docs/research.md: the numbers of its answers are those of the stored data."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.support.results import RESULTS, ROOT
+
+PAGE = ROOT / "docs" / "research.md"
+
+
+def section(title: str) -> str:
+    """Return the text below a heading, on one line."""
+    return " ".join(PAGE.read_text().split(f"\n## {title}\n")[1].split("\n## ")[0].split())
+
+
+def closed(name: str) -> dict:
+    """Return what a closed benchmark measured."""
+    return json.loads((RESULTS / "closed" / f"{name}.json").read_text())["figures"]
+
+
+def test_every_question_has_its_parts():
+    titles = [line[3:] for line in PAGE.read_text().splitlines() if line.startswith("## ")]
+    assert len(titles) == 8
+    for title in titles:
+        assert all(word in section(title) for word in ("*Question.*", "*Measured.*", "*Answer.*", "results/closed/"))
+
+
+def test_codes():
+    found = {
+        kind: {name: one["mean"] for name, one in of.items()} for kind, of in closed("frame_codes_woman_casual").items()
+    }
+    view, pose = found["novel_view"], found["novel_pose"]
+    text = section("What codes are worth")
+    assert f"({pose['null code']:.1f} to {pose['fitted code']:.1f} dB)" in text
+    assert f"trained code ({view['trained code']:.1f} dB)" in text
+    assert f"({view['fitted code']:.1f} dB; null code {view['null code']:.1f} dB)" in text
+
+
+def test_motion():
+    text = section("What can be learned from motion")
+    shirt, skirt = (
+        {name: round(row[part], 1) for name, row in closed(f"motion_codes_{person}")["rows"].items()}
+        for person, part in (("talking", "upper"), ("woman_casual", "lower"))
+    )
+    fields = ("field, pose", "field, history", "field, autoregressive", "field, second order")
+    for found in (shirt, skirt):
+        assert f"{min(map(found.get, fields))} to {max(map(found.get, fields))} mm" in text
+    assert f"({skirt['simulated: lower']} mm)" in text and f"({shirt['simulated: upper']} mm)" in text
+
+
+def test_pose_and_surface():
+    cloth = closed("cloth_from_pose_woman_casual")
+    best = min(one["p2s_mm"] for one in cloth.values() if isinstance(one, dict) and "p2s_mm" in one)
+    text = section("What a pose tells of a skirt")
+    assert f"{best:.1f} mm for the best" in text and f"{cloth['skinning alone']:.1f} mm for skinning" in text
+    rows = closed("held_out_poses_talking")["rows"]
+    text = section("Why new poses are worse")
+    own, true, skinned = (
+        rows[name] for name in ("student", "its Gaussians on the true surface", "its Gaussians on skinning")
+    )
+    assert f"gain {true['PSNR'] - own['PSNR']:.1f} dB (shirt {own['upper']:.1f} to {true['upper']:.1f} dB)" in text
+    assert f"lose {own['PSNR'] - skinned['PSNR']:.1f} dB (shirt to {skinned['upper']:.1f} dB)" in text
+    assert f"{rows['LBS Gaussians']['PSNR'] - skinned['PSNR']:.1f} dB below Gaussians that were trained" in text
+
+
+def test_patterns():
+    rows = closed("followed_surface_patterns")["rows"]
+    found = {name.split(",")[0]: row["vertexwise"] for name, row in rows.items()}
+    words = ", ".join(f"{name} {found[name]:.1f}" for name in ("dots", "plaid", "stripes", "plain"))
+    assert f"{words} mm" in section("Does a pattern help the tracking")
+
+
+def test_interpolation():
+    found = closed("interpolation")
+    text = section("Motions between their frames")
+    for motion in ("turning", "talking"):
+        assert f"{found[motion]['shortest turns']['vertices, mean mm']:.2f} mm ({motion})" in text
+        assert f"{found[motion]['frame before, held']['vertices, mean mm']:.1f}" in text
+    flipped = [
+        found[f"{motion}, hemispheres flipped"]["axis angles mixed"]["vertices, mean mm"]
+        for motion in ("talking", "turning")
+    ]
+    assert f"{round(flipped[0], -1):.0f} to {round(flipped[1], -1):.0f} mm off" in text
+
+
+@pytest.mark.parametrize("which", ["darned", "holes"])
+def test_armpits(which):
+    means = [person["T-pose"][f"at the patch, {which}"][0] for person in closed("darning")["people"].values()]
+    assert f"{min(means):.1f} to {max(means):.1f} mm" in section("Armpits that nobody saw")
+
+
+def test_icp():
+    rows = closed("registration_icp")["rows"]
+    text = section("Is iterated closest points enough")
+    for right in (True, False):
+        errors = np.array([row["body_mm"] for row in rows if (row["degrees_off"] == 0) == right])
+        assert f"{errors.min():.0f} to {errors.max():.0f} mm" in text
+    assert (
+        f"has {json.loads((RESULTS / 'scan_alone_captures.json').read_text())['figures']['summary']['body_mm_median']:.1f} mm"
+        in text
+    )
