@@ -30,6 +30,7 @@ from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
 from avatar.runtime import AvatarPlayer
 from benchmarks.support.results import store_results
+from pipelines.runs import layout
 from smplxpp.capture import open_capture
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.template.template import Template
@@ -70,11 +71,11 @@ class BundleBenchmark:
 
     def run(self) -> None:
         """Print and store the figures."""
-        template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
+        template = Template.load(self.run_folder / layout.TEMPLATE)
         sequence = AvatarSequence(open_capture(self.capture), template)
-        student = load_avatar(self.run_folder / "90_compensate" / "student.safetensors", sequence.rig)
+        student = load_avatar(self.run_folder / layout.STUDENT, sequence.rig)
         assert isinstance(student, Student)
-        garments = self.run_folder / "83_cloth" / "garments.npz"
+        garments = self.run_folder / layout.GARMENTS
         extras = BundleExtras(
             name="benchmark", garments=load_garments(garments, template) if garments.is_file() else ()
         )
@@ -90,7 +91,7 @@ class BundleBenchmark:
         for item in sequence.measured_views(self.frames):
             measure(rows, student, players, sequence, item)
         full = rows["full student, torch"].psnr
-        stored = (self.run_folder / "90_compensate" / "student_compact.safetensors").stat().st_size
+        stored = (self.run_folder / layout.COMPACT_STUDENT).stat().st_size
         out = {"full student, torch": {"megabytes": stored / 1e6, **_means(full, full)}}
         for name in WAYS:
             out[name] = {**figures[name], **_means(rows[name].psnr, full), "to the full student": min(rows[name].near)}

@@ -32,6 +32,7 @@ from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from benchmarks.support.results import store_results
+from pipelines.runs import layout
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.protocol import run_protocol
 from smplxpp.capture import open_capture
@@ -39,7 +40,7 @@ from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
-STAGES = ("70_fit", "80_teacher", "85_bake", "90_compensate")
+STAGES = tuple(stage for stage in layout.MODEL_STAGES if stage != layout.CLOTH_STAGE)
 WARM_UP, TIMED = 3, 14
 KINDS = {
     "rasteriser": ("_Rasterize",),
@@ -71,8 +72,8 @@ class TrainingBenchmark:
             "preset": self.preset,
             "threads": torch.get_num_threads(),
             "stages": {name: stage_figures(self.run_folder / name) for name in STAGES},
-            **evaluation_conditions(self.run_folder / "95_evaluate" / "metrics.json"),
-            "evaluation": evaluation_figures(self.run_folder / "95_evaluate" / "metrics.json"),
+            **evaluation_conditions(self.run_folder / layout.EVALUATION),
+            "evaluation": evaluation_figures(self.run_folder / layout.EVALUATION),
         }
         preset = training_preset(self.preset)
         if self.profile:
@@ -80,7 +81,7 @@ class TrainingBenchmark:
         figures["minutes"] = round(sum(stage["seconds"] for stage in figures["stages"].values()) / 60.0, 2)
         print(json.dumps(figures, indent=1))
         protocol = figures["inputs"]["name"]
-        share = figures["stages"]["90_compensate"]["iterations"] / preset.compensate.iterations
+        share = figures["stages"][layout.COMPENSATE_STAGE]["iterations"] / preset.compensate.iterations
         of_all = "" if share == 1 else f" --iterations-share {share:g}"
         name = f"training_{open_capture(self.capture).name}_{self.preset}"
         name += ("" if share == 1 else f"_times_{share:g}") + (f"_{TRACKED}" if protocol == TRACKED else "")
@@ -194,17 +195,15 @@ def _rounded(value: Any) -> Any:
 def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict[str, float]]:
     """Milliseconds of a step of every training, and the shares of each kind of work in it."""
     protocol = run_protocol(run)
-    sequence = AvatarSequence(
-        open_capture(capture, protocol=protocol), Template.load(run / "60_assemble" / "smplxpp.npz")
-    )
+    sequence = AvatarSequence(open_capture(capture, protocol=protocol), Template.load(run / layout.TEMPLATE))
     rig = sequence.rig
-    teacher = load_avatar(run / "80_teacher" / "teacher.safetensors", rig)
-    baked = load_avatar(run / "85_bake" / "student.safetensors", rig)
-    student = load_avatar(run / "90_compensate" / "student.safetensors", rig)
+    teacher = load_avatar(run / layout.TEACHER, rig)
+    baked = load_avatar(run / layout.BAKED, rig)
+    student = load_avatar(run / layout.STUDENT, rig)
     track, pretrain, bake = preset.teacher.track, preset.teacher.pretrain, preset.bake
 
     def tracking(config: TrackConfig) -> Callable[[int], Any]:
-        gaussians = load_bound(run / "70_fit" / "gaussians.safetensors")
+        gaussians = load_bound(run / layout.GAUSSIANS)
         avatar = TrackedAvatar(rig, gaussians, config.control_points, still_body=config.still_body)
         task = TrackTask(sequence, avatar, config)
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.

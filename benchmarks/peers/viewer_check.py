@@ -41,6 +41,7 @@ from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
 from avatar.losses.psnr import psnr_from_mse
 from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
+from pipelines.runs import layout
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
@@ -177,7 +178,7 @@ def build_fixture(folder: Path) -> Path:
 
 def posed_template(run: Path, count: int) -> tuple[BoundGaussians, torch.Tensor, torch.Tensor]:
     """Gaussians on a run's template in a high step, with a sheen that depends on the view."""
-    template = Template.load(run / "60_assemble" / "smplxpp.npz")
+    template = Template.load(run / layout.TEMPLATE)
     bound = sample_on_mesh(template, SamplingConfig(count=count))
     sh = torch.zeros_like(bound.sh)
     # Brighter and redder where the triangle faces the camera, greener along its median.

@@ -27,6 +27,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.spherical_harmonics import view_colors, view_colors_reference
 from benchmarks.peers.viewer_check import build_fixture
 from benchmarks.support.results import store_results
+from pipelines.runs import layout
 from smplxpp.template.template import Template
 
 COUNTS = (50_000, 220_000)
@@ -47,7 +48,7 @@ class BindingBenchmark:
     def __call__(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
             run = self.run or build_fixture(Path(folder))
-            template = Template.load(run / "60_assemble" / "smplxpp.npz")
+            template = Template.load(run / layout.TEMPLATE)
         figures = {"faces": len(template.faces), "threads": torch.get_num_threads()}
         for count in COUNTS:
             bound = sample_on_mesh(template, SamplingConfig(count=count))

@@ -31,6 +31,7 @@ from avatar.training.fit.config import PRESETS, FitConfig
 from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
 from benchmarks.support.results import store_results
 from pipelines.commands.build import Build
+from pipelines.runs import layout
 from pipelines.stages.build import build
 from smplxpp.capture import open_capture
 from smplxpp.template.template import Template
@@ -81,8 +82,8 @@ class FitBenchmark:
 
 def _scene(folder: Path, run: Path) -> FitScene:
     command = Build(out=run, capture=folder)
-    build(run, command.inputs(), command.config(), last="60_assemble")
-    template = Template.load(run / "60_assemble" / "smplxpp.npz")
+    build(run, command.inputs(), command.config(), last=layout.ASSEMBLE_STAGE)
+    template = Template.load(run / layout.TEMPLATE)
     capture = open_capture(folder)
     frame = capture.frames[0]
     train, held_out = capture.splits.train_cameras, capture.splits.novel_view_cameras

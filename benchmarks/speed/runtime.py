@@ -38,6 +38,7 @@ from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.player import PARTS
 from benchmarks.support.results import store_results
+from pipelines.runs import layout
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
@@ -69,8 +70,8 @@ class RuntimeBenchmark:
 
 def students_of(run_folder: Path) -> dict[str, Student]:
     """Return a run's student, then students of its sizes with other numbers of Gaussians, by name."""
-    rig = Rig(Template.load(run_folder / "60_assemble" / "smplxpp.npz"))
-    trained = load_avatar(run_folder / "90_compensate" / "student.safetensors", rig)
+    rig = Rig(Template.load(run_folder / layout.TEMPLATE))
+    trained = load_avatar(run_folder / layout.STUDENT, rig)
     assert isinstance(trained, Student)
     students = {f"trained, {len(trained.gaussians)}": trained}
     return students | {f"sampled, {count}": sampled(trained, count) for count in SAMPLED}

@@ -26,6 +26,7 @@ from avatar.export.bundle import BundleExtras, write_bundle
 from avatar.runtime import AvatarPlayer
 from benchmarks.speed.runtime import from_the_front, poses_of, students_of
 from benchmarks.support.results import ROOT, store_results
+from pipelines.runs import layout
 from pipelines.web.page import PageContent, PageLight, single_page
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.camera import Camera
@@ -108,7 +109,7 @@ class WebPlayerBenchmark:
         students = students_of(self.run_folder)
         trained = next(iter(students.values()))
         template = trained.rig.template
-        loose = self.run_folder / "83_cloth" / "garments.npz"
+        loose = self.run_folder / layout.GARMENTS
         garments = load_garments(loose, template) if loose.exists() else []
         subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
         variants = {"WebAssembly": WEB / "build" / "modules.mjs"}
