@@ -18,9 +18,9 @@ from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.reconstruct import PhotoView
 from smplxpp.reconstruct.hull import main_body, zero_surface
-from smplxpp.reconstruct.trust import Box
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct.views import Box
 
 _CHUNK = 1 << 17
 _FAR = 0.05

@@ -13,7 +13,7 @@ from torch import Tensor
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct import PhotoView
 
 
 @dataclass(frozen=True, eq=False)

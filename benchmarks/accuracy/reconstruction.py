@@ -30,8 +30,7 @@ from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.metrics.distance import MM, point_to_surface
 from smplxpp.metrics.sampling import sample_surface
 from smplxpp.raster import rasterize_mesh
-from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, reconstruct
-from smplxpp.reconstruct.agreement import silhouette_agreement
+from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, reconstruct, silhouette_agreement
 
 COMMAND = "python -m benchmarks reconstruction --capture DIR"
 SAMPLES = 100_000

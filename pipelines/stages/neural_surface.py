@@ -54,4 +54,4 @@ def _neural_surface(
         **{name: found.numbers[name] for name in ("status", "genus", "vertices", "faces", "unseen", "unsure", "gains")},
         "loss": float(np.mean(fit.losses[-100:])),
     }
-    return replace(found, hull=start.hull, numbers=numbers, problems=start.problems)
+    return replace(found, hull=start.hull, numbers=numbers, notes=start.notes)

@@ -34,10 +34,16 @@ from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, i
 from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.files.json_file import as_object, jsonable, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
-from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct
-from smplxpp.reconstruct.agreement import silhouette_agreement
+from smplxpp.reconstruct import (
+    PhotoView,
+    ReconstructConfig,
+    Reconstruction,
+    adopt_surface,
+    reconstruct,
+    silhouette_agreement,
+    usable_views,
+)
 from smplxpp.reconstruct.neus2 import mesh_in_world
-from smplxpp.reconstruct.views import usable_views
 
 Maker = Callable[..., Reconstruction]
 """`make(views, progress=...)`: the surface of a moment."""
@@ -170,7 +176,7 @@ def _make_frame(
     numbers = {
         **result.numbers,
         "silhouettes": agreement,
-        "problems": [*problems, *result.problems],
+        "problems": [*problems, *result.notes],
     }
     with atomic_folder(made) as temporary:
         save_surface(temporary / "scan", result)

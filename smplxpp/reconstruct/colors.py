@@ -1,4 +1,4 @@
-"""Colours a vertex: blended from the views that look most squarely at it, after their exposures were made alike."""
+"""Blend a colour for every vertex from the views that see it most frontally, after their exposures are equalised."""
 
 from __future__ import annotations
 
@@ -11,42 +11,41 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.reconstruct.photographs import Pyramids, Sight
 from smplxpp.reconstruct.sweep import LEAST_COSINE, LEAST_OPACITY, sparse_laplacian
 
-_BEST = 4
-_ROUNDS = 5
-# A view's colour this far from the others' counts half, of 1: a highlight, or another surface.
-_STRANGE = 0.08
-_GAINS = (0.5, 2.0)
+# Colour of vertices about which no view says anything, in [0, 1].
 _GREY = 0.7
 
 
 def blend_colors(
     mesh: TriangleMesh, seen: Sight, pyramids: Pyramids
 ) -> tuple[UInt8[np.ndarray, "N 3"], Float64[np.ndarray, "V 3"]]:
-    """sRGB of every vertex, and the gain that each view's channels were multiplied by to look alike.
+    """Return the sRGB colour of every vertex, and the gain of each view's channels that equalises their exposures.
 
-    A view counts by the square of its cosine and by its resolution, the best four of a vertex; one that differs from
-    the others counts less. Vertices that no view sees squarely take their neighbours' colours.
+    The four best views of a vertex are averaged, weighted by the square of the cosine and by resolution, and robustly:
+    a view whose colour differs by 0.08 from the mean has half the weight, because it shows a highlight or another
+    surface. Vertices that no view sees well get colours from their neighbours.
     """
+    best, outlier = 4, 0.08
     samples, opaque = _sampled(mesh, seen, pyramids)
     weight = np.where(opaque & (seen.cosine > LEAST_COSINE), seen.cosine**2, 0.0)
     weight = weight / np.maximum(seen.pixel, 1e-6)
     order = np.sort(weight, axis=1)
-    least = order[:, -min(_BEST, order.shape[1])]
+    least = order[:, -min(best, order.shape[1])]
     weight = np.where(weight >= least[:, None], weight, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     gains = _gains(samples, weight)
     samples = samples * gains[None].astype(np.float32)
+    # Two rounds of iteratively reweighted means with Cauchy weights.
     mean = _mean(samples, weight)
     for _ in range(2):
         off = np.linalg.norm(samples - mean[:, None], axis=2)
-        mean = _mean(samples, weight / (1.0 + (off / _STRANGE) ** 2))
+        mean = _mean(samples, weight / (1.0 + (off / outlier) ** 2))
     known = weight.sum(axis=1) > 0
     colors = _spread(mesh, mean, known) if known.any() else np.full_like(mean, _GREY)
     return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8), gains
 
 
 def _sampled(mesh: TriangleMesh, seen: Sight, pyramids: Pyramids) -> tuple[Float32[np.ndarray, "N V 3"], np.ndarray]:
-    """The colours that the views show at the vertices, and whether all of it is the person's."""
+    """Sample the views at the vertices bilinearly; return colours, and whether all four pixels are the person's."""
     shape = (mesh.vertex_count, len(pyramids.cameras))
     samples, opaque = np.zeros((*shape, 3), np.float32), np.zeros(shape, dtype=bool)
     for k, camera in enumerate(pyramids.cameras):
@@ -67,29 +66,37 @@ def _sampled(mesh: TriangleMesh, seen: Sight, pyramids: Pyramids) -> tuple[Float
 
 
 def _mean(samples: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the weighted mean over views."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
     return np.einsum("nv,nvc->nc", weight, samples, dtype=np.float64) / total[:, None]
 
 
 def _gains(samples: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(V, 3) factors that bring the views' channels to the mean of what they see together; 1 on the average."""
+    """Return (V, 3) gains that minimise the differences of the views' channels where several see a vertex.
+
+    Five rounds of alternating least squares between the gains and the vertices' mean colours; the geometric mean of the
+    gains is 1, and each lies between 0.5 and 2.
+    """
     shared = (weight > 0).sum(axis=1) >= 2
     samples, weight = samples[shared], weight[shared]
     gains = np.ones((samples.shape[1], 3))
     if not len(samples):
         return gains
     squares = np.einsum("nv,nvc->vc", weight, samples**2, dtype=np.float64)
-    for _ in range(_ROUNDS):
+    for _ in range(5):
         mean = _mean(samples * gains[None], weight)
         products = np.einsum("nv,nvc,nc->vc", weight, samples, mean, dtype=np.float64, optimize=True)
         gains = np.divide(products, squares, out=np.ones_like(products), where=squares > 0)
-        gains = np.clip(gains, *_GAINS)
+        gains = np.clip(gains, 0.5, 2.0)
         gains /= np.exp(np.log(gains).mean(axis=0))
     return gains
 
 
 def _spread(mesh: TriangleMesh, colors: np.ndarray, known: Bool[np.ndarray, " N"]) -> np.ndarray:
-    """Colours of the other vertices between those of the known ones, as heat would spread; lone pieces are grey."""
+    """Interpolate the colours of unknown vertices harmonically between known ones; isolated components are grey.
+
+    Solves `(D + L) c = D c0` with the graph Laplacian L, and D large at known vertices and tiny elsewhere.
+    """
     if known.all():
         return colors
     laplacian = sparse_laplacian(mesh)

@@ -1,4 +1,4 @@
-"""The soft visual hull: the zero set of the smallest depth within all silhouettes, on cells refined where it runs."""
+"""Extract the soft visual hull, the zero set of the smallest depth in all silhouettes, by adaptive marching cubes."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import face_components
 from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
-from smplxpp.reconstruct.trust import Box
+from smplxpp.reconstruct.views import Box
 
 Field = Callable[[Float32[np.ndarray, "N 3"]], Float32[np.ndarray, " N"]]
-"""Metres inside at (N, 3) points; it changes by at most a metre a metre."""
-_COARSE = 0.02
+"""Depth inside the surface at (N, 3) points, metres, negative outside; Lipschitz with constant 1."""
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-# The cell beyond each face, and the face's corners.
+# For each of the six faces of a cell: the step to its neighbour, and the face's corners.
 _FACES = [
     (np.eye(3, dtype=np.int64)[axis] * (1 if side else -1), np.flatnonzero(_CORNERS[:, axis] == side))
     for axis in range(3)
     for side in (0, 1)
 ]
+# Added to cell coordinates before they are packed, so that cells a few steps outside the grid are positive too.
 _SHIFT = 64
-# A second piece of this share of the largest one's volume is a body of its own.
-_ANOTHER = 0.2
 
 
 def soft_hull(silhouettes: Sequence[Silhouette], box: Box, *, cell: float, dissent: int = 0) -> TriangleMesh:
-    """The closed surface of what lies in all silhouettes, or in all but `dissent` of them at every point.
+    """Return the closed surface of the points inside all silhouettes, or inside all but `dissent` of them.
 
     Args:
-        cell: metres between samples of the field; edges come out a little shorter.
+        silhouettes: of the views.
+        box: that holds the body.
+        cell: distance of the field's samples, metres; edges of the surface are a little shorter.
+        dissent: number of views that may reject a point.
 
     Raises:
         InputError: nothing lies in all silhouettes.
@@ -47,22 +48,24 @@ def soft_hull(silhouettes: Sequence[Silhouette], box: Box, *, cell: float, disse
 
 
 def zero_surface(field: Field, box: Box, *, cell: float) -> TriangleMesh:
-    """The closed, outward surface on which a field is zero, from coarse cells to fine ones (marching cubes).
+    """Return the closed, outward surface on which a field is zero, by marching cubes on cells refined around it.
 
-    A cell is refined when its middle is no farther from the surface than a corner of it can be.
+    A cell is refined if the field at its centre is below half the cell's diagonal, with 5 % to spare. For a Lipschitz
+    field no other cell can contain the surface.
 
     Raises:
         InputError: the field is positive nowhere.
     """
 
     def within(points: np.ndarray) -> np.ndarray:
-        """The field, closed at the box's sides."""
+        """Return the field, cut off at the sides of the box."""
         to_side = np.minimum(points - box.low.astype(np.float32), box.high.astype(np.float32) - points).min(axis=1)
         return np.minimum(field(points), to_side)
 
-    halvings = max(0, round(float(np.log2(_COARSE / cell))))
+    # Start with cells of about 2 cm and halve them until they have the requested size.
+    halvings = max(0, round(float(np.log2(0.02 / cell))))
     size = cell * 2**halvings
-    # A layer of cells more on every side, so that the surface closes within.
+    # One more layer of cells on every side closes the surface.
     counts = np.ceil((box.high - box.low) / size).astype(np.int64) + 2
     origin = 0.5 * (box.low + box.high) - 0.5 * counts * size
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -89,26 +92,28 @@ def zero_surface(field: Field, box: Box, *, cell: float) -> TriangleMesh:
 def _closed(
     cells: Int64[np.ndarray, "N 3"], field: Field, origin: np.ndarray, size: float
 ) -> tuple[Int64[np.ndarray, "C 3"], Int64[np.ndarray, "M 8"], Float64[np.ndarray, " C"]]:
-    """Corners, cells by their rows, and the corners' values, below zero inside; with the cells that close the surface.
+    """Return corners, cells as rows of corners, and the corners' values (negative inside), with all cells that the
+    surface crosses.
 
-    Where a field jumps, at the edge of a view, its values do not tell of all cells that the surface runs through: it is
-    followed from cell to cell.
+    At the edge of a view the field jumps and is not Lipschitz, so that refinement misses cells there. They are added by
+    following the surface through the faces of known cells (flood fill).
     """
     known, front = np.unique(_keys(cells)), cells
     keys, values = [], []
     while len(front):
         corner_keys, index = np.unique(_keys((front[:, None] + _CORNERS).reshape(-1, 3)), return_inverse=True)
         found = -field((origin + _cells_of(corner_keys) * size).astype(np.float32)).astype(np.float64)
-        # Marching cubes wants the inside below zero; a corner on the surface would give faces without area.
+        # Marching cubes expects negative values inside; a zero at a corner would give faces without area.
         found = np.where(np.abs(found) < 1e-3 * size, -1e-3 * size, found)
         keys.append(corner_keys)
         values.append(found)
+        # The surface crosses a face whose corners differ in sign; the cell on its other side belongs to the surface.
         inside = found[index.reshape(-1, 8)] < 0
-        beyond = []
+        neighbours = []
         for direction, face in _FACES:
             crossed = inside[:, face].any(axis=1) & ~inside[:, face].all(axis=1)
-            beyond.append(_keys(front[crossed] + direction))
-        more = np.setdiff1d(np.concatenate(beyond), known)
+            neighbours.append(_keys(front[crossed] + direction))
+        more = np.setdiff1d(np.concatenate(neighbours), known)
         known, front = np.union1d(known, more), _cells_of(more)
     corner_keys, first = np.unique(np.concatenate(keys), return_index=True)
     found = np.concatenate(values)[first]
@@ -117,18 +122,19 @@ def _closed(
 
 
 def _keys(cells: np.ndarray) -> np.ndarray:
-    """One number a cell; cells a few steps outside of the grid have one too."""
+    """Pack the three coordinates of each cell into one integer, 21 bits each."""
     x, y, z = (cells + _SHIFT).T
     return (x << 42) | (y << 21) | z
 
 
 def _cells_of(keys: np.ndarray) -> np.ndarray:
+    """Unpack the coordinates of cells."""
     low = (1 << 21) - 1
     return np.stack([keys >> 42, keys >> 21 & low, keys & low], axis=1) - _SHIFT
 
 
 def main_body(mesh: TriangleMesh) -> tuple[TriangleMesh, list[str]]:
-    """The largest of a closed surface's pieces, and words on others that are no crumbs.
+    """Return the component of largest volume of a closed surface, and notes about others of over a fifth of it.
 
     Raises:
         InputError: no piece encloses a volume.
@@ -139,21 +145,21 @@ def main_body(mesh: TriangleMesh) -> tuple[TriangleMesh, list[str]]:
     largest = int(volume.argmax())
     if not volume[largest] > 0:
         raise InputError("silhouettes", expected="a body that lies in all of them", received="no volume")
-    others = np.flatnonzero((volume > _ANOTHER * volume[largest]) & (np.arange(len(volume)) != largest))
-    said = [f"another body of {1e3 * volume[k]:.0f} litres beside that of {1e3 * volume[largest]:.0f}" for k in others]
-    return mesh.submesh(piece == largest)[0], said
+    others = np.flatnonzero((volume > 0.2 * volume[largest]) & (np.arange(len(volume)) != largest))
+    notes = [f"another body of {1e3 * volume[k]:.0f} litres beside that of {1e3 * volume[largest]:.0f}" for k in others]
+    return mesh.submesh(piece == largest)[0], notes
 
 
 def solid_status(mesh: TriangleMesh) -> tuple[str, int]:
-    """What manifold3d says of a surface, "NoError" where it is closed and manifold; and its genus, holes through it."""
+    """Return the status of a surface in manifold3d, "NoError" if it is a closed manifold, and its genus."""
     solid = manifold3d.Manifold(
-        manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64))  # it takes no read-only arrays
+        manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64))  # manifold3d refuses read-only arrays
     )
     status = solid.status().name
     return status, int(solid.genus()) if status == "NoError" else 0
 
 
 def pixel_footprint(silhouettes: Sequence[Silhouette], center: Float64[np.ndarray, " 3"]) -> float:
-    """Metres that a pixel takes at a point: the median over the views."""
+    """Return the size of a pixel at a point, metres, as the median over the views."""
     z = [float((one.camera.cam_from_world[:3] @ np.append(center, 1.0))[2]) for one in silhouettes]
     return float(np.median([one.pixel * depth for one, depth in zip(silhouettes, z, strict=True)]))

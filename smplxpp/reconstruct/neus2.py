@@ -1,8 +1,8 @@
-"""Meshes of NeuS2 and Instant-NGP in the world of the cameras: which of the spaces they write is told by the masks.
+"""Transform meshes of NeuS2 and Instant-NGP to world coordinates; the masks decide in which space they were written.
 
-NeuS2 writes meshes in the input's units or in its unit cube, by version and option. The cube holds
-`p * scale + offset` (`scale` and `offset` of transform.json; NeuS2's .5 and .5 where nothing is said); Instant-NGP, for
-files without `from_na`, also turns the axes: its x, y, z are the world's y, z, x (`nerf_matrix_to_ngp` of its
+NeuS2 writes meshes in the input's units or in its unit cube, depending on version and options. The cube holds
+`p * scale + offset` (`scale` and `offset` of transform.json, 0.5 and 0.5 by default). Instant-NGP, for
+files without `from_na`, also permutes the axes: its x, y, z are the world's y, z, x (`nerf_matrix_to_ngp` of its
 `include/neural-graphics-primitives/nerf_loader.h`).
 """
 
@@ -16,18 +16,15 @@ from jaxtyping import Float64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.reconstruct.agreement import silhouette_agreement
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct.views import PhotoView, silhouette_agreement
 
 SPACES = ("world", "cube", "turned cube")
-"""Where a mesh may lie: the cameras' world, NeuS2's unit cube, Instant-NGP's with its axes."""
-_LEAST_AGREEMENT = 0.7
-_NGP_SCALE = 0.33
+"""Spaces of a mesh: the cameras' world, NeuS2's unit cube, and Instant-NGP's cube with permuted axes."""
 
 
 @dataclass(frozen=True)
 class UnitCube:
-    """How a trainer's unit cube lies in the world: `p * scale + offset`."""
+    """The transform of a trainer's unit cube, which holds `p * scale + offset` of world coordinates p."""
 
     scale: float = 0.5
     offset: tuple[float, float, float] = (0.5, 0.5, 0.5)
@@ -40,7 +37,7 @@ class UnitCube:
 def world_from_space(
     vertices: Float64[np.ndarray, "N 3"], space: str, cube: UnitCube | None = None
 ) -> Float64[np.ndarray, "N 3"]:
-    """The vertices in the world of the cameras.
+    """Return vertices of one of the `SPACES` in world coordinates, metres.
 
     Raises:
         InputError: an unknown space.
@@ -57,15 +54,18 @@ def world_from_space(
 def mesh_in_world(
     mesh: TriangleMesh, views: Sequence[PhotoView], cube: UnitCube | None = None
 ) -> tuple[TriangleMesh, str, dict[str, float]]:
-    """The mesh in the world of the cameras, the space that it came in, and each space's agreement with the masks.
+    """Return the mesh in world coordinates, the space that it came in, and each space's agreement with the masks.
 
     Args:
-        cube: of transform.json; None: NeuS2's and Instant-NGP's defaults are tried.
+        mesh: in one of the `SPACES`.
+        views: photographs with masks.
+        cube: of transform.json; None to try the defaults of NeuS2 (scale 0.5) and Instant-NGP (scale 0.33).
 
     Raises:
-        InputError: in no space its silhouettes fill the masks (mean IoU of .7 at least).
+        InputError: the silhouettes fill the masks in no space (mean IoU below 0.7).
     """
-    cubes = [cube] if cube is not None else [UnitCube(), UnitCube(_NGP_SCALE)]
+    least_agreement = 0.7  # a mesh in the wrong space has a mean IoU near 0
+    cubes = [cube] if cube is not None else [UnitCube(), UnitCube(0.33)]
     found: dict[str, tuple[float, TriangleMesh]] = {}
     for space in SPACES:
         for one in cubes if space != "world" else cubes[:1]:
@@ -75,10 +75,10 @@ def mesh_in_world(
             found[name] = (share, moved)
     best = max(found, key=lambda name: found[name][0])
     shares = {name: share for name, (share, _) in found.items()}
-    if shares[best] < _LEAST_AGREEMENT:
+    if shares[best] < least_agreement:
         raise InputError(
             "mesh of a reconstruction",
-            expected=f"silhouettes that fill the masks in one of its spaces (mean IoU {_LEAST_AGREEMENT:g})",
+            expected=f"silhouettes that fill the masks in one of its spaces (mean IoU {least_agreement:g})",
             received=", ".join(f"{name} {share:.2f}" for name, share in shares.items()),
             remedy="check that mesh, frame and cameras belong together, and crop what is not the person",
         )

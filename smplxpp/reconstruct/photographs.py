@@ -1,4 +1,4 @@
-"""Photographs as the sweep and the colours look at them: levels of resolution, what each camera sees of a surface."""
+"""Prepare photographs for sampling: image pyramids, and the visibility of a surface's vertices in each camera."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct.views import PhotoView
 
 LEVELS = 4
-_FULL = np.float32(255.0)
-# How far behind the nearest surface a vertex may lie and count as seen: metres, and pixels of the surface's slope.
-_BEHIND, _BEHIND_PIXELS = 2e-3, 1.5
+"""Resolutions of a pyramid, each half of the one before."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pyramids:
-    """All photographs at `LEVELS` resolutions, one after another.
+    """The image pyramids of all photographs, concatenated.
 
     Attributes:
-        values: red, green, blue, opacity in [0, 1] of every pixel.
-        starts: (V, L) of each level in `values`. sizes: (V, L, 2) heights and widths.
-        projections: (V, 3, 4) to full pixels.
+        values: red, green, blue and opacity of every pixel, in [0, 1].
+        starts: (V, L) offset of each level in `values`.
+        sizes: (V, L, 2) height and width of each level.
+        projections: (V, 3, 4) world coordinates to pixels of the full resolution.
         cameras: of the views.
     """
 
@@ -38,10 +37,10 @@ class Pyramids:
 
     @staticmethod
     def of(views: Sequence[PhotoView]) -> Pyramids:
-        """Halve every photograph as often as its size allows; the last level stands for those that it does not."""
+        """Halve every photograph as often as its size allows; smaller levels repeat the last one."""
         values, starts, sizes, start = [], [], [], 0
         for view in views:
-            level = np.concatenate([view.color, view.opacity[..., None]], axis=2).astype(np.float32) / _FULL
+            level = np.concatenate([view.color, view.opacity[..., None]], axis=2).astype(np.float32) / np.float32(255.0)
             for _ in range(LEVELS):
                 values.append(level.ravel())
                 starts.append(start)
@@ -63,33 +62,37 @@ class Pyramids:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """How cameras see the vertices of a surface.
+    """The visibility of a surface's vertices in V cameras.
 
     Attributes:
-        cosine: of the angle between normal and view; 0 where something hides the vertex or it lies outside the image.
-        pixel: metres that a pixel takes there.
+        cosine: of the angle between normal and ray; 0 if the vertex is hidden or outside the image.
+        pixel: size of a pixel at the vertex, metres.
     """
 
     cosine: Float32[np.ndarray, "N V"]
     pixel: Float32[np.ndarray, "N V"]
 
     def select(self, rows: Bool[np.ndarray, " N"]) -> Sight:
-        """The sight of some of the vertices."""
+        """Return the visibility of some of the vertices."""
         return Sight(self.cosine[rows], self.pixel[rows])
 
     def chosen(self, most: int, *, least_cosine: float) -> Int32[np.ndarray, "N most"]:
-        """The views that look at a vertex most squarely; -1 where there are fewer."""
+        """Return the views of largest cosine for each vertex; -1 where there are fewer."""
         most = min(most, self.cosine.shape[1])
         order = np.argsort(-self.cosine, axis=1, kind="stable")[:, :most].astype(np.int32)
         return np.where(np.take_along_axis(self.cosine, order, axis=1) > least_cosine, order, np.int32(-1))
 
     def seen(self, *, least_cosine: float = 0.2) -> Int64[np.ndarray, " N"]:
-        """How many cameras see each vertex."""
+        """Return the number of cameras that see each vertex."""
         return (self.cosine > least_cosine).sum(axis=1)
 
 
 def sight(mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"], cameras: Sequence[Camera]) -> Sight:
-    """Find what each camera sees of the vertices, by its z-buffer."""
+    """Compute which vertices each camera sees, by its z-buffer.
+
+    A vertex may lie 2 mm and 1.5 pixels of the surface's slope behind the z-buffer, because the depth of a pixel is
+    that of its centre.
+    """
     cosine = np.zeros((mesh.vertex_count, len(cameras)), np.float32)
     pixel = np.zeros_like(cosine)
     for k, camera in enumerate(cameras):
@@ -97,16 +100,18 @@ def sight(mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"], cameras: Sequen
         to_camera = normalize_rows(camera.position - mesh.vertices)
         facing = np.einsum("ij,ij->i", to_camera, normals)
         pixel[:, k] = np.abs(screen[:, 2]) * 2.0 / (camera.K[0, 0] + camera.K[1, 1])
+        # Visible: in the image, facing the camera, and not behind the z-buffer.
         shown = _in_image(screen, camera) & (facing > 0)
         depth = rasterize_mesh(mesh, camera).depth
         column, row = screen[shown, 0].astype(np.int64), screen[shown, 1].astype(np.int64)
         behind = screen[shown, 2] - depth[row, column]
         slope = pixel[shown, k] / np.maximum(facing[shown], 0.1)
-        visible = behind <= _BEHIND + _BEHIND_PIXELS * slope
+        visible = behind <= 2e-3 + 1.5 * slope
         cosine[np.flatnonzero(shown)[visible], k] = facing[shown][visible]
     return Sight(cosine, pixel)
 
 
 def _in_image(screen: Float64[np.ndarray, "N 4"], camera: Camera) -> Bool[np.ndarray, " N"]:
+    """Return which projected points lie in the image and in front of the camera."""
     x, y, z = screen[:, 0], screen[:, 1], screen[:, 2]
     return (z > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)

@@ -1,4 +1,10 @@
-"""The surface of a person from photographs, cameras and masks of one moment, and where it is sure of it."""
+"""Reconstruct the surface of a person from photographs, cameras and masks of one moment, with its confidence.
+
+1. Masks that contradict the others are dropped (`mask_consensus`).
+2. The soft visual hull is extracted by marching cubes (`hull`).
+3. A plane sweep along the normals moves the hull to where photographs agree, from coarse to fine levels (`sweep`).
+4. Colours are blended from the photographs; visibility and agreement give the confidence (`colors`).
+"""
 
 from __future__ import annotations
 
@@ -12,42 +18,74 @@ from jaxtyping import Float32, Int64, UInt8
 
 from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.reconstruct.colors import blend_colors
-from smplxpp.reconstruct.config import ReconstructConfig
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status
+from smplxpp.reconstruct.mask_consensus import Consensus, find_consensus
 from smplxpp.reconstruct.photographs import Pyramids, sight
 from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
 from smplxpp.reconstruct.sweep import (
     PatchConfig,
+    SweepLevel,
     mean_of_neighbours,
     refine_surface,
     smooth_normals,
     sweep_scores,
     taubin,
 )
-from smplxpp.reconstruct.trust import Consensus, find_consensus
 from smplxpp.reconstruct.views import PhotoView, check_spread, usable_views
 
-_CELLS = (3e-3, 6e-3)
-_CELL_PIXELS = 2.0
+# Cameras that must see a vertex for photographs to determine it.
 _LEAST_SEEN = 2
-# Agreement of the photographs: none, and what is as sure as it gets.
-_NO_AGREEMENT, _FULL_AGREEMENT = 0.1, 0.7
+# Sweeps from 5 cm and 2 mm steps, for arms pressed to the body, to 4 mm and 0.5 mm steps.
+LEVELS = (
+    SweepLevel(0.05, 0.004, 0.002, 0.06, (1.0, 2.0)),
+    SweepLevel(0.02, 0.006, 0.001, 0.04),
+    SweepLevel(0.004, 0.004, 0.0005, 0.03),
+)
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Options of a reconstruction.
+
+    Attributes:
+        cell: size of the grid's cells, metres; None for two pixels, within 3 to 6 mm.
+        dissent: number of views that may reject a point; the hull grows with it.
+        refine: whether to sweep along the normals; else the result is the hull.
+        levels: of the sweep, from coarse to fine.
+        smoothness: weight of the displacements' Laplacian relative to the agreement of the views.
+        most_views: number of views that are compared at a point.
+    """
+
+    cell: float | None = None
+    dissent: int = 0
+    refine: bool = True
+    levels: tuple[SweepLevel, ...] = LEVELS
+    smoothness: float = 0.3
+    most_views: int = 6
+
+    def __post_init__(self) -> None:
+        if self.cell is not None:
+            require_positive("reconstruction config cell", self.cell)
+        require_at_least("reconstruction config dissent", self.dissent, 0)
+        require_at_least("reconstruction config most_views", self.most_views, 2)
+        require_positive("reconstruction config smoothness", self.smoothness)
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A person's closed surface.
+    """The closed surface of a person.
 
     Attributes:
         mesh: metres, +Y up; closed and manifold, checked with manifold3d.
-        colors: sRGB a vertex.
-        seen: cameras that see a vertex, none of them at a grazing angle.
-        confidence: a vertex, from 0 (no photograph tells: seen by fewer than two cameras, or they show different
-            things there, as over the air between the legs) to 1 (they show the same).
-        hull: the silhouettes' surface before the photographs were compared.
-        numbers: for reports: cell, footprint, views by name and why others were left out, genus, moved.
-        problems: what was wrong with the inputs, or where the result is to be doubted, in words.
+        colors: sRGB of each vertex.
+        seen: number of cameras that see each vertex, without grazing views.
+        confidence: of each vertex, from 0 (fewer than two cameras see it, or they show different things, as over the
+            air between the legs) to 1 (they show the same).
+        hull: the visual hull before the sweep.
+        numbers: for reports: cell size, pixel size, used and dropped views, genus, mean displacement.
+        notes: sentences about faults of the inputs and uncertain regions of the result.
     """
 
     mesh: TriangleMesh
@@ -56,11 +94,11 @@ class Reconstruction:
     confidence: Float32[np.ndarray, " N"]
     hull: TriangleMesh
     numbers: dict[str, Any]
-    problems: tuple[str, ...]
+    notes: tuple[str, ...]
 
     @property
     def unseen(self) -> float:
-        """Share of the surface that fewer than two cameras see."""
+        """The share of the surface's area that fewer than two cameras see."""
         return _share_of_area(self.mesh, self.seen < _LEAST_SEEN)
 
 
@@ -70,39 +108,43 @@ def reconstruct(
     *,
     progress: ProgressCallback = ignore_progress,
 ) -> Reconstruction:
-    """Reconstruct one moment: consensus of the masks, soft visual hull, gated sweep along the normals, colours.
+    """Reconstruct one moment: consensus of the masks, soft visual hull, plane sweep along the normals, colours.
 
-    Masks that the others contradict are left out and named, in `problems` and as a `GeometryWarning`.
+    Masks that contradict the others are dropped and named, in `notes` and as a `GeometryWarning`.
 
     Args:
-        views: of one moment, at least four, from all around; photographs with the person's opacity.
+        views: at least four of one moment, from all around.
+        config: options.
+        progress: called with the work under way and its share done.
 
     Raises:
-        InputError: too few views, all from one side, masks of nothing or of the background, masks that contradict each
-            other.
+        InputError: too few views, views from one side only, masks of nothing or of the background, or masks that
+            contradict each other.
 
     Example:
         >>> found = reconstruct([PhotoView("front", camera, image, mask), ...])
-        >>> found.mesh, found.seen < 2  # the surface, and where it is a guess
+        >>> found.mesh, found.seen < 2  # the surface, and the vertices that photographs do not determine
     """
     config = config or ReconstructConfig()
     progress("masks", 0.0)
+    # Views with plausible masks, and of these the ones whose silhouettes agree.
     usable, faults = usable_views(views)
     silhouettes = [Silhouette.of(view) for view in usable]
     consensus = find_consensus(silhouettes)
     kept = np.flatnonzero(consensus.trusted)
     trusted, silhouettes = [usable[k] for k in kept], [silhouettes[k] for k in kept]
     center = 0.5 * (consensus.box.low + consensus.box.high)
-    problems = [f"mask of {name} left out: {why}" for name, why in (*faults.items(), *consensus.reasons.items())]
-    for words in problems:
-        warnings.warn(words, GeometryWarning, stacklevel=2)
+    notes = [f"mask of {name} left out: {why}" for name, why in (*faults.items(), *consensus.reasons.items())]
+    for note in notes:
+        warnings.warn(note, GeometryWarning, stacklevel=2)
     one_sided = check_spread(center, [view.camera for view in trusted])
-    problems += [one_sided] if one_sided else []
+    notes += [one_sided] if one_sided else []
+    # The hull of the component of largest volume, with cells of two pixels between 3 and 6 mm.
     pixel = pixel_footprint(silhouettes, center)
-    cell = config.cell or float(np.clip(_CELL_PIXELS * pixel, *_CELLS))
+    cell = config.cell or float(np.clip(2.0 * pixel, 3e-3, 6e-3))
     progress("hull", 0.0)
     hull, more = main_body(soft_hull(silhouettes, consensus.box, cell=cell, dissent=config.dissent))
-    problems += more
+    notes += more
     hull = taubin(hull, mean_of_neighbours(hull), steps=3)
     pyramids = Pyramids.of(trusted)
     levels = config.levels if config.refine else ()
@@ -110,6 +152,7 @@ def reconstruct(
     def inside(points: np.ndarray) -> np.ndarray:
         return smallest_depths(silhouettes, points, count=config.dissent + 1)[:, config.dissent]
 
+    # The sweep, level by level, each followed by one Taubin step against the noise of the displacements.
     mesh = hull
     for k, level in enumerate(levels):
         progress("photographs", k / len(levels))
@@ -121,26 +164,26 @@ def reconstruct(
     if status != "NoError":
         raise InputError("reconstructed surface", expected="a closed manifold", received=f"manifold3d: {status}")
     progress("colours", 0.0)
-    return _finished(mesh, hull, pyramids, config, problems, _numbers(usable, faults, consensus, pixel, cell))
+    return _finished(mesh, hull, pyramids, config, notes, _numbers(usable, faults, consensus, pixel, cell))
 
 
 def adopt_surface(
     mesh: TriangleMesh, views: Sequence[PhotoView], config: ReconstructConfig | None = None
 ) -> Reconstruction:
-    """Take another program's surface in the cameras' world as the reconstruction: seen, confidence and colours.
+    """Adopt a surface of another program, in world coordinates, and compute its visibility, confidence and colours.
 
-    It stays as it is; where manifold3d does not call it a closed manifold, `problems` says so.
+    The surface is not changed; if it is no closed manifold, `notes` says so.
 
     Raises:
-        InputError: as `reconstruct`, but masks that disagree with each other are not asked about.
+        InputError: as `reconstruct`, except that masks may contradict each other.
     """
     config = config or ReconstructConfig()
     usable, faults = usable_views(views)
     silhouettes = [Silhouette.of(view) for view in usable]
-    problems = [f"mask of {name} left out: {why}" for name, why in faults.items()]
+    notes = [f"mask of {name} left out: {why}" for name, why in faults.items()]
     status, _ = solid_status(mesh)
     if status != "NoError":
-        problems.append(f"the mesh is no closed manifold (manifold3d: {status}); `smplxpp build` repairs what it needs")
+        notes.append(f"the mesh is no closed manifold (manifold3d: {status}); `smplxpp build` repairs what it needs")
     numbers = {
         "views": [view.name for view in usable],
         "left_out": faults,
@@ -148,7 +191,7 @@ def adopt_surface(
         "pixel_mm": 1e3 * pixel_footprint(silhouettes, mesh.vertices.mean(axis=0)),
         "cell_mm": 0.0,
     }
-    return _finished(mesh, mesh, Pyramids.of(usable), config, problems, numbers)
+    return _finished(mesh, mesh, Pyramids.of(usable), config, notes, numbers)
 
 
 def _finished(
@@ -156,10 +199,10 @@ def _finished(
     hull: TriangleMesh,
     pyramids: Pyramids,
     config: ReconstructConfig,
-    problems: list[str],
+    notes: list[str],
     numbers: dict[str, Any],
 ) -> Reconstruction:
-    """The surface with its colours and what is known of it."""
+    """Compute colours and confidence of a surface, and the numbers of the report."""
     status, genus = solid_status(mesh)
     seen, confidence, colors, gains = look_at(mesh, pyramids, most_views=config.most_views)
     moved = np.linalg.norm(mesh.vertices - hull.vertices, axis=1)
@@ -173,13 +216,17 @@ def _finished(
         "unsure": _share_of_area(mesh, confidence == 0),
         "gains": gains.round(4).tolist(),
     }
-    return Reconstruction(mesh, colors, seen, confidence, hull, numbers, tuple(problems))
+    return Reconstruction(mesh, colors, seen, confidence, hull, numbers, tuple(notes))
 
 
 def look_at(
     mesh: TriangleMesh, pyramids: Pyramids, *, most_views: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, " N"], UInt8[np.ndarray, "N 3"], np.ndarray]:
-    """How many cameras see each vertex, how sure the photographs are of it, its colour, and the views' gains."""
+    """Return the number of cameras that see each vertex, its confidence and colour, and the views' gains.
+
+    The confidence rises linearly from 0 at an agreement of 0.1 to 1 at 0.7, which is as high as real photographs agree.
+    """
+    none, full = 0.1, 0.7
     mean = mean_of_neighbours(mesh)
     normals = smooth_normals(mesh, mean)
     sights = sight(mesh, normals, pyramids.cameras)
@@ -189,7 +236,7 @@ def look_at(
     ]
     for _ in range(2):
         scores = 0.5 * scores + 0.5 * (mean @ scores)
-    confidence = np.clip((scores - _NO_AGREEMENT) / (_FULL_AGREEMENT - _NO_AGREEMENT), 0.0, 1.0)
+    confidence = np.clip((scores - none) / (full - none), 0.0, 1.0)
     confidence = np.where(seen >= _LEAST_SEEN, confidence, 0.0).astype(np.float32)
     colors, gains = blend_colors(mesh, sights, pyramids)
     return seen, confidence, colors, gains
@@ -198,6 +245,7 @@ def look_at(
 def _numbers(
     usable: Sequence[PhotoView], faults: dict[str, str], consensus: Consensus, pixel: float, cell: float
 ) -> dict[str, Any]:
+    """Return the numbers of a report that are known before the surface is."""
     return {
         "views": [view.name for view, good in zip(usable, consensus.trusted, strict=True) if good],
         "left_out": {**faults, **consensus.reasons},
@@ -208,6 +256,6 @@ def _numbers(
 
 
 def _share_of_area(mesh: TriangleMesh, vertices: np.ndarray) -> float:
-    """Share of the area of the faces all of whose corners are chosen."""
+    """Return the share of the area whose faces have all their corners chosen."""
     chosen = vertices[mesh.faces].all(axis=1)
     return float(mesh.face_areas[chosen].sum() / mesh.face_areas.sum())

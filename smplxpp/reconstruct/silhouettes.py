@@ -1,4 +1,4 @@
-"""Masks as fields of distance: how far inside its silhouette every view sees a point, in metres."""
+"""Turn masks into signed distance fields: how far inside its silhouette a view sees a point, in metres."""
 
 from __future__ import annotations
 
@@ -13,23 +13,20 @@ from smplxpp.core.camera import Camera
 from smplxpp.reconstruct.views import INSIDE, PhotoView
 
 UNSEEN = np.float32(1e6)
-"""Metres inside of a view that does not show the point: it has nothing to say."""
-_CHUNK = 1 << 18
-_MARGIN = 8  # pixels about the mask's box in which the distance is exact
-_FULL = 255.0
-_SHOWN = 0.25
+"""Depth inside the silhouette of a view that does not show the point, metres; such a view has no vote."""
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """A mask's signed distance within the box that holds the mask.
+    """The signed distance field of a mask, in a window around the mask.
 
     Attributes:
-        name, camera: of the view.
-        distance: pixels to the outline at pixel centres, positive inside.
-        corner: x, y of the box's first pixel.
-        pixel: metres that a pixel takes at a distance of one metre.
-        projection: pixels from the world, homogeneous.
+        name: of the view.
+        camera: of the view.
+        distance: distances of pixel centres to the outline, pixels, positive inside.
+        corner: x and y of the window's first pixel.
+        pixel: size of a pixel at a depth of one metre, metres.
+        projection: homogeneous pixels from world coordinates.
     """
 
     name: str
@@ -41,11 +38,12 @@ class Silhouette:
 
     @staticmethod
     def of(view: PhotoView) -> Silhouette:
-        """The silhouette of a view whose mask is neither empty nor full."""
+        """Compute the silhouette of a view whose mask is neither empty nor full."""
+        margin = 8  # pixels around the mask in which the distance is exact
         inside = view.opacity > INSIDE
         rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-        y0, y1 = max(0, rows[0] - _MARGIN), min(len(inside), rows[-1] + 1 + _MARGIN)
-        x0, x1 = max(0, columns[0] - _MARGIN), min(inside.shape[1], columns[-1] + 1 + _MARGIN)
+        y0, y1 = max(0, rows[0] - margin), min(len(inside), rows[-1] + 1 + margin)
+        x0, x1 = max(0, columns[0] - margin), min(inside.shape[1], columns[-1] + 1 + margin)
         camera = view.camera
         return Silhouette(
             view.name,
@@ -57,13 +55,15 @@ class Silhouette:
         )
 
     def depth(self, points: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
-        """Metres inside the silhouette's cone at (N, 3) points, `UNSEEN` where the image does not show them."""
+        """Return the depth of points inside the silhouette's cone, metres; `UNSEEN` where the image ends."""
+        # Project; points behind the camera or outside the image are not shown.
         m = self.projection.astype(np.float32)
         x, y, z = (points @ row[:3] + row[3] for row in m)
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = x / z, y / z
             shown = (z > 0) & (x >= 0) & (y >= 0) & (x <= self.camera.width) & (y <= self.camera.height)
         x, y = np.where(shown, x, 0) - (self.corner[0] + 0.5), np.where(shown, y, 0) - (self.corner[1] + 0.5)
+        # Bilinear interpolation in the window, clamped at its border.
         height, width = self.distance.shape
         u, v = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
         column, row = np.minimum(u.astype(np.int32), width - 2), np.minimum(v.astype(np.int32), height - 2)
@@ -71,21 +71,21 @@ class Silhouette:
         flat, first = self.distance.ravel(), row * width + column
         top = flat[first] + du * (flat[first + 1] - flat[first])
         bottom = flat[first + width] + du * (flat[first + width + 1] - flat[first + width])
-        # Beyond the box it is farther by the way to the box.
+        # Outside the window, the distance to the window is added.
         pixels = top + dv * (bottom - top) - np.hypot(x - u, y - v)
         return np.where(shown, pixels * np.maximum(z, 0) * np.float32(self.pixel), UNSEEN).astype(np.float32)
 
 
 def signed_distance(opacity: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Pixels from pixel centres to the outline of an antialiased mask, positive inside.
+    """Return the distances of pixel centres to the outline of an antialiased mask, pixels, positive inside.
 
-    A pixel that is covered in part says where in it the outline lies. Others add their way to the nearest one of the
-    other side or, where that makes them nearer to the outline, to the nearest covered in part of their own (after
-    Gustavson and Strand 2011).
+    The coverage of a partly covered pixel gives the position of the outline in it. Other pixels add their distance to
+    the nearest pixel of the other side or, where that is less, to the nearest partly covered one of their own side
+    (after Gustavson and Strand 2011).
     """
     inside = opacity > INSIDE
     out = np.empty(opacity.shape, np.float32)
-    for own, whole in ((inside, _FULL), (~inside, 0.0)):
+    for own, whole in ((inside, 255.0), (~inside, 0.0)):
         own_at_outline = own & (opacity != whole) & ndimage.binary_dilation(~own)
         sign = 1.0 if whole else -1.0
         found = [_by_nearest(opacity, there, sign) for there in (~own, own_at_outline) if there.any()]
@@ -94,24 +94,25 @@ def signed_distance(opacity: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
 
 
 def _by_nearest(opacity: np.ndarray, there: np.ndarray, sign: float) -> np.ndarray:
-    """The signed distance that the nearest of the pixels `there` tells of."""
+    """Return the signed distance to the outline as the nearest of the pixels `there` gives it."""
     distance, nearest = ndimage.distance_transform_edt(~there, return_indices=True)
-    return sign * distance + (opacity[tuple(nearest)].astype(np.float32) / np.float32(_FULL) - 0.5)
+    return sign * distance + (opacity[tuple(nearest)].astype(np.float32) / np.float32(255.0) - 0.5)
 
 
 def least_shown(views: int) -> int:
-    """How many of the views have to show a point that is to count as inside: what none shows is not the person."""
-    return max(2, int(_SHOWN * views))
+    """Return the number of views that must show a point for it to count as inside: a quarter, and at least two."""
+    return max(2, int(0.25 * views))
 
 
 def smallest_depths(
     silhouettes: Sequence[Silhouette], points: Float32[np.ndarray, "N 3"], *, count: int = 1
 ) -> Float32[np.ndarray, "N count"]:
-    """The `count` smallest depths of each point among the views, ascending; far outside where too few show it."""
+    """Return the `count` smallest depths of each point among the views, ascending; -`UNSEEN` if too few show it."""
+    chunk = 1 << 18  # points at once, which bounds the memory
     out = np.empty((len(points), count), np.float32)
     least = least_shown(len(silhouettes))
-    for first in range(0, len(points), _CHUNK):
-        part = points[first : first + _CHUNK]
+    for first in range(0, len(points), chunk):
+        part = points[first : first + chunk]
         smallest = np.full((len(part), count), UNSEEN, np.float32)
         shown = np.zeros(len(part), np.int32)
         for silhouette in silhouettes:
@@ -122,5 +123,5 @@ def smallest_depths(
             else:
                 both = np.concatenate([smallest, depth[:, None]], axis=1)
                 smallest = np.sort(both, axis=1)[:, :count]
-        out[first : first + _CHUNK] = np.where((shown >= least)[:, None], smallest, -UNSEEN)
+        out[first : first + chunk] = np.where((shown >= least)[:, None], smallest, -UNSEEN)
     return out

@@ -10,8 +10,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct.hull import zero_surface
-from smplxpp.reconstruct.trust import Box
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct.views import Box, PhotoView
 
 RADIUS = 0.5
 BOX = Box(np.full(3, -0.6), np.full(3, 0.6))

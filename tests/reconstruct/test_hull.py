@@ -6,7 +6,7 @@ from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status, zero_surface
 from smplxpp.reconstruct.silhouettes import Silhouette
-from smplxpp.reconstruct.trust import Box
+from smplxpp.reconstruct.views import Box
 from tests.reconstruct.scene import BOX, RADIUS, dented_views, inside_ball, inside_dented
 
 

@@ -60,11 +60,11 @@ def test_a_mesh_of_something_else_is_refused(truth):
 
 def test_an_adopted_surface_stays_and_gets_colours_and_confidence(truth):
     found = adopt_surface(truth, dented_views())
-    assert (found.mesh.vertices == truth.vertices).all() and not found.problems
+    assert (found.mesh.vertices == truth.vertices).all() and not found.notes
     assert found.confidence[found.seen > 3].mean() > 0.6
     assert found.colors.std() > 10
     opened = TriangleMesh(truth.vertices, truth.faces[50:])
-    assert any("no closed manifold" in words for words in adopt_surface(opened, dented_views()).problems)
+    assert any("no closed manifold" in words for words in adopt_surface(opened, dented_views()).notes)
 
 
 def test_a_cube_without_a_size_is_refused():

@@ -6,8 +6,8 @@ import pytest
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.reconstruct import ReconstructConfig, SweepLevel, reconstruct
-from smplxpp.reconstruct.agreement import silhouette_agreement
 from smplxpp.reconstruct.hull import solid_status
+from smplxpp.reconstruct.views import silhouette_agreement
 from tests.reconstruct.scene import dented_views, inside_dented
 
 CONFIG = ReconstructConfig(cell=0.025, levels=(SweepLevel(0.1, 0.01, 0.005, 0.06),))
@@ -30,7 +30,7 @@ def test_it_is_closed_and_fills_its_masks(found):
     assert found.numbers["genus"] == 0 and found.numbers["status"] == "NoError"
     shares = silhouette_agreement(found.mesh, dented_views())
     assert len(shares) == len(dented_views()) and min(shares.values()) > 0.96
-    assert not found.problems and not found.numbers["left_out"]
+    assert not found.notes and not found.numbers["left_out"]
 
 
 def test_confidence_is_high_where_it_is_right_and_none_where_nobody_looks():
@@ -76,7 +76,7 @@ def test_bad_masks_are_left_out_with_a_warning():
         result = reconstruct(views, replace(CONFIG, refine=False))
     assert set(result.numbers["left_out"]) == {"cam02", "cam07"}
     assert {type(one.message) for one in caught} == {GeometryWarning}
-    assert sum("cam07" in words for words in result.problems) == 1
+    assert sum("cam07" in words for words in result.notes) == 1
     assert np.abs(inside_dented(result.mesh.vertices)).mean() < 0.02
 
 

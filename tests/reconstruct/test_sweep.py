@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.reconstruct.config import SweepLevel
+from smplxpp.reconstruct import SweepLevel
 from smplxpp.reconstruct.hull import zero_surface
 from smplxpp.reconstruct.photographs import Pyramids, sight
 from smplxpp.reconstruct.sweep import (

@@ -29,7 +29,7 @@ def test_masks_of_the_background_are_refused_with_what_to_do():
 def test_empty_and_full_masks_are_refused():
     for value in (0, 255):
         views = [replace(view, opacity=np.full_like(view.opacity, value)) for view in dented_views()]
-        with pytest.raises(InputError, match="Make the masks anew"):
+        with pytest.raises(InputError, match="Make new masks"):
             usable_views(views)
 
 

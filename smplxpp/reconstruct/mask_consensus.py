@@ -1,9 +1,9 @@
-"""Which masks can be believed: silhouettes of one body agree with each other, and those that do not are named.
+"""Decide which masks to trust: silhouettes of one body agree, and masks that contradict them are dropped.
 
-A body's voxel lies within every true mask. With no bad mask, the hull's silhouette covers every mask; one mask that
-lacks an arm takes the arm from the hull, and all other views show arms that nothing explains. So the views are asked
-what they could explain if `k` masks were wrong at each voxel; while `k` must be above 0, the view goes whose word
-leaves most of the others' masks unexplained.
+A voxel of the body lies inside every correct mask, so that without faulty masks the visual hull covers every mask. One
+mask that lacks an arm removes the arm from the hull, and every other view then shows an arm that the hull does not
+explain. So the hull is computed with k dissenting views allowed at each voxel, for the smallest k that explains the
+masks. While k is above 0, the view is dropped whose vote leaves most of the other masks unexplained.
 """
 
 from __future__ import annotations
@@ -17,34 +17,24 @@ from scipy import ndimage
 
 from smplxpp.core.errors import InputError
 from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown
-from smplxpp.reconstruct.views import LEAST_VIEWS
+from smplxpp.reconstruct.views import LEAST_VIEWS, Box
 
-_CELLS = 72
-"""Voxels along the longer side of the box in which views are compared."""
-_EXPLAINED = 0.97
-"""Share of a mask that the hull of views that agree explains, at least; the median over the views counts."""
-_OWN = 0.80
+# Smallest share of a mask that the hull of the trusted views must explain. It trades faulty masks that are missed
+# against good ones that are dropped, since cameras and masks are never exact.
+_OWN_EXPLAINED = 0.80
+# Largest share of the views that may be dropped; if more contradict each other, no majority can be trusted.
 _MOST_WRONG = 1.0 / 3.0
-_SLACK_PIXELS = 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class Box:
-    """An upright box in the world, metres."""
-
-    low: Float64[np.ndarray, " 3"]
-    high: Float64[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """Views that agree.
+    """The views whose masks agree.
 
     Attributes:
-        trusted: by view.
-        reasons: what is wrong with the others, by name.
-        explained: share of each view's mask that the hull of the trusted ones explains.
-        box: about the body, with a margin.
+        trusted: whether a view is kept.
+        reasons: why the others were dropped, by name.
+        explained: share of each view's mask that the hull of the trusted views explains.
+        box: around the body, with a margin.
     """
 
     trusted: Bool[np.ndarray, " V"]
@@ -54,10 +44,12 @@ class Consensus:
 
 
 def body_box(silhouettes: Sequence[Silhouette]) -> Box:
-    """A cube about the point where the rays through the masks' middles meet, as large as the masks say.
+    """Return a cube around the point where the rays through the masks' centroids meet.
 
-    Robust to a few wrong ones: residuals are weighted anew, the size is a high quantile over the views.
+    The point minimises the sum of distances to the rays by iteratively reweighted least squares, which is robust to a
+    few wrong masks; the size is the median of the masks' extents at its depth, with half as much again.
     """
+    # The ray of each mask's centroid in world coordinates.
     eyes = np.stack([one.camera.position for one in silhouettes])
     rays = []
     for one in silhouettes:
@@ -65,6 +57,7 @@ def body_box(silhouettes: Sequence[Silhouette]) -> Box:
         x = np.array([columns.mean() + one.corner[0] + 0.5, rows.mean() + one.corner[1] + 0.5, 1.0])
         ray = one.camera.cam_from_world[:3, :3].T @ np.linalg.solve(one.camera.K, x)
         rays.append(ray / np.linalg.norm(ray))
+    # Projections perpendicular to the rays; the weights 1 / distance turn squares into distances.
     across = np.eye(3) - np.einsum("vi,vj->vij", np.stack(rays), np.stack(rays))
     weight, center = np.ones(len(eyes)), np.zeros(3)
     for _ in range(20):
@@ -72,6 +65,7 @@ def body_box(silhouettes: Sequence[Silhouette]) -> Box:
         center = np.linalg.solve(matrix, np.einsum("v,vij,vj->i", weight, across, eyes))
         off = np.linalg.norm(np.einsum("vij,vj->vi", across, center - eyes), axis=1)
         weight = 1.0 / (off + 0.1 * np.median(off) + 1e-6)
+    # Metres that each mask's window spans at the depth of the point.
     sizes = []
     for one in silhouettes:
         z = float((one.camera.cam_from_world[:3] @ np.append(center, 1.0))[2])
@@ -81,13 +75,14 @@ def body_box(silhouettes: Sequence[Silhouette]) -> Box:
 
 
 def find_consensus(silhouettes: Sequence[Silhouette]) -> Consensus:
-    """Find the views whose masks agree, and the body's box.
+    """Find the views whose masks agree, and the box of the body.
 
     Raises:
-        InputError: masks contradict each other so that less than two thirds of them agree, or no body is left.
+        InputError: fewer than two thirds of the masks agree, or no body is left.
     """
+    # Once in a box around the rays' meeting point, once in the box of the body that was found, at its resolution.
     box = body_box(silhouettes)
-    for _ in range(2):  # once to find the body, once at a resolution that fits it
+    for _ in range(2):
         points, shape, cell = _grid(box)
         votes = _Votes.of(silhouettes, points, shape, cell)
         trusted, reasons = _agreeing(votes, silhouettes)
@@ -103,12 +98,12 @@ def find_consensus(silhouettes: Sequence[Silhouette]) -> Consensus:
 def _without_the_unexplained(
     votes: _Votes, trusted: np.ndarray, reasons: dict[str, str], silhouettes: Sequence[Silhouette]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Take masks away, the worst first, that show much of what is nowhere in the hull; the hull, what it explains."""
+    """Drop masks of which the hull explains too little, worst first; return the hull and the explained shares."""
     while True:
         inside = votes.accepted(trusted, 0)
         explained = votes.explained(inside)
         worst = int(np.where(trusted, explained, np.inf).argmin())
-        if explained[worst] >= _OWN or trusted.sum() <= LEAST_VIEWS or not inside.any():
+        if explained[worst] >= _OWN_EXPLAINED or trusted.sum() <= LEAST_VIEWS or not inside.any():
             return inside, explained
         trusted[worst] = False
         share = 100 * (1 - explained[worst])
@@ -116,8 +111,9 @@ def _without_the_unexplained(
 
 
 def _grid(box: Box) -> tuple[np.ndarray, tuple[int, ...], float]:
+    """Return the voxels' centres, 72 along the longest side of the box, the grid's shape and the voxels' size."""
     size = box.high - box.low
-    cell = float(size.max()) / _CELLS
+    cell = float(size.max()) / 72
     axes = [
         low + cell * (np.arange(int(np.ceil(extent / cell))) + 0.5) for low, extent in zip(box.low, size, strict=True)
     ]
@@ -127,14 +123,14 @@ def _grid(box: Box) -> tuple[np.ndarray, tuple[int, ...], float]:
 
 @dataclass(frozen=True, eq=False)
 class _Votes:
-    """What the views say of voxels that most of them may accept.
+    """The votes of V views on N voxels.
 
     Attributes:
-        shape: of the grid, N in all.
-        inside: (N, V) the view accepts the voxel or does not show it.
-        place: (N, V) the coarse pixel in which a view shows the voxel; -1 where it does not.
-        pixels: how many coarse ones a view has.
-        masks: per view, the coarse pixels of its mask that voxels fall into.
+        shape: of the grid of voxels.
+        inside: (N, V) whether a view accepts the voxel or does not show it.
+        place: (N, V) the coarse pixel in which a view shows the voxel; -1 if it does not.
+        pixels: number of coarse pixels of each view.
+        masks: coarse pixels of each view that are well inside its mask.
     """
 
     shape: tuple[int, ...]
@@ -145,13 +141,15 @@ class _Votes:
 
     @staticmethod
     def of(silhouettes: Sequence[Silhouette], points: np.ndarray, shape: tuple[int, ...], cell: float) -> _Votes:
+        """Project all voxels into all views."""
         inside, place, counts, masks = [], [], [], []
         for one in silhouettes:
+            # A voxel is accepted if it is inside by more than minus half its size and three pixels of mask error.
             depth = one.depth(points)
             z = points @ one.projection[2, :3].astype(np.float32) + np.float32(one.projection[2, 3])
-            slack = 0.5 * cell + _SLACK_PIXELS * one.pixel * np.maximum(z, 0)
+            slack = 0.5 * cell + 3.0 * one.pixel * np.maximum(z, 0)
             inside.append(depth > -slack)
-            # Coarse pixels are as large as a voxel in the middle of the box.
+            # Coarse pixels have the size of a voxel in the middle of the box, so that voxels leave no holes in them.
             step = max(1.0, cell / (one.pixel * max(float(np.median(z)), 1e-6)))
             screen = one.camera.screen_from_world(points)
             shown = depth < UNSEEN
@@ -165,10 +163,10 @@ class _Votes:
         return _Votes(shape, np.stack(inside, axis=1), np.stack(place, axis=1), tuple(counts), tuple(masks))
 
     def accepted(self, trusted: np.ndarray, dissent: int) -> np.ndarray:
-        """(N,) the connected voxels that all but `dissent` of the trusted views accept, where enough show them.
+        """Return (N,) the voxels that all but `dissent` of the trusted views accept, where enough views show them.
 
-        Of several pieces the one that most of the views show: others lie before single cameras, out of the others'
-        sight.
+        Of several connected components, the one that most views show is kept; the others lie in front of single
+        cameras, where the other views do not reach.
         """
         shown = (self.place[:, trusted] >= 0).sum(axis=1)
         kept = (shown >= least_shown(int(trusted.sum()))) & ((~self.inside[:, trusted]).sum(axis=1) <= dissent)
@@ -179,7 +177,7 @@ class _Votes:
         return piece == np.bincount(piece[kept], (shown[kept] == shown[kept].max()).astype(float)).argmax()
 
     def explained(self, kept: np.ndarray) -> np.ndarray:
-        """(V,) share of each mask that the kept voxels cover; 1 for a mask outside of the box."""
+        """Return (V,) the share of each mask that the kept voxels cover; 1 for a mask outside the box."""
         out = np.ones(len(self.masks))
         for v, mask in enumerate(self.masks):
             covered = np.zeros(self.pixels[v] + 1, dtype=bool)
@@ -190,7 +188,7 @@ class _Votes:
 
 
 def _coarse_mask(one: Silhouette, step: float, rows: int, columns: int) -> np.ndarray:
-    """(rows * columns,) coarse pixels whose middle is well inside of the mask."""
+    """Return (rows * columns,) coarse pixels whose centre is well inside the mask."""
     y, x = np.mgrid[:rows, :columns]
     column = ((x + 0.5) * step - one.corner[0]).astype(np.int64)
     row = ((y + 0.5) * step - one.corner[1]).astype(np.int64)
@@ -202,21 +200,23 @@ def _coarse_mask(one: Silhouette, step: float, rows: int, columns: int) -> np.nd
 
 
 def _agreeing(votes: _Votes, silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, dict[str, str]]:
-    """Take views away until no dissent is needed to explain the masks of the rest."""
+    """Drop views until no dissent is needed to explain the masks of the rest."""
     count = len(silhouettes)
     most = int(count * _MOST_WRONG)
     trusted, reasons = np.ones(count, dtype=bool), dict[str, str]()
     while True:
+        # The smallest dissent k whose hull explains the median mask by 97 % and most masks by their least share.
         for k in range(most + 1 - len(reasons)):
             accepted = votes.accepted(trusted, k)
             explained = votes.explained(accepted)[trusted]
-            if np.median(explained) >= _EXPLAINED and (explained >= _OWN).mean() >= 0.5:
+            if np.median(explained) >= 0.97 and (explained >= _OWN_EXPLAINED).mean() >= 0.5:
                 break
         else:
             _refuse(reasons, count)
         if k == 0:
             return trusted, reasons
-        # What each one's word costs the others.
+        # What each view's vote costs the others: the share of their masks that is unexplained without the voxels it
+        # rejects.
         cost = np.full(count, -1.0)
         for v in np.flatnonzero(trusted):
             others = trusted.copy()
@@ -229,6 +229,7 @@ def _agreeing(votes: _Votes, silhouettes: Sequence[Silhouette]) -> tuple[np.ndar
 
 
 def _refuse(reasons: dict[str, str], count: int) -> None:
+    """Raise the error of masks that contradict each other."""
     raise InputError(
         "masks to reconstruct from",
         expected=f"silhouettes of one body: masks of at least {count - int(count * _MOST_WRONG)} of {count} views that "

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import InputError
+from smplxpp.reconstruct.mask_consensus import find_consensus
 from smplxpp.reconstruct.silhouettes import Silhouette
-from smplxpp.reconstruct.trust import find_consensus
 from tests.reconstruct.scene import RADIUS, dented_views
 
 
