@@ -32,8 +32,13 @@ def quick(seed: int = 0, cameras: bool = False) -> RefineConfig:
 
 @pytest.fixture(autouse=True)
 def few_gaussians(monkeypatch):
+    use_quick(monkeypatch)
+
+
+def use_quick(patch: pytest.MonkeyPatch) -> None:
+    """Refine with few Gaussians; the recipe is imported before the configuration that it takes over is replaced."""
     for module in ("avatar.training.recipe", "avatar.training.refinement.config"):
-        monkeypatch.setattr(f"{module}.RefineConfig", quick)
+        patch.setattr(f"{module}.RefineConfig", quick)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +62,7 @@ def refine(run: Path, capture: Path, *options: str) -> int:
 def refined(capture, tmp_path_factory):
     run = doll().write_run(tmp_path_factory.mktemp("runs") / "gestures")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("avatar.training.refinement.config.RefineConfig", quick)
+        use_quick(patch)
         assert refine(run, capture) == 0  # the capture says that these are tracked
     return run
 
