@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -23,7 +26,9 @@ from avatar.models.networks.pose_gate import PoseGate
 from avatar.models.networks.pose_regression import PoseRegression
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose, Rig
+from smplxpp.cloth.garment import Garment
 from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least
 
 
@@ -46,6 +51,23 @@ class StudentConfig:
 
     def __post_init__(self) -> None:
         require_at_least("student control_points", self.control_points, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentOrigin:
+    """What belongs to a student beside its networks and Gaussians; bundles and other files take it along.
+
+    Attributes:
+        name: name of the avatar.
+        garments: loose clothes, which players simulate.
+        reference: parameters, without shape, that pose the template as its scan; None: not known.
+        digests: SHA-256 of the files that the student was opened from, by name.
+    """
+
+    name: str = "avatar"
+    garments: tuple[Garment, ...] = ()
+    reference: BodyParams | None = None
+    digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 class Student(nn.Module):
@@ -77,7 +99,7 @@ class Student(nn.Module):
     ) -> None:
         super().__init__()
         gaussians.check_topology(rig.faces, "template of the student")
-        self.config, self.rig = config, rig
+        self.config, self.rig, self.origin = config, rig, StudentOrigin()
         self.gaussians = LearnedGaussians(gaussians)
         self.field = None if config.field is None else _make_field(config.field, config, rig)
         self.codes = None if config.field is None else FrameCodes(frames, config.field.code_size)
@@ -174,7 +196,24 @@ class Student(nn.Module):
                 its.load_state_dict(mine.state_dict())
         if self.codes is not None and other.codes is not None:
             other.codes.null_code_shown = self.codes.null_code_shown
+        other.origin = self.origin
         return other
+
+    def export(self, path: str | Path, **options: Any) -> dict[str, Any]:
+        """Write the student for players and other programs, as `avatar.export_student` does.
+
+        Args:
+            path: its suffix says what is written: `.avatar` (a bundle for our players), `.ply .spz .sog .glb` (splats
+                of a pose), `.usdc` (splats that move), `.onnx` (the step from a pose to splats).
+            options: see `avatar.export_student`.
+
+        Example:
+            >>> student.export("me.avatar")
+            >>> student.export("me.ply", params=params.frame(0))
+        """
+        import avatar  # the writers lie above this room; the front door knows where
+
+        return avatar.export_student(self, path, **options)
 
 
 def _make_field(config: FieldConfig, student: StudentConfig, rig: Rig) -> DeformationField:

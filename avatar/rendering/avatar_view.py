@@ -10,6 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.rendering.api import rasterize
+from smplxpp.core.camera import Camera
+from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.data.views import View
@@ -35,7 +37,7 @@ class Rendering:
 def render_view(
     posed: PosedAvatar,
     index: int,
-    view: View,
+    view: View | Camera,
     background: Float[Tensor, " 3"],
     *,
     eps2d: float = 0.1,
@@ -45,11 +47,13 @@ def render_view(
     """Rasterise camera `index` of the posed avatar's C, through the pixels of `view`, with gradients.
 
     Args:
+        view: a photograph's camera, or a camera alone.
         background: the colour behind the person; normals and extra values have 0 there.
         eps2d: see `rasterize`.
         normals: draw the Gaussians' normals too. extra: D more values a Gaussian.
     """
     world = posed.gaussians
+    camera, viewmat, intrinsics = _camera_of(view, world.means)
     features = [posed.colors[index]]
     if normals:
         features.append(world.normals)
@@ -63,10 +67,10 @@ def render_view(
         world.scales,
         world.opacities,
         channels[None],
-        view.viewmat[None],
-        view.K[None],
-        view.camera.width,
-        view.camera.height,
+        viewmat[None],
+        intrinsics[None],
+        camera.width,
+        camera.height,
         background=behind,
         eps2d=eps2d,
         check=False,
@@ -78,3 +82,19 @@ def render_view(
         image[..., 3:6] if normals else None,
         None if extra is None else image[..., 3 + 3 * normals :],
     )
+
+
+def _camera_of(view: View | Camera, like: Tensor) -> tuple[Camera, Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
+    """Return the camera of a view, its `cam_from_world` and its intrinsics in pixels, on the device of `like`.
+
+    Raises:
+        InputError: an orthographic camera.
+    """
+    if not isinstance(view, Camera):
+        return view.camera, view.viewmat, view.K
+    if view.orthographic:
+        raise InputError(f"camera {view.name!r}", expected="a pinhole camera", received="an orthographic one")
+    cam_from_world, intrinsics = (
+        torch.tensor(matrix, dtype=torch.float32, device=like.device) for matrix in (view.cam_from_world, view.K)
+    )
+    return view, cam_from_world, intrinsics

@@ -18,9 +18,10 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.losses.perceptual import load_metric
 from avatar.models.model_file import load_avatar, save_avatar
-from avatar.models.open_student import StudentFiles, open_student
+from avatar.models.open_student import TRAINING_FILES, open_student
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.rig.rig import Rig
 from avatar.training.checks import check_training, note_missing_normals
 from avatar.training.engine.device import choose_device
 from avatar.training.engine.loop import Progress
@@ -42,21 +43,13 @@ from smplxpp.capture.declared import has_estimated_params
 from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.files.json_file import read_json
-from smplxpp.core.files.json_file import jsonable
+from smplxpp.core.files.json_file import jsonable, read_json
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_choice
 from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)
-FILES = StudentFiles(
-    template="template.npz",
-    student="compensate/student.safetensors",
-    garments="cloth/garments.npz",
-    reference="reference.npz",
-)
-"""Files of a training's folder from which a student is opened again."""
 _RECORD = "step.json"
 Report = Callable[[str, Progress], None]
 
@@ -119,13 +112,13 @@ def train(
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     # The template is trained on as it is read back, so that a student opened later stands on the same numbers.
-    template.save(folder / FILES.template)
-    template = Template.load(folder / FILES.template)
+    template.save(folder / TRAINING_FILES.template)
+    template = Template.load(folder / TRAINING_FILES.template)
     capture = hold_out_cameras(capture, config.hold_out)
     training = _Training(folder, config, recipe, report)
     reference = _reference_pose(capture, config.template_frame)
     if reference is not None:
-        reference.save(folder / FILES.reference)
+        reference.save(folder / TRAINING_FILES.reference)
     scene = prepare_scene(template, capture, built_frame=config.template_frame)
     _refuse_held_out_template(capture, config.template_frame)
     steps = [step for step in STEPS if step not in ({"cloth"} if recipe.cloth is None else ())]
@@ -137,7 +130,7 @@ def train(
         scene = prepare_scene(template, with_refined_poses(capture, found), built_frame=config.template_frame)
     note_missing_normals(scene.capture, recipe, steps)
     training.models(scene, reference)
-    return open_student(folder, FILES, device=training.device)
+    return open_student(folder, TRAINING_FILES, device=training.device)
 
 
 def _reference_pose(capture: Capture, frame: int | None) -> BodyParams | None:
@@ -169,6 +162,13 @@ def _refine(scene: TrainScene, config: Any, session: Session, folder: Path) -> P
     return Progress(1, 1, 0.0, 0.0)
 
 
+def _teacher(path: Path, rig: Rig) -> TeacherAvatar:
+    """Read a teacher that this training wrote."""
+    model = load_avatar(path, rig)
+    assert isinstance(model, TeacherAvatar)
+    return model
+
+
 class _Training:
     """The steps of a training in a folder, each made once and read back from its file.
 
@@ -184,6 +184,7 @@ class _Training:
         self.device = choose_device(config.device)
         self._together = Distributed(device=self.device)
         self._deadline = time.monotonic() + 60.0 * config.max_minutes
+        self._worked = False
         keep_freed_memory()
 
     @cached_property
@@ -232,9 +233,7 @@ class _Training:
             settings = {"training": training, "networks": preset.networks.teacher}
             source = self.once("teacher", settings, scene, {"gaussians": fitted}, teach) / "teacher.safetensors"
             needs = {"source": source}
-            read = load_avatar(source, rig)
-            assert isinstance(read, TeacherAvatar)
-            teacher = read
+            teacher = _teacher(source, rig)
             if self.recipe.cloth is not None:
                 # Clothes that leave skinning, cut for simulation and fitted to the followed surface.
                 how = self.recipe.cloth
@@ -252,8 +251,8 @@ class _Training:
         # The teacher's maps become motion of the student's mesh; new poses are shown with simulated clothes.
         def baked(session: Session, made: Path) -> Progress:
             # Each step has a teacher of its own: the bake freezes the one it is given.
-            own = None if teacher is None else load_avatar(source, rig)
-            start = gaussians if not isinstance(own, TeacherAvatar) else own.gaussians.snapshot()
+            own = None if teacher is None else _teacher(source, rig)
+            start = gaussians if own is None else own.gaussians.snapshot()
             model, done = bake(clothed, start, preset.student(), preset.bake, session, teacher=own)
             save_avatar(made / "student.safetensors", model)
             return done
@@ -265,10 +264,10 @@ class _Training:
         shapes = replace(self.recipe.shapes, expression_size=template.body.num_expressions)
 
         def compensated(session: Session, made: Path) -> Progress:
-            own = load_avatar(source, rig) if teacher is not None and preset.compensate.init_from_track else None
-            model, done = compensate(
-                clothed, load_avatar(bake_file, rig), shapes, preset.compensate, session, teacher=own
-            )
+            own = _teacher(source, rig) if teacher is not None and preset.compensate.init_from_track else None
+            start = load_avatar(bake_file, rig)
+            assert isinstance(start, Student)
+            model, done = compensate(clothed, start, shapes, preset.compensate, session, teacher=own)
             write_student(
                 made / "student.safetensors",
                 made / "student_compact.safetensors",
@@ -310,8 +309,9 @@ class _Training:
             log.info("%s: stands, skipped", step)
             return folder
         left = self._deadline - time.monotonic()
-        if left <= 0.0:
+        if left <= 0.0 and self._worked:
             raise UnfinishedTrainingError(f"the limit of time was over before {step}; the same call continues")
+        self._worked = True
         if self.config.force:
             shutil.rmtree(state, ignore_errors=True)
         session = Session(
@@ -319,7 +319,7 @@ class _Training:
             key,
             self._metric if step in ("teacher", "bake", "compensate") else None,
             self._together,
-            left,
+            max(left, 1e-9),  # each call takes one iteration at least
             tensorboard=self.config.tensorboard,
             report=lambda progress: self.report(step, progress),
         )
@@ -337,7 +337,7 @@ class _Training:
 
     def _key(self, settings: Mapping[str, Any], scene: TrainScene, needs: Mapping[str, Path]) -> str:
         """Return the digest of all that decides a step: settings, template, capture, earlier steps, version, device."""
-        files = {"template": self.folder / FILES.template, **needs}
+        files = {"template": self.folder / TRAINING_FILES.template, **needs}
         identity = {
             "version": version("smplxpp"),
             "device": self.device,

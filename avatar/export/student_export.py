@@ -1,0 +1,220 @@
+"""A student in a file of any kind: the bundle of our players, splats of a pose, and the step that makes them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
+from avatar.formats.splats import Splats, world_splats
+from avatar.models.open_student import load
+from avatar.models.student import Student
+from avatar.runtime import AvatarBundle, AvatarPlayer, load_bundle
+from avatar.runtime.bundle import SUFFIX
+from smplxpp.cloth.following import ways
+from smplxpp.core.errors import InputError
+from smplxpp.core.params import BodyParams
+
+_WRITERS = {
+    ".ply": "avatar.formats.ply:write_splat_ply",
+    ".spz": "avatar.formats.spz:write_splat_spz",
+    ".sog": "avatar.formats.sog:write_splat_sog",
+    ".glb": "avatar.formats.splat_gltf:write_splat_glb",
+}
+_MOVING = (".usdc", ".usda", ".usd")
+SUFFIXES = (SUFFIX, *_WRITERS, *_MOVING, ".onnx")
+"""Kinds of files that `export_student` writes."""
+
+
+def export_student(
+    student: Student,
+    path: str | Path,
+    *,
+    params: BodyParams | None = None,
+    cloth: Literal["simulate", "field", "skin"] = "simulate",
+    name: str | None = None,
+    licence: str = "",
+    exact: bool = False,
+) -> dict[str, Any]:
+    """Write a student to a file whose kind its suffix says, whole or not at all.
+
+    Args:
+        student: with its loose clothes and the pose of its scan, as `avatar.train` and `avatar.load` give it.
+        path: NAME.avatar (bundle), NAME.ply .spz .sog .glb (splats of a pose), NAME.usdc (splats that move), NAME.onnx.
+        params: of a bundle: the motion that it has to play; of splats: the pose (the first frame) or the motion. None:
+            the poses that training saw.
+        cloth: what moves loose clothes along `params` in splats: a simulation, the student's own field, or skinning.
+        name: of the avatar in a bundle; None: the student's.
+        licence: of the avatar, as the bundle states it.
+        exact: keep every number of a bundle in float32.
+
+    Returns:
+        "out", "bytes" of the file (of a bundle: by its pieces, and "total") and the number of "frames".
+
+    Raises:
+        InputError: another suffix, or parameters of another body.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"output {path}", expected=f"a name that ends with {', '.join(SUFFIXES)}", received=suffix)
+    if suffix == SUFFIX:
+        return export_bundle(student, path, name=name, licence=licence, motion=params, exact=exact)
+    bundle = bundle_of_student(student, exact=True)
+    frames = 1
+    if suffix == ".onnx":
+        import_module("avatar.formats.onnx_step").write_onnx(path, bundle=bundle)
+    else:
+        player = AvatarPlayer(bundle)
+        motion = params if params is not None else seen_poses(student)
+        motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
+        if suffix in _MOVING and params is not None:
+            frames = len(motion)
+        # Poses of the training are no motion in time: nothing is simulated along them.
+        mode = cloth if params is not None or cloth != "simulate" else "field"
+        splats = posed_splats_of(player, motion, range(frames), cloth=mode)
+        if suffix in _MOVING:
+            fps = (motion.fps or DEFAULT_FPS) if frames > 1 else None
+            import_module("avatar.formats.splat_usd").write_splat_usd(path, frames=splats, fps=fps)
+        else:
+            module, function = _WRITERS[suffix].split(":")
+            getattr(import_module(module), function)(path, splats=next(splats))
+    return {"out": str(path), "bytes": path.stat().st_size, "frames": frames}
+
+
+DEFAULT_FPS = 20.0
+"""Frames a second of poses that do not say how fast they come."""
+PRE_ROLL = 0.7
+"""Seconds of a motion before its first frame that loose clothes follow, so that they hang when it begins."""
+
+
+def posed_splats_of(
+    player: AvatarPlayer,
+    motion: BodyParams,
+    rows: range,
+    *,
+    cloth: str = "simulate",
+    notes: list[str] | None = None,
+) -> Iterator[Splats]:
+    """Yield the splats of rows of a motion; simulated clothes follow it from a moment before the first row.
+
+    Args:
+        player: of the avatar.
+        motion: body parameters.
+        rows: ascending.
+        cloth: what moves loose clothes: "simulate", "field" or "skin".
+        notes: receives the player's remarks on the simulation after the last row.
+    """
+    rate = motion.fps or DEFAULT_FPS
+    if cloth != "simulate" or not player.has_clothes:
+        skinned = player.skinned_clothes if cloth == "skin" else None
+        for k in rows:
+            yield world_splats(player.pose(motion.frame(k), cloth=skinned))
+        return
+    begin = max(0, rows[0] - round(PRE_ROLL * rate))
+    for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
+        posed = player.step(motion.frame(k), 1.0 / rate, way=way)
+        if k in rows:
+            yield world_splats(posed)
+    if notes is not None:
+        notes += player.said
+
+
+def export_bundle(
+    student: Student,
+    path: Path,
+    *,
+    name: str | None = None,
+    licence: str = "",
+    motion: BodyParams | None = None,
+    exact: bool = False,
+    provenance: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Write a student as a bundle for players, whole or not at all.
+
+    Args:
+        student: with its loose clothes.
+        path: NAME.avatar.
+        name, licence: of the avatar; no name: the student's.
+        motion: what it has to play; None: the poses that training saw.
+        exact: keep float32.
+        provenance: where it comes from; None: this version, and the digests of the student's files.
+
+    Returns:
+        The file ("out"), "bytes" of its pieces and "total", and the number of "frames" that it plays.
+    """
+    motion = seen_poses(student) if motion is None else motion
+    origin = student.origin
+    extras = BundleExtras(
+        name=name or origin.name,
+        licence=licence,
+        provenance={"made by": f"smplxpp {version('smplxpp')}", **origin.digests} if provenance is None else provenance,
+        garments=origin.garments,
+        motion=motion,
+    )
+    sizes = write_bundle(path, student, extras, BundleConfig(exact=exact))
+    return {"out": str(path), "bytes": sizes, "frames": 0 if motion is None else len(motion)}
+
+
+def seen_poses(student: Student) -> BodyParams | None:
+    """Return the poses that training saw, one after the other, standing as the scan stands; None: not known."""
+    if student.pose_gate is None:
+        return None
+    poses = student.pose_gate.poses.cpu().double().numpy()
+    reference = student.origin.reference
+    reference = BodyParams.rest(betas=0) if reference is None else reference
+    still = reference.select(np.zeros(len(poses), dtype=np.int64))
+    return replace(still, body_pose=poses, fps=reference.fps or DEFAULT_FPS)
+
+
+def bundle_of_student(student: Student, *, exact: bool = False) -> AvatarBundle:
+    """Return a student as a bundle in memory, as it would be read from its file.
+
+    Args:
+        student: with its loose clothes.
+        exact: keep every number in float32.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"student{SUFFIX}"
+        export_bundle(student, path, exact=exact)
+        return load_bundle(path)
+
+
+def open_bundle(source: Path, *, exact: bool = False) -> AvatarBundle:
+    """Read a bundle, or make one in memory of the student in a folder.
+
+    Args:
+        source: a bundle NAME.avatar, or a folder that `avatar.train` or `smplxpp train` wrote.
+        exact: make it with every number in float32.
+
+    Raises:
+        InputError: neither of them.
+    """
+    with bundle_file(source, exact=exact) as path:
+        return load_bundle(path)
+
+
+@contextmanager
+def bundle_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
+    """Give the file of a bundle: the source itself, or one made of the student in a folder for the block.
+
+    Args:
+        source, exact: see `open_bundle`.
+    """
+    if source.suffix.lower() == SUFFIX:
+        yield source
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"student{SUFFIX}"
+        student = load(source)
+        assert isinstance(student, Student)  # a folder holds no bundle
+        export_bundle(student, path, exact=exact)
+        yield path
