@@ -21,12 +21,18 @@ from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
 from pipelines.runs import gates
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
-from pipelines.stages.train_names import KINDS, kind_name
 from smplxpp.core.checks import Check
 
+KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
+"""Kinds of views that a training measures, by the words for them."""
 WAY_BACK = f"{TRACK}/{BACK}"
 BEFORE = {TRACK: "track_metrics.jsonl", WAY_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
 """Logs of what comes before a training, by its folder."""
+
+
+def kind_name(kind: str, *, held_out: bool) -> str:
+    """Return the words for a kind of views; without held-out cameras "novel" views are views that were trained on."""
+    return KINDS[kind] if held_out or kind != "novel_view" else "training views"
 
 
 def keep_logs(work: Path, folder: Path) -> None:

@@ -18,7 +18,7 @@ from smplxpp.capture.protocols import (
 )
 from smplxpp.capture.readers import simple
 from smplxpp.capture.recording import ParamSource
-from smplxpp.capture.sources import FrameParams, ParamFiles, StackedParams
+from smplxpp.capture.sources import ParamFiles, StackedParams
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import lies_in, same_place
 
@@ -125,6 +125,6 @@ def has_estimated_params(capture: Capture) -> bool:
         InputError: a declaration in other words than docs/captures.md has.
     """
     source = capture.recording.params
-    if isinstance(source, FrameParams):
-        return source.estimated
+    if source is not None and path_of_params(source) is None:  # in memory: a registration made them, unless they say
+        return bool(getattr(source, "estimated", True))
     return DeclaredInputs.of(capture).given_parameters(path_of_params(source)) == TRACKED

@@ -7,8 +7,8 @@ import pytest
 from avatar.evaluation.report import EvalReport, ModelFigures, Surfaces
 from avatar.metrics.surface_quality import SurfaceQuality
 from avatar.metrics.view_quality import ViewQuality
+from pipelines.runs import gates
 from pipelines.stages.evaluate import evaluation_checks
-from pipelines.stages.train_names import PSNR_FLOORS
 from smplxpp.core.checks import Check
 
 
@@ -32,8 +32,8 @@ def checks(psnr: float, *, fit: float | None = None, upper: float = 1.0, pixel: 
 
 @pytest.mark.parametrize(("above", "status"), [(0.1, "pass"), (-0.1, "warn"), (-2.1, "fail")])
 def test_psnr_has_a_floor(above, status):
-    warn, _ = PSNR_FLOORS["novel_view"]
-    assert checks(warn + above)["student, novel views: PSNR of the person"].status == status
+    floor = gates.PSNR["novel_view"].warn
+    assert checks(floor + above)["student, novel views: PSNR of the person"].status == status
 
 
 @pytest.mark.parametrize(("gain", "status"), [(1.0, "pass"), (-0.5, "warn"), (-1.5, "fail")])

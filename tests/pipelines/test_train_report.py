@@ -12,7 +12,7 @@ from pipelines.report import Report, write_report
 from pipelines.report.builder import readable
 from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.train_names import kind_name
+from pipelines.stages.train_results import kind_name
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.spread import spread
 from tests.dolls.dancing import write_dance, write_dance_run

@@ -14,7 +14,7 @@ from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import BAKE_STAGE, COMPENSATE_STAGE, TEACHER_STAGE, TRAIN_STAGES
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.train_names import KINDS, kind_name
+from pipelines.stages.train_results import KINDS, kind_name
 from smplxpp.core.spread import spread
 
 SHOWN_VIEWS = 4
