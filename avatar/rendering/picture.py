@@ -56,7 +56,7 @@ def render(
     center = torch.tensor(camera.position, dtype=torch.float32, device=device)
     behind = torch.tensor(background, dtype=torch.float32, device=device)
     with at_rest(avatar):
-        posed = avatar(avatar.rig.motion(params, frame=frame), center[None])
+        posed = avatar(avatar.rig.pose(params, frame=frame), center[None])
         return _eight_bit(render_view(posed, 0, camera, behind).image.cpu().numpy())
 
 
