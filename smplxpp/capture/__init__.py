@@ -1,4 +1,4 @@
-"""Captures on disk: one type for all data sets, cameras, and the reference frame that a template is built from."""
+"""Open captures of all data sets as one type, and find the reference frame that a template is built from."""
 
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.capture import Capture

@@ -1,4 +1,4 @@
-"""A cache bounded in bytes, one for each process."""
+"""Cache arrays within a bound in bytes, separately in each process."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ Arrays = tuple[np.ndarray, ...]
 
 
 class ArrayCache:
-    """Least recently used arrays are forgotten first; safe to use from several threads.
+    """A least-recently-used cache of arrays, safe to use from several threads.
 
-    Pickling (a loader's worker) carries the bound, not the content; a forked process starts empty. So every process
-    holds at most `max_bytes`, whatever the number of workers.
+    Pickling (for a worker of a data loader) keeps the bound, not the content, and a forked process starts empty. So
+    every process holds at most `max_bytes`.
+
+    Args:
+        max_bytes: bound of the size of all cached arrays.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -31,11 +34,11 @@ class ArrayCache:
 
     @property
     def held_bytes(self) -> int:
-        """Bytes of the arrays held now."""
+        """Total size of the cached arrays in bytes."""
         return self._bytes if self._process == os.getpid() else 0
 
     def get(self, key: Hashable, make: Callable[[], Arrays]) -> Arrays:
-        """The arrays of `key`, made if they are not here. Read-only: they are shared."""
+        """Return the arrays of `key`, making them if they are not cached; read-only, because they are shared."""
         if self._process != os.getpid():  # a lock that another thread held at the fork would never be released
             self._start()
         with self._lock:

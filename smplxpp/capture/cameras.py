@@ -1,4 +1,4 @@
-"""Camera files: a JSON list in OpenCV form, and ActorsHQ's calibration.csv."""
+"""Read camera files: a JSON list in OpenCV's convention, and ActorsHQ's calibration.csv."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy",
 
 
 def read_cameras(path: str | Path) -> list[Camera]:
-    """Cameras of `cameras.json` (`K`, `R`, `T` with x_cam = R x_world + T) or ActorsHQ's `calibration.csv`.
+    """Read the cameras of `cameras.json` (`K`, `R`, `T` with x_cam = R x_world + T) or ActorsHQ's `calibration.csv`.
 
     ActorsHQ stores camera-to-world rotation vectors and positions, and intrinsics in units of the image's size.
 
@@ -41,12 +41,12 @@ def read_cameras(path: str | Path) -> list[Camera]:
 
 
 def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
-    """Read what `read_cameras` reads, with each camera's lens; None: a pinhole.
+    """Read cameras like `read_cameras`, each with the distortion of its lens, None for a pinhole.
 
-    `dist` holds a lens's coefficients and `dist_model` its model, `opencv` unless told (`Distortion.from_opencv`).
+    `dist` holds the coefficients of a lens and `dist_model` its model, by default `opencv` (`Distortion.from_opencv`).
 
     Raises:
-        InputError: missing file, unknown layout, fields missing or of another type, a name given twice.
+        InputError: missing file, unknown layout, fields missing or of another type, a duplicate name.
     """
     path = Path(path)
     readers = {".csv": _read_actorshq, ".json": _read_opencv}

@@ -1,4 +1,4 @@
-"""Capture: cameras, frames read when they are asked for, masks, labels, parameters, splits."""
+"""Define Capture: cameras, images read on request, masks, labels, parameters, splits."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A recorded person. Made by `open_capture`; pickles, and works in the processes of a loader.
+    """A multi-view recording of a person; made by `open_capture`, and usable in workers of a data loader.
 
-    Images are decoded when they are asked for and kept in a cache bounded in bytes, one a process. `resized` and
-    `cropped` give captures of other pixels with cameras to match, over the same files and cache.
+    Images are decoded on request and cached within a bound in bytes in each process. `resized` and `cropped` return
+    captures with other pixels and matching cameras, over the same files and cache.
 
     Attributes:
-        recording: what was found on disk.
-        splits: cameras and frames to train on and to hold out.
-        windows: the part of each camera's image that is shown, and its size.
-        cache: decoded images.
-        excluded: (camera, frame) that are left out, None meaning all.
+        recording: files and calibration as found on disk.
+        splits: cameras and frames for training and for evaluation.
+        windows: shown part of each camera's image, and its size.
+        cache: cache of decoded images.
+        excluded: pairs (camera, frame) that are left out; None stands for all.
     """
 
     recording: Recording
@@ -61,47 +61,47 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the capture's folder or description."""
         return self.recording.name
 
     @property
     def root(self) -> Path:
-        """The folder."""
+        """Folder that the capture was opened from."""
         return self.recording.root
 
     @property
     def format(self) -> str:
-        """Name of the layout that it was read as."""
+        """Name of the layout that the folder was read as."""
         return self.recording.format
 
     @property
     def protocol(self) -> str | None:
-        """Name of the protocol whose files are read, None without one."""
+        """Name of the protocol whose files are read; None without one."""
         return self.recording.protocol
 
     @property
     def label_set(self) -> str:
-        """What the numbers of `labels` mean."""
+        """Name of the label set that defines the numbers of `labels`."""
         return self.recording.label_set
 
     @property
     def fps(self) -> float | None:
-        """Frames a second, None where the set does not say."""
+        """Frames per second; None if the data set does not state them."""
         return self.recording.fps
 
     @property
     def problems(self) -> tuple[Problem, ...]:
-        """What was left out on opening; `find_problems` looks into the files too."""
+        """Problems that were found on opening; `find_problems` also looks into the files."""
         return self.recording.problems
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
-        """Pinhole cameras of the images as they are given out (undistorted, resized, cropped)."""
+        """Pinhole cameras of the images after undistortion, resizing and cropping."""
         return {name: self.windows[name].camera(camera) for name, camera in self.recording.cameras.items()}
 
     @cached_property
     def frames(self) -> tuple[int, ...]:
-        """Frames with an image in any camera, or without images those with parameters; ascending."""
+        """Frames with an image in any camera, ascending; without images, the frames with parameters."""
         dropped = {frame for camera, frame in self.excluded if camera is None}
         return tuple(frame for frame in self.recording.frames() if frame not in dropped)
 
@@ -130,13 +130,13 @@ class Capture:
             >>> [finding.message for finding in check.findings if finding.status == "fail"]
             []
         """
-        # The check takes captures, so that it is imported when it is called, by name.
+        # `smplxpp.capture.check` imports this module, so that it is imported at the call.
         if body is None:
             body = import_module("smplxpp.body").load_body()
         return import_module("smplxpp.capture.check").check_capture(self, body, config, progress=progress)
 
     def file(self, camera: str, frame: int, kind: str = "image") -> Path | None:
-        """The file that a view is read from, None where there is none. Kinds: image, mask, label, normal."""
+        """Return the file of a view, None without one. Kinds: image, mask, label, normal."""
         require_choice("kind", kind, KINDS)
         self._full_camera(camera)
         if {(camera, frame), (None, frame), (camera, None)} & self.excluded:
@@ -145,7 +145,7 @@ class Capture:
         return None if series is None else series.path(frame)
 
     def required_file(self, camera: str, frame: int) -> Path:
-        """The image of a view.
+        """Return the image file of a view that must exist.
 
         Raises:
             InputError: no such camera, or no image.
@@ -160,7 +160,7 @@ class Capture:
         return path
 
     def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
-        """Tell which cameras have a file of which frame, without opening any."""
+        """Return for each camera and frame whether there is a file of a kind, without opening files."""
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
         numbers = np.array(self.frames, dtype=np.int64)
         for row, camera in enumerate(self.recording.cameras):
@@ -174,7 +174,7 @@ class Capture:
         return table
 
     def views(self, cameras: Iterable[str] | None = None, frames: Iterable[int] | None = None) -> list[tuple[str, int]]:
-        """The (camera, frame) of every image, among the given cameras and frames (None: all), frame by frame."""
+        """Return (camera, frame) of every image of the given cameras and frames (None: all), frame by frame."""
         names = list(self.recording.cameras)
         table = self.presence()
         wanted_cameras = set(names if cameras is None else cameras)
@@ -186,7 +186,7 @@ class Capture:
         return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
 
     def image(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
-        """The image of a view, sRGB as recorded, read-only.
+        """Return the image of a view, sRGB as recorded, read-only.
 
         Raises:
             InputError: no such camera, no file, a damaged file, or one of another size than the calibration's.
@@ -195,7 +195,7 @@ class Capture:
         return self._cached("image", camera, frame, lambda reader: (reader.color(path),))[0]
 
     def mask(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
-        """The opacity of the person, 255 inside; None where there is no mask. Read-only.
+        """Return the opacity of the person, 255 inside, read-only; None without a mask.
 
         Raises:
             InputError: no such camera, a damaged file, or one of another size.
@@ -206,14 +206,14 @@ class Capture:
         return self._cached("mask", camera, frame, lambda reader: (reader.alpha(path),))[0]
 
     def labels(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
-        """Numbers of the set `label_set`, resampled to the nearest; None where there is no map."""
+        """Return the label map in numbers of `label_set`, nearest neighbour; None without a map."""
         path = self.file(camera, frame, "label")
         if path is None:
             return None
         return self._cached("label", camera, frame, lambda reader: (reader.labels(path),))[0]
 
     def normals(self, camera: str, frame: int) -> Float32[np.ndarray, "H W 3"] | None:
-        """Unit normals in the world, 0 on the background; None where there is no map."""
+        """Return unit normals in the world, 0 on the background; None without a map."""
         path = self.file(camera, frame, "normal")
         if path is None:
             return None
@@ -222,7 +222,7 @@ class Capture:
     def composited(
         self, camera: str, frame: int, background: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> Float32[np.ndarray, "H W 3"]:
-        """The person on a plain background: (H, W, 3) float32 sRGB in [0, 1].
+        """Return the person on a plain background, (H, W, 3) float32 sRGB in [0, 1].
 
         `C = F + (1 - a) B` with a the mask and F the image times a, mixed in sRGB. For photographs F is formed before
         resampling; for images that a capture declares as composited on a colour c, `F = I - (1 - a) c`.
@@ -237,12 +237,12 @@ class Capture:
             transparent = 1.0 - alpha * np.float32(1 / 255)
             for channel in range(3):
                 out[..., channel] += transparent * colour[channel]
-            # JPEG's own errors may have left the product brighter than its opacity.
+            # Errors of JPEG may have left the product brighter than its opacity.
             np.minimum(out, 1.0, out=out)
         return out
 
     def foreground(self, camera: str, frame: int) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
-        """The person alone: (H, W, 3) uint8 colour times opacity, and (H, W) uint8 opacity; both read-only.
+        """Return colour times opacity, (H, W, 3) uint8, and opacity, (H, W) uint8, both read-only.
 
         Raises:
             InputError: as `composited`.
@@ -260,7 +260,7 @@ class Capture:
         return colour, opacity
 
     def params(self, frame: int) -> BodyParams | None:
-        """Body parameters of one frame, None where there are none.
+        """Return the body parameters of one frame, None without any.
 
         Raises:
             InputError: a damaged file, NaN or infinity in the frame.
@@ -271,10 +271,10 @@ class Capture:
         return source.read(frame)
 
     def keypoints(self, camera: str) -> Keypoints2D | None:
-        """What a detector saw in the images of a camera, in the pixels of `cameras[camera]`; None: nothing.
+        """Return the detected keypoints of a camera in pixels of `cameras[camera]`; None without any.
 
-        Points follow the images: undistorted, resized, cropped (those outside the window stay, with coordinates outside
-        of it), without the frames that are left out. Read anew at each call.
+        Points are undistorted, resized and cropped like the images (points outside the window keep coordinates outside
+        of it). Excluded frames are left out. The file is read at each call.
 
         Raises:
             InputError: no such camera, a damaged file.
@@ -290,15 +290,15 @@ class Capture:
         return shown_keypoints(found, full, self.windows[camera], self.recording.distortions.get(camera))
 
     def truth_mesh(self, frame: int) -> TriangleMesh | None:
-        """The true surface of a frame as the images show it, where the set has one; else None."""
+        """Return the true surface of a frame as the images show it; None if the data set has none."""
         return None if self.recording.meshes is None else self.recording.meshes.read(frame)
 
     def resized(self, scale: float) -> Capture:
-        """The same capture at `scale` times the resolution; sizes are rounded and the intrinsics follow."""
+        """Return the capture at `scale` times the resolution; sizes are rounded, and intrinsics match them."""
         return replace(self, windows={name: window.resized(scale) for name, window in self.windows.items()})
 
     def cropped(self, boxes: Mapping[str, tuple[int, int, int, int]]) -> Capture:
-        """The same capture with some cameras' images cut to x0, y0, x1, y1 (pixels of this capture's images)."""
+        """Return the capture with images of some cameras cropped to x0, y0, x1, y1 in pixels of this capture."""
         for camera in boxes:
             self._full_camera(camera)
         cut = {name: self.windows[name].cropped(box) for name, box in boxes.items()}
@@ -318,7 +318,7 @@ class Capture:
         return replace(self, recording=recording, splits=splits, excluded=frozenset(excluded))
 
     def reader(self, camera: str) -> ViewReader:
-        """Reads files of a camera into its window, past the cache."""
+        """Return the reader of a camera's files in its window, without the cache."""
         full, recording = self._full_camera(camera), self.recording
         return ViewReader(full, self.windows[camera], recording.distortions.get(camera), recording.background)
 

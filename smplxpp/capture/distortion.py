@@ -1,4 +1,4 @@
-"""Lens models, in OpenCV's parameters: where a lens puts points of the plane z = 1, and undistortion of images."""
+"""Model lens distortion with OpenCV's parameters on the plane z = 1, and undistort images."""
 
 from __future__ import annotations
 
@@ -15,19 +15,15 @@ from smplxpp.core.validation import require_choice
 from smplxpp.native import address, check_size, native_library
 
 OPENCV, FISHEYE, FOV = LENS_MODELS = ("opencv", "fisheye", "fov")
-"""Names of the models, as `dist_model` of cameras.json says them."""
+"""Names of the models in `dist_model` of cameras.json."""
 
-_NEWTON_STEPS = 12
-_BISECTIONS = 60
-# The farthest from the axis that a pinhole is asked to show: at 90 degrees its picture would have no end.
+# Largest angle from the axis that undistortion shows: at 90 degrees a pinhole image would be infinite.
 _WIDEST = np.radians(89.0)
-# A telephoto lens has large ones, since its radii are small.
-_LARGEST = 1e12
 _NO_LENS_REMEDY = "calibrate without thin prism and tilt, or undistort the images beforehand"
 
 
 class Distortion(ABC):
-    """A lens, between points of the plane z = 1 of the pinhole camera and points of the same plane as it draws them.
+    """Maps points of the plane z = 1 of the pinhole camera to their places after lens distortion, and back.
 
     Attributes:
         native_id: number of the model in the native library.
@@ -37,18 +33,18 @@ class Distortion(ABC):
 
     @abstractmethod
     def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """Where the lens puts points on the plane z = 1 of the pinhole camera; NaN where it does not show them."""
+        """Return the distorted points on the plane z = 1; NaN for points that the lens does not show."""
 
     @abstractmethod
     def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """Where the pinhole would have put points that the lens has put at `xy`: the inverse of `distort`.
+        """Return the undistorted points on the plane z = 1, the inverse of `distort`.
 
-        NaN for what no pinhole sees (89 degrees from the axis and more).
+        NaN for points that no pinhole shows (89 degrees from the axis and more).
         """
 
     @abstractmethod
     def native_parameters(self) -> Float64[np.ndarray, " P"]:
-        """The numbers that the native library takes for this model."""
+        """Return the parameters of this model for the native library."""
 
     @staticmethod
     def from_opencv(coefficients: Any, *, subject: str, model: str = OPENCV) -> Distortion | None:
@@ -57,17 +53,18 @@ class Distortion(ABC):
         Args:
             coefficients: `opencv`: k1, k2, p1, p2[, k3[, k4, k5, k6]]; `fisheye` (`cv2.fisheye`): k1, k2, k3, k4;
                 `fov`: omega, in radians.
-            subject: what messages call the camera.
+            subject: name of the camera in messages.
             model: one of `LENS_MODELS`.
 
         Raises:
             InputError: an unknown model, other values than finite numbers, another number of them (thin prism and tilt:
-                any beyond the eighth that is not zero), no field of view.
+                nonzero ones after the eighth), no field of view.
         """
         require_choice(f"{subject}: model of the lens", model, LENS_MODELS)
         values = as_numbers(coefficients, subject=f"{subject}: distortion").ravel()
-        if np.abs(values).max(initial=0.0) > _LARGEST:
-            raise _misfit(subject, f"coefficients of at most {_LARGEST:g}", values)
+        largest = 1e12  # telephoto lenses have large coefficients, because their radii are small
+        if np.abs(values).max(initial=0.0) > largest:
+            raise _coefficient_error(subject, f"coefficients of at most {largest:g}", values)
         if model == FISHEYE:
             return FisheyeDistortion.from_coefficients(values, subject=subject)
         if model == FOV:
@@ -84,7 +81,8 @@ class RationalDistortion(Distortion):
     `x_d = x q + 2 p1 x y + p2 (r^2 + 2 x^2)`, `y_d = y q + p1 (r^2 + 2 y^2) + 2 p2 x y`.
 
     Attributes:
-        radial: k1..k6. tangential: p1, p2.
+        radial: coefficients k1..k6.
+        tangential: coefficients p1, p2.
     """
 
     radial: tuple[float, float, float, float, float, float]
@@ -95,7 +93,7 @@ class RationalDistortion(Distortion):
     def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> RationalDistortion | None:
         """Read k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero."""
         if len(values) not in (0, 4, 5, 8, 12, 14) or values[8:].any():
-            raise _misfit(subject, "4, 5 or 8 finite coefficients k1 k2 p1 p2 k3 k4 k5 k6", values)
+            raise _coefficient_error(subject, "4, 5 or 8 finite coefficients k1 k2 p1 p2 k3 k4 k5 k6", values)
         if not values.any():
             return None
         full = np.zeros(8)
@@ -113,14 +111,14 @@ class RationalDistortion(Distortion):
         )
 
     def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """The inverse of `distort`, by Newton.
+        """Invert `distort` by twelve Newton steps with a numerical Jacobian.
 
-        Far outside of the picture, where a lens's polynomial folds back, there is no inverse and the result means
-        nothing.
+        Far outside of the image the polynomial is not monotonic, so that it has no inverse and the result is
+        meaningless.
         """
         target = np.asarray(xy, dtype=np.float64)
         found, step = target.copy(), 1e-6
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(12):
             value = self.distort(found)
             columns = [(self.distort(found + shift) - value) / step for shift in step * np.eye(2)]
             (a, c), (b, d) = (column.T for column in columns)
@@ -135,32 +133,32 @@ class RationalDistortion(Distortion):
 
 
 class _RadialDistortion(Distortion):
-    """A lens that moves points along the line to the middle alone."""
+    """A lens that moves points only along the line to the principal point."""
 
     @abstractmethod
-    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
-        """The distance from the middle at which the lens puts what is at `r`; NaN where it shows nothing."""
+    def distorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        """Return the distorted radius of points at radius `r`; NaN where the lens shows nothing."""
 
     @abstractmethod
-    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
-        """The inverse of `bent`; NaN where there is none."""
+    def undistorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        """Return the inverse of `distorted_radius`; NaN where there is none."""
 
     def distort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        return _scaled(xy, self.bent)
+        return _scaled_radially(xy, self.distorted_radius)
 
     def undistort(self, xy: Float[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        return _scaled(xy, self.unbent)
+        return _scaled_radially(xy, self.undistorted_radius)
 
 
 @dataclass(frozen=True)
 class FisheyeDistortion(_RadialDistortion):
     """OpenCV's fisheye (`cv2.fisheye`; Kannala and Brandt 2006): equidistant where all coefficients are 0.
 
-    With theta the angle from the axis: `r_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`. Beyond
-    the angle where that turns back (or 89 degrees) the lens counts as showing nothing.
+    With theta the angle from the axis: `r_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`. The lens
+    shows nothing from the angle on at which r_d decreases (or 89 degrees).
 
     Attributes:
-        k: k1..k4.
+        k: coefficients k1..k4.
     """
 
     k: tuple[float, float, float, float]
@@ -170,32 +168,34 @@ class FisheyeDistortion(_RadialDistortion):
     def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> FisheyeDistortion:
         """Read k1, k2, k3, k4; none at all are four zeros."""
         if len(values) not in (0, 4):
-            raise _misfit(subject, "4 finite coefficients k1 k2 k3 k4 of a fisheye", values)
+            raise _coefficient_error(subject, "4 finite coefficients k1 k2 k3 k4 of a fisheye", values)
         k1, k2, k3, k4 = values.tolist() or [0.0] * 4
         return FisheyeDistortion((k1, k2, k3, k4))
 
     @property
-    def reach(self) -> float:
-        """The angle from the axis, in radians, up to which the lens is one to one, at most 89 degrees."""
+    def max_angle(self) -> float:
+        """Angle from the axis, in radians, up to which r_d increases, at most 89 degrees."""
+        # The first positive root of the derivative of r_d, as a polynomial in theta^2.
         slope = [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.k, strict=True))]
         roots = np.asarray(np.polynomial.Polynomial(slope).trim(1e-15).roots(), dtype=np.complex128)
         turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
         return float(min(_WIDEST, np.sqrt(turns).min(initial=_WIDEST)))
 
-    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    def distorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         theta = np.arctan(r)
-        return np.where(theta <= self.reach, self._polynomial(theta), np.nan)
+        return np.where(theta <= self.max_angle, self._polynomial(theta), np.nan)
 
-    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
-        low, high = np.zeros_like(r), np.full_like(r, self.reach)
-        for _ in range(_BISECTIONS):
+    def undistorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+        low, high = np.zeros_like(r), np.full_like(r, self.max_angle)
+        # Bisection: 60 halvings reach the precision of float64.
+        for _ in range(60):
             middle = 0.5 * (low + high)
-            beyond = self._polynomial(middle) < r
-            low, high = np.where(beyond, middle, low), np.where(beyond, high, middle)
-        return np.where(r <= self._polynomial(np.array([self.reach])), np.tan(0.5 * (low + high)), np.nan)
+            outside = self._polynomial(middle) < r
+            low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        return np.where(r <= self._polynomial(np.array([self.max_angle])), np.tan(0.5 * (low + high)), np.nan)
 
     def native_parameters(self) -> Float64[np.ndarray, " P"]:
-        return np.array([*self.k, np.tan(self.reach)])
+        return np.array([*self.k, np.tan(self.max_angle)])
 
     def _polynomial(self, theta: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         t2, (k1, k2, k3, k4) = theta * theta, self.k
@@ -207,7 +207,7 @@ class FovDistortion(_RadialDistortion):
     """The field-of-view model (Devernay and Faugeras 2001): `r_d = atan(2 r tan(omega / 2)) / omega`.
 
     Attributes:
-        omega: the lens's field of view, in radians, above 0 and below pi.
+        omega: field of view of the lens, in radians, above 0 and below pi.
     """
 
     omega: float
@@ -217,13 +217,13 @@ class FovDistortion(_RadialDistortion):
     def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> FovDistortion | None:
         """Read omega; None for 0, which is a pinhole."""
         if len(values) != 1 or not 0 <= values[0] < np.pi:
-            raise _misfit(subject, "one angle omega from 0 to below pi", values)
+            raise _coefficient_error(subject, "one angle omega from 0 to below pi", values)
         return FovDistortion(float(values[0])) if values[0] > 0 else None
 
-    def bent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    def distorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         return np.arctan(r * self._slope) / self.omega
 
-    def unbent(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    def undistorted_radius(self, r: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
         plane = np.tan(np.minimum(r * self.omega, _WIDEST)) / self._slope
         return np.where((r * self.omega < _WIDEST) & (plane < np.tan(_WIDEST)), plane, np.nan)
 
@@ -244,25 +244,25 @@ def undistort(
     size: tuple[int, int],
     nearest: bool = False,
 ) -> UInt8[np.ndarray, "h w *C"]:
-    """The image that a pinhole camera would have taken; bilinear, black where the source does not reach.
+    """Return the image of a pinhole camera, resampled bilinearly, black where the source has no pixels.
 
     Args:
-        image: (H, W) or (H, W, C) uint8, as the lens drew it.
-        distortion: the lens.
+        image: (H, W) or (H, W, C) uint8, distorted.
+        distortion: distortion of the lens.
         source_K: (3, 3) intrinsics of `image`, pixel centres at +0.5.
         target_K: (3, 3) intrinsics of the result.
         size: width and height of the result.
         nearest: take the nearest pixel, for labels.
 
     Raises:
-        InputError: an image without pixels or beyond 65536 a side; intrinsics that cannot be inverted.
+        InputError: an image without pixels or with sides over 65536; intrinsics that cannot be inverted.
     """
     image = np.ascontiguousarray(image, dtype=np.uint8)
     width, height = size
     for columns, rows in ((image.shape[1], image.shape[0]), size):
         check_size(columns, rows, "image to undistort")
     channels = 1 if image.ndim == 2 else image.shape[2]
-    if channels not in (1, 3):  # the kernel knows grey and colour
+    if channels not in (1, 3):  # the kernel takes one or three channels
         planes = [
             undistort(plane, distortion, source_K=source_K, target_K=target_K, size=size, nearest=nearest)
             for plane in np.moveaxis(image, 2, 0)
@@ -270,6 +270,7 @@ def undistort(
         return np.stack(planes, axis=2) if planes else np.empty((height, width, 0), np.uint8)
     if np.linalg.det(target_K) == 0:
         raise InputError("intrinsics of the undistorted image", expected="focal lengths that are not 0", received="0")
+    # The kernel maps each pixel of the result to the plane z = 1, distorts it there, and samples the source.
     out = np.empty((height, width, *image.shape[2:]), dtype=np.uint8)
     inverse = np.ascontiguousarray(np.linalg.inv(target_K)[:2], dtype=np.float64)
     K = np.ascontiguousarray(np.asarray(source_K)[:2], dtype=np.float64)
@@ -291,8 +292,8 @@ def undistort(
     return out
 
 
-def _scaled(xy: Float[np.ndarray, "N 2"], change: Any) -> Float64[np.ndarray, "N 2"]:
-    """Points at another distance from the middle, in the same direction."""
+def _scaled_radially(xy: Float[np.ndarray, "N 2"], change: Any) -> Float64[np.ndarray, "N 2"]:
+    """Scale points to the radius that `change` returns, in the same direction."""
     points = np.asarray(xy, dtype=np.float64)
     r = np.linalg.norm(points, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -300,6 +301,6 @@ def _scaled(xy: Float[np.ndarray, "N 2"], change: Any) -> Float64[np.ndarray, "N
     return points * factor[:, None]
 
 
-def _misfit(subject: str, expected: str, received: Float64[np.ndarray, " N"]) -> InputError:
+def _coefficient_error(subject: str, expected: str, received: Float64[np.ndarray, " N"]) -> InputError:
     text = str(received.tolist())[:200]
     return InputError(f"{subject}: distortion", expected=expected, received=text, remedy=_NO_LENS_REMEDY)

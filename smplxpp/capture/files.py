@@ -1,4 +1,4 @@
-"""Numbered files of a folder, held compactly: a capture may have a million of them."""
+"""Find the numbered files of a folder and hold them compactly, because a capture may have a million files."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from jaxtyping import Bool, Int, Int64, Shaped
 
 from smplxpp.core.errors import InputError
 
+# Largest frame number, above which float64 does not hold every integer.
 _LAST_FRAME = 1 << 53
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 
 
 @dataclass(frozen=True, eq=False)
 class FileSeries:
-    """The file of each frame.
+    """The files of a camera or capture by frame number.
 
     Attributes:
-        folder: what the names are relative to.
-        numbers: (F,) int64 frames, ascending.
+        folder: folder that the names are relative to.
+        numbers: (F,) int64 frame numbers, ascending.
         names: (F,) bytes, the encoded path of each file below `folder`. Fixed-width bytes take a tenth of the memory
             of a dictionary of paths.
     """
@@ -37,7 +38,7 @@ class FileSeries:
         """Make a series of the file name of each frame.
 
         Raises:
-            InputError: a frame's number beyond 2^53, which is none.
+            InputError: a frame number over 2^53.
         """
         if max(names, default=0) > _LAST_FRAME:
             raise InputError(f"frames of {folder}", expected=f"numbers up to {_LAST_FRAME}", received=f"{max(names)}")
@@ -47,9 +48,9 @@ class FileSeries:
 
     @staticmethod
     def find(folder: Path, pattern: str) -> FileSeries:
-        """Files of `folder` whose whole name matches `pattern`; its group `frame` is the number. May be empty.
+        """Find the files of `folder` whose whole name matches `pattern` with a group `frame`; may be empty.
 
-        Of two files with one number the first in alphabetical order counts; numbers beyond 2^53 are no frames'.
+        Of two files with one number the first in alphabetical order is taken; numbers over 2^53 are ignored.
         """
         compiled = re.compile(pattern)
         found: dict[int, str] = {}
@@ -69,17 +70,17 @@ class FileSeries:
         return len(self.numbers)
 
     def path(self, frame: int) -> Path | None:
-        """The file of a frame, None where there is none."""
+        """Return the file of a frame, None without one."""
         index = int(np.searchsorted(self.numbers, frame))
         if index == len(self.numbers) or self.numbers[index] != frame:
             return None
         return self.folder / os.fsdecode(bytes(self.names[index]))
 
     def required(self, frame: int) -> Path:
-        """The file of a frame that is among `numbers`.
+        """Return the file of a frame that must exist.
 
         Raises:
-            InputError: there is none.
+            InputError: no file of this frame.
         """
         path = self.path(frame)
         if path is None:
@@ -87,22 +88,22 @@ class FileSeries:
         return path
 
     def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
-        """Tell which of the frames have a file."""
+        """Return for each frame whether it has a file."""
         return np.isin(frames, self.numbers)
 
     def only(self, keep: Bool[np.ndarray, " F"]) -> FileSeries:
-        """The files selected by a (F,) bool array."""
+        """Return the files that a (F,) bool array selects."""
         return FileSeries(self.folder, self.numbers[keep], self.names[keep])
 
 
 def image_name(before: str = "", *, after: str = "", suffixes: Sequence[str] = IMAGE_SUFFIXES) -> str:
-    """Pattern of a file's name: `before`, the frame's digits, the pattern `after`, a suffix in either case."""
+    """Return a pattern of file names: `before`, the digits of the frame, the pattern `after`, a suffix of any case."""
     endings = "|".join(re.escape(suffix[1:]) for suffix in suffixes)
     return rf"{re.escape(before)}(?P<frame>\d+){after}\.(?i:{endings})"
 
 
 def subfolders(folder: Path) -> list[str]:
-    """Names of the folders in a folder, sorted; none if it does not exist."""
+    """Return the sorted names of the folders in a folder; none if it does not exist."""
     if not folder.is_dir():
         return []
     with os.scandir(folder) as entries:

@@ -1,6 +1,6 @@
-"""Keypoints of detectors from their files: OpenPose, EasyMocap, mmpose, COCO, MediaPipe, and our own npz.
+"""Read keypoint files of OpenPose, EasyMocap, mmpose, COCO and MediaPipe, and this project's npz.
 
-One file of all frames or a folder with a file a frame; docs/captures.md says what is in them.
+Keypoints are one file of all frames or a folder with a file for each frame; docs/captures.md describes the layouts.
 """
 
 from __future__ import annotations
@@ -32,21 +32,20 @@ from smplxpp.core.validation import require_choice
 KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")
 _SUFFIXES = (".npz", ".json")
-_MOST_FRAMES = 1 << 53
 
 
 @dataclass(frozen=True)
 class KeypointOptions:
-    """How files of keypoints are read.
+    """Options for reading keypoint files.
 
     Attributes:
-        format: None or "auto": told by the content. OpenPose's BODY_25B has as many points as BODY_25 and must be named
-            `openpose-25b`.
-        person: the one to take, by the file's id or else the place in its list; None: in each frame the one with the
+        format: "auto" recognises the format by the content, except OpenPose's BODY_25B, which has as many points as
+            BODY_25 and must be named `openpose-25b`.
+        person: id of the person in the file, else the index in its list; None: in each frame the person with the
             greatest sum of confidences.
-        size: width and height of the images, for MediaPipe's shares of them.
-        first_frame: number of the first frame that is found; the others follow at their distances. None: as in the
-            files (mmpose counts a video's frames from 1).
+        size: width and height of the images, for MediaPipe's normalised coordinates.
+        first_frame: number of the first frame, to which all frames are shifted. None: as in the files (mmpose counts
+            the frames of a video from 1).
     """
 
     format: KeypointFormat = "auto"
@@ -59,14 +58,14 @@ class KeypointOptions:
 
 
 def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> Keypoints2D:
-    """Read the keypoints of one camera; pixels as they lie on disk (distorted where the images are), centres at +0.5.
+    """Read the keypoints of one camera, in pixels of the images on disk (distorted if they are), centres at +0.5.
 
     Args:
-        path: one file of all frames, or a folder with a JSON file a frame, whose last number is the frame.
-        options: how.
+        path: one file of all frames, or a folder with a JSON file for each frame, whose last number is the frame.
+        options: format, person and image size.
 
     Raises:
-        InputError: nothing there, a damaged file, an unknown layout, other numbers of points than the layout has.
+        InputError: no file, a damaged file, an unknown layout, or another number of points than the layout has.
     """
     path, options = Path(path), options or KeypointOptions()
     try:
@@ -83,10 +82,12 @@ def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> 
 
 @dataclass(frozen=True, eq=False)
 class KeypointFiles:
-    """Keypoints by camera; one place, a file or a folder, for each camera that has them.
+    """Keypoint files by camera, read on request.
 
     Attributes:
-        places: by camera. options: how they are read. sizes: of the images on disk.
+        places: file or folder of each camera with keypoints.
+        options: options for reading.
+        sizes: width and height of each camera's images on disk.
     """
 
     places: Mapping[str, Path]
@@ -94,11 +95,11 @@ class KeypointFiles:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that have keypoints."""
+        """Return the names of the cameras with keypoints."""
         return tuple(self.places)
 
     def read(self, camera: str) -> Keypoints2D | None:
-        """Read a camera's keypoints, None where there are none.
+        """Read the keypoints of a camera, None without any.
 
         Raises:
             InputError: as `read_keypoints`.
@@ -111,12 +112,12 @@ class KeypointFiles:
 
 
 def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str, Path]:
-    """Find what belongs to each camera: the folder of its name, or the file (`CAM.npz`, `CAM.json`, `CAM_more.json`,
+    """Find the keypoints of each camera: the folder of its name, or the file (`CAM.npz`, `CAM.json`, `CAM_more.json`,
     `results_CAM.json`).
 
     Args:
-        folder: holds a file or a folder for each camera.
-        cameras: their names; None: every folder with files in it, and every file, is a camera.
+        folder: folder with a file or a folder for each camera.
+        cameras: names of the cameras; None: every file and every folder belongs to a camera.
     """
     inside = set(subfolders(folder))
     files = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
@@ -142,7 +143,7 @@ def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
     if path.suffix.lower() == ".npz" and path.is_file():
         arrays = safe_npz(path)
         if "joint_names" in arrays and options.format in ("auto", "simple"):
-            return _ours(arrays, path)
+            return _own_layout(arrays, path)
         frames = dict(_mediapipe_arrays(arrays, path, options))
     elif path.is_dir():
         frames = {}
@@ -163,7 +164,7 @@ def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
 
 
 def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Keypoints2D:
-    """The chosen person of each frame, in one table; frames without are all 0."""
+    """Join the chosen person of each frame into one table; frames without one are all 0."""
     chosen = {number: chosen_person(people, options.person) for number, people in frames.items()}
     if options.person is not None and not any(chosen.values()):
         ids = sorted({-1 if one.id is None else one.id for people in frames.values() for one in people})
@@ -179,7 +180,8 @@ def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Key
     return Keypoints2D(names, np.array(numbers, dtype=np.int64) + shift, table[..., :2], table[..., 2])
 
 
-def _ours(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
+def _own_layout(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
+    """Read this project's layout: `keypoints` (frames, K, 3), `joint_names` and perhaps `frames`."""
     values = np.asarray(arrays.get("keypoints"), dtype=np.float64)
     names = tuple(str(name) for name in np.ravel(arrays["joint_names"]))
     if values.ndim != 3 or values.shape[1:] != (len(names), 3):
@@ -194,7 +196,8 @@ def _ours(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
 
 
 def _frames(content: Any, number: int, options: KeypointOptions, *, source: str) -> Iterator[tuple[int, list[Person]]]:
-    """The people of each frame of a JSON file; `number` is the frame of a file that does not say one."""
+    """Yield the people of each frame of a JSON file; `number` is the frame of a file without frame numbers."""
+    # One branch for each format: some hold one frame, others a list of frames or of detections.
     kind = _kind(content) if options.format == "auto" else options.format
     if kind in ("openpose", "openpose-25b"):
         yield number, openpose_people(content, body_25b=kind == "openpose-25b", source=source)
@@ -209,6 +212,7 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
         else:
             yield number, mmpose_people(entries, source=source)
     elif kind == "coco":
+        # A flat list of detections: gather those of one image.
         by_image: dict[int, list[Person]] = {}
         for entry in content["annotations"] if isinstance(content, Mapping) else content:
             image = entry["image_id"]
@@ -227,7 +231,7 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
 
 
 def _kind(content: Any) -> str:
-    """Tell the format by the keys of a JSON file; "" where none fits."""
+    """Recognise the format by the keys of a JSON file; "" if none fits."""
     if isinstance(content, Mapping):
         for key, kind in (("people", "openpose"), ("annots", "easymocap"), ("instance_info", "mmpose")):
             if key in content:
@@ -268,20 +272,20 @@ def _mediapipe_arrays(
 
 
 def _frame_numbers(arrays: Mapping[str, Any], count: int, path: Path) -> np.ndarray:
-    """The numbers of the frames in an npz file, 0, 1, ... where it has none."""
+    """Return the frame numbers in an npz file, or 0, 1, ... without any."""
     if "frames" not in arrays:
         return np.arange(count)
     numbers = as_numbers(np.ravel(arrays["frames"]), (count,), subject=f"file {path}: frames")
-    if numbers.size and not (np.abs(numbers).max() < _MOST_FRAMES and np.array_equal(numbers, np.rint(numbers))):
+    if numbers.size and not (np.abs(numbers).max() < 1 << 53 and np.array_equal(numbers, np.rint(numbers))):
         raise InputError(f"file {path}: frames", expected="whole numbers", received=f"{numbers[:5].tolist()}, ...")
     return numbers.astype(np.int64)
 
 
 def _last_number(path: Path) -> int:
-    """The last number of a file's name.
+    """Return the last number in a file name.
 
     Raises:
-        InputError: it has none.
+        InputError: a name without a number.
     """
     numbers = re.findall(r"\d+", path.stem)
     if not numbers:

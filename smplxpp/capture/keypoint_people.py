@@ -1,6 +1,7 @@
-"""What one file of a detector says of one image: its people, with their points in the names of `Keypoints2D`.
+"""Read the people that a detector found in one image, with points named as in `Keypoints2D`.
 
-Pixel centres of OpenPose, EasyMocap, COCO and mmpose are at whole numbers, ours at +0.5: half a pixel is added.
+OpenPose, EasyMocap, COCO and mmpose put pixel centres at whole numbers, this project at +0.5, so that half a pixel is
+added.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from smplxpp.body.keypoint_names import (
 )
 from smplxpp.core.errors import InputError
 
-_HALF = 0.5
-# Lists of one person in OpenPose's and in EasyMocap's files, with the orders by their lengths.
+_HALF = 0.5  # pixels between the two conventions of pixel centres
+# Keys of hands and face in OpenPose's and EasyMocap's files, with the orders of points by their number.
 _FACES = {len(order): order for order in (FACE_68, FACE_70)} | {len(FACE): FACE}
 _OPENPOSE = {
     "hand_left_keypoints_2d": {21: LEFT_HAND},
@@ -36,26 +37,23 @@ _OPENPOSE = {
 }
 _EASYMOCAP = {"handl2d": {21: LEFT_HAND}, "handr2d": {21: RIGHT_HAND}, "face2d": _FACES}
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")
-_VISIBILITY = 3
-# Coordinates of MediaPipe beyond this share of the image's size are pixels.
-_NORMALISED_BOUND = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """Points of one person in one image: u, v in our pixels and confidence, 0 where there is none."""
+    """Points of one person in one image: u, v in pixels (centres at +0.5) and confidence, 0 for missing points."""
 
     points: Mapping[str, Float64[np.ndarray, " 3"]]
     id: int | None = None
 
     @property
     def confidence(self) -> float:
-        """The sum over all points."""
+        """Sum of the confidences of all points."""
         return float(sum(point[2] for point in self.points.values()))
 
 
 def chosen_person(people: Sequence[Person], person: int | None) -> Person | None:
-    """The one with the id `person`, or at that place in the list where the file has no ids; None: the surest one."""
+    """Return the person with the id `person` (index, if the file has no ids); None: the one of most confidence."""
     if person is None:
         return max(people, key=lambda one: one.confidence, default=None)
     ids = [one.id if one.id is not None else place for place, one in enumerate(people)]
@@ -123,10 +121,10 @@ def mediapipe_person(
 
     Args:
         parts: `pose` (33), `face` (468, or 478 with irises), `left_hand`, `right_hand` (21): each rows of x, y and
-            perhaps z, visibility, or objects with these names; None or NaN where nothing was found.
-        size: width and height of the image, for shares of it.
-        normalised: x and y are shares of the image's size; None: told by their range.
-        source: for messages.
+            perhaps z, visibility, or objects with these names; None or NaN for undetected parts.
+        size: width and height of the image, for normalised coordinates.
+        normalised: whether x and y are fractions of the image size; None: decided by their range.
+        source: name of the file in messages.
     """
     orders = {"pose": MEDIAPIPE_POSE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
     points: dict[str, np.ndarray] = {}
@@ -135,8 +133,9 @@ def mediapipe_person(
         if rows is None:
             continue
         if normalised is None:
+            # Normalised coordinates may leave the image by a few sizes; larger ones are pixels.
             seen = rows[rows[:, 2] > 0, :2]
-            shares = bool(len(seen)) and float(np.abs(seen).max()) < _NORMALISED_BOUND
+            shares = bool(len(seen)) and float(np.abs(seen).max()) < 4.0
         else:
             shares = normalised
         if shares:
@@ -148,6 +147,7 @@ def mediapipe_person(
                     remedy="give --size WIDTHxHEIGHT, or the capture",
                 )
             rows[:, :2] *= size
+        # A face has hundreds of points; the named ones are means of a few of them.
         if name == "face":
             if len(rows) not in (468, 478):
                 raise InputError(f"{source}: face", expected="468 or 478 points", received=f"{len(rows)}")
@@ -159,7 +159,7 @@ def mediapipe_person(
 
 
 def landmark_rows(value: Any, *, source: str) -> Float64[np.ndarray, "N 3"] | None:
-    """Rows of x, y, confidence of MediaPipe's landmarks; confidence is the visibility where there is one, else 1."""
+    """Return rows of x, y, confidence of MediaPipe's landmarks; confidence is the visibility, or 1 without one."""
     if isinstance(value, Mapping):
         value = value.get("landmark", value.get("landmarks"))
     if value is None or not len(value):
@@ -169,7 +169,8 @@ def landmark_rows(value: Any, *, source: str) -> Float64[np.ndarray, "N 3"] | No
     rows = np.asarray(value, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] < 2:
         raise InputError(source, expected="rows of x, y[, z[, visibility]]", received=f"shape {rows.shape}")
-    visibility = rows[:, _VISIBILITY] if rows.shape[1] > _VISIBILITY else np.ones(len(rows))
+    # Columns are x, y, z, visibility.
+    visibility = rows[:, 3] if rows.shape[1] > 3 else np.ones(len(rows))
     there = np.isfinite(rows[:, :2]).all(axis=1) & np.isfinite(visibility)
     out = np.concatenate([rows[:, :2], visibility[:, None]], axis=1)
     out[~there] = 0.0
@@ -181,7 +182,7 @@ def _with_25b(body_25b: bool) -> dict[int, Order]:
 
 
 def _named(rows: Any, orders: Mapping[int, Order], *, source: str, shift: float = 0.0) -> dict[str, np.ndarray]:
-    """Points by name; confidences are cut to [0, 1] (detectors' scores are a little above 1 at times)."""
+    """Name the points, and clip confidences to [0, 1] (scores of detectors may slightly exceed 1)."""
     values = np.asarray(rows, dtype=np.float64).reshape(-1, 3)
     if len(values) not in orders:
         counts = " or ".join(str(count) for count in orders)

@@ -1,4 +1,4 @@
-"""Keypoints of a capture: where they lie, and where its images show them."""
+"""Find the keypoint files of a capture, and map keypoints into its images."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from smplxpp.core.keypoints import Keypoints2D
 
 
 def with_keypoints(recording: Recording, folder: Path, options: KeypointOptions | None = None) -> Recording:
-    """The recording with its keypoints taken from `folder` alone: a file or a folder for each camera, any layout.
+    """Return the recording with keypoints from `folder` only: a file or folder for each camera, in any layout.
 
     Raises:
-        InputError: no such folder, or nothing in it of any camera.
+        InputError: no such folder, or no keypoints of any camera in it.
     """
     if not folder.is_dir():
         raise InputError("folder of keypoints", expected="an existing folder", received=str(folder))
@@ -40,7 +40,7 @@ def with_keypoints(recording: Recording, folder: Path, options: KeypointOptions 
 def found_keypoints(
     folder: Path, cameras: Mapping[str, Camera], *, format: KeypointFormat, person: int | None
 ) -> KeypointFiles | None:
-    """A layout's own keypoints, where its folder of them is there."""
+    """Return the keypoints that a data set contains; None without its folder of keypoints."""
     if not folder.is_dir():
         return None
     files = _files(folder, cameras, KeypointOptions(format=format, person=person))
@@ -48,7 +48,7 @@ def found_keypoints(
 
 
 def shown_keypoints(found: Keypoints2D, full: Camera, window: Window, distortion: Distortion | None) -> Keypoints2D:
-    """Where a window of the undistorted image shows points of the image on disk."""
+    """Map keypoints of the image on disk into a window of the undistorted image."""
     if distortion is not None:
         found = moved_keypoints(found, full, distortion.undistort)
     x0, y0 = window.box[:2]
@@ -58,7 +58,7 @@ def shown_keypoints(found: Keypoints2D, full: Camera, window: Window, distortion
 def moved_keypoints(
     found: Keypoints2D, camera: Camera, change: Callable[[Float64[np.ndarray, "N 2"]], Float64[np.ndarray, "N 2"]]
 ) -> Keypoints2D:
-    """Keypoints after a change on the plane z = 1; those that it leaves nowhere (NaN) have confidence 0."""
+    """Apply a map of the plane z = 1 to keypoints; points that it maps to NaN get confidence 0."""
     there, K = found.confidence > 0, camera.K
     plane = change((found.points[there] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
     points, confidence = found.points.copy(), found.confidence.copy()

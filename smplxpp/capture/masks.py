@@ -20,15 +20,15 @@ from smplxpp.core.files.onnx_file import OnnxModel
 
 
 def with_masks(recording: Recording, folder: Path) -> Recording:
-    """The recording with its masks taken from `folder` alone.
+    """Return the recording with masks from `folder` only.
 
-    A matte belongs to the image whose name it bears, with or without something behind it (`IMAGE.png`,
-    `IMAGE_alpha.png`), else to the frame whose number ends its name (`CAM_mask000012.png`, `000012.png`). Mattes are
-    in a folder for each camera, or all in one, where their names start with the camera's. The file's alpha channel
-    counts if it has one (cut-outs), else its brightness.
+    A matte belongs to the image of the same name, with or without a suffix (`IMAGE.png`, `IMAGE_alpha.png`), else to
+    the frame whose number ends its name (`CAM_mask000012.png`, `000012.png`). Mattes are in a folder for each camera,
+    or all in one folder with names that start with the camera's name. The alpha channel of a file is taken if it has
+    one (cut-outs), else its brightness.
 
     Raises:
-        InputError: no such folder, no matte of any image.
+        InputError: no such folder, or no matte of any image.
     """
     if not folder.is_dir():
         raise InputError("folder of masks", expected="an existing folder", received=str(folder))
@@ -52,6 +52,7 @@ def with_masks(recording: Recording, folder: Path) -> Recording:
 
 
 def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> dict[int, str]:
+    """Return the file name of the matte of each frame; in a shared folder names start with the camera's name."""
     by_stem = {images.required(int(number)).stem: int(number) for number in images.numbers}
     known = set(by_stem.values())
     found: dict[int, str] = {}
@@ -74,7 +75,7 @@ def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> di
 
 
 def _by_image(stem: str, by_stem: Mapping[str, int]) -> int | None:
-    """The frame of the image with this name, or with this name up to a `.`, `_` or `-`."""
+    """Return the frame of the image with this name, or with this name up to a `.`, `_` or `-`."""
     while stem not in by_stem:
         shorter = re.sub(r"[._-][^._-]*$", "", stem)
         if shorter == stem:
@@ -83,20 +84,20 @@ def _by_image(stem: str, by_stem: Mapping[str, int]) -> int | None:
     return by_stem[stem]
 
 
-# Side of the square that models of free input size are fed with.
-_DEFAULT_SIDE = 1024
-_LONGEST_SIDE = 8192
+# Pixels of the sides of a model's input: of a free one, and the largest accepted.
+_FREE_SIDE, _MAX_SIDE = 1024, 8192
 _FLOATS: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 @dataclass(frozen=True)
 class MattingConfig:
-    """How images are put to the model.
+    """Preprocessing of images for a matting model.
 
     Attributes:
-        mean, std: (3,) of the normalisation `(rgb - mean) / std` with rgb in [0, 1]; ImageNet's, as BiRefNet, ISNet's
-            descendants and most others were trained with.
-        threads: of the model's computation.
+        mean: (3,) of the normalisation `(rgb - mean) / std` with rgb in [0, 1]. The default is that of ImageNet, with
+            which BiRefNet, ISNet's descendants and most others were trained.
+        std: (3,) of the same normalisation.
+        threads: number of threads of the computation.
     """
 
     mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
@@ -105,10 +106,10 @@ class MattingConfig:
 
 
 class MattingModel:
-    """An ONNX model that takes a (1, 3, H, W) float image; of what it gives, the first matte of H x W values counts.
+    """An ONNX model of the user that takes a (1, 3, H, W) float image; its first output of H x W values is the matte.
 
-    The matte's values are read as opacities if they lie in [0, 1], otherwise as logits. The image is stretched to the
-    model's input (or to 1024 x 1024 where that is free) and the matte back.
+    Values of the matte are opacities if they lie in [0, 1], otherwise logits. The image is stretched to the model's
+    input (1024 x 1024 if that is free), and the matte is stretched back.
 
     Raises:
         MissingExtraError: onnxruntime is not installed.
@@ -124,21 +125,20 @@ class MattingModel:
         if len(sizes) != 1 or sizes[0] is None:
             raise InputError(
                 self._subject,
-                expected=f"one input of floats of shape (1, 3, H, W), sides of at most {_LONGEST_SIDE}",
+                expected=f"one input of floats of shape (1, 3, H, W), sides of at most {_MAX_SIDE}",
                 received=f"{[(one.name, one.type, one.shape) for one in entries]}"[:400],
             )
         self._name, self._dtype, self._size = entries[0].name, _FLOATS[entries[0].type], sizes[0]
 
     @staticmethod
     def _size_of(entry: Any) -> tuple[int, int] | None:
-        """Width and height that an input asks for; None where it is no image of floats. Sides that are no numbers are
-        free."""
+        """Return width and height of an input; None if it is no image of floats. Symbolic sides are free."""
         if entry.type not in _FLOATS or len(entry.shape) != 4:
             return None
         batch, channels, *sides = entry.shape
-        height, width = (side if isinstance(side, int) else _DEFAULT_SIDE for side in sides)
+        height, width = (side if isinstance(side, int) else _FREE_SIDE for side in sides)
         wanted = (not isinstance(batch, int) or batch == 1) and (not isinstance(channels, int) or channels == 3)
-        return (width, height) if wanted and min(height, width) > 0 and max(height, width) <= _LONGEST_SIDE else None
+        return (width, height) if wanted and min(height, width) > 0 and max(height, width) <= _MAX_SIDE else None
 
     def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
         """Return the opacity of the person in an sRGB image."""
@@ -155,6 +155,7 @@ class MattingModel:
         return np.clip(np.asarray(back) * 255.0 + 0.5, 0, 255).astype(np.uint8)
 
     def _opacity(self, outputs: list[Any]) -> np.ndarray:
+        """Return the first matte among the outputs as opacities, (H, W) float32 in [0, 1]."""
         arrays = [o for o in outputs if isinstance(o, np.ndarray) and o.dtype.kind in "fiub"]
         mattes = [o.astype(np.float32) for o in arrays if o.ndim >= 2 and o.size == self._pixels]
         if not mattes or not np.isfinite(mattes[0]).all():
@@ -164,6 +165,7 @@ class MattingModel:
                 received=f"NaN or infinity in {mattes[0].size}" if mattes else f"shapes {[o.shape for o in arrays]}",
             )
         matte = mattes[0].reshape(self._size[1], self._size[0])
+        # Within [0, 1], up to rounding in half precision, values are opacities.
         inside = matte.min() >= -1e-3 and matte.max() <= 1.0 + 1e-3
         return np.clip(matte, 0.0, 1.0) if inside else 1.0 / (1.0 + np.exp(-np.clip(matte, -30, 30)))
 
@@ -173,7 +175,7 @@ class MattingModel:
 
 
 def matte_path(folder: str | Path, camera: str, frame: int) -> Path:
-    """Where the matte of a view lies in a folder of masks."""
+    """Return the path of the matte of a view in a folder of masks."""
     return Path(folder) / camera / f"{camera}_mask{frame:06d}.png"
 
 
@@ -184,18 +186,18 @@ def write_mattes(
     *,
     views: Iterable[tuple[str, int]] | None = None,
 ) -> Iterator[Path]:
-    """Make the mattes of a capture's views, `folder/CAM/CAM_maskFFFFFF.png`; those that exist are left as they are.
+    """Write the mattes of a capture's views, `folder/CAM/CAM_maskFFFFFF.png`, and keep those that exist.
 
-    The files are in the pixels of the images on disk, as masks have to be: open the capture with `masks=folder`.
+    The files are in the pixels of the images on disk; open the capture with `masks=folder` to use them.
 
     Args:
-        capture: at full size; distorted images are matted as the lens drew them.
-        model: gives the opacity of the person in an sRGB image: a `MattingModel`, or anything else that does.
-        folder: where to.
-        views: (camera, frame); None: every image there is.
+        capture: capture at full size; distorted images are matted without undistortion.
+        model: function from an sRGB image to the opacity of the person, such as a `MattingModel`.
+        folder: folder of the mattes.
+        views: pairs (camera, frame); None: every image.
 
     Yields:
-        Each file when it stands, so that the caller can show progress.
+        The path of each matte after it is written, so that the caller can show progress.
     """
     from PIL import Image
 

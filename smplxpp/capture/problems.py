@@ -1,4 +1,4 @@
-"""What is wrong with a capture's files, told before a training run finds out."""
+"""Find damaged, missing and inconsistent files of a capture before a training fails on them."""
 
 from __future__ import annotations
 
@@ -14,27 +14,24 @@ from smplxpp.capture.recording import Problem
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 
-# So many cameras, whose pictures' upper edges have this mean along an axis, say which one points up.
-_AGREEING_CAMERAS, _UPRIGHT = 3, 0.8
-
 
 def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
-    """Everything that would stop a view or a frame from being used, each with its file.
+    """Return all problems that make a view or a frame unusable, each with its file.
 
-    The world: cameras that agree on another axis up than +y. Missing: cameras without images, frames that not every
-    camera has, images without a mask where others have one, frames without parameters. Unusable: parameters and
-    keypoints that cannot be read or hold NaN; with `decode` (which reads every file) damaged images, masks, label and
-    normal maps, ones of another size than the calibration's, and images that are not on the declared background.
-    `capture.without(problems)` leaves out what is named, and then has no problems but those of the whole capture.
+    World: cameras that agree on another up axis than +y. Missing: cameras without images, frames that not every camera
+    has, images without a mask where others have one, frames without parameters. Unusable: parameters and keypoints that
+    cannot be read or contain NaN; with `decode` (which reads every file) damaged images, masks, label and normal maps,
+    files of another size than the calibration, and images that are not on the declared background.
+    `capture.without(problems)` excludes these views and frames; problems of the whole capture remain.
 
     Args:
-        capture: as opened; its own `problems` come first.
-        decode: open every image file as well.
+        capture: the capture; its own `problems` come first.
+        decode: whether to open every image file.
     """
     found = list(capture.problems)
-    told = {(problem.camera, problem.frame) for problem in found}
-    found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in told]
-    found += [*_other_way_up(capture), *_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
+    known = {(problem.camera, problem.frame) for problem in found}
+    found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in known]
+    found += [*_wrong_up_axis(capture), *_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
     if decode:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):
@@ -43,6 +40,7 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
 
 
 def _missing_images(capture: Capture) -> Iterator[Problem]:
+    """Find cameras without any image, frames of one camera only, and gaps in the images of a camera."""
     names, table = list(capture.cameras), capture.presence()
     source = capture.recording.keypoints
     tracked = () if source is None or table.any() else source.cameras()  # cameras for keypoints alone
@@ -59,13 +57,17 @@ def _missing_images(capture: Capture) -> Iterator[Problem]:
                 yield Problem(f"camera {names[row]}: no image of frame {frame}", names[row], frame)
 
 
-def _other_way_up(capture: Capture) -> Iterator[Problem]:
-    """A world with another axis up: pictures are upright, their upper edges say it; rigs on their side do not."""
-    if len(capture.cameras) < _AGREEING_CAMERAS:
+def _wrong_up_axis(capture: Capture) -> Iterator[Problem]:
+    """Find a world whose up axis is not +y, by the mean up direction of the cameras' images.
+
+    Images are upright in most rigs. Fewer than three cameras, or cameras whose mean up direction is shorter than 0.8
+    along its main axis, prove nothing.
+    """
+    if len(capture.cameras) < 3:
         return
     up = -np.mean([camera.cam_from_world[1, :3] for camera in capture.cameras.values()], axis=0)
     axis = int(np.abs(up).argmax())
-    if abs(up[axis]) > _UPRIGHT and (axis, up[axis] > 0) != (1, True):
+    if abs(up[axis]) > 0.8 and (axis, up[axis] > 0) != (1, True):
         name = ("+" if up[axis] > 0 else "-") + "xyz"[axis]
         yield Problem(
             f"the upper edges of the cameras' pictures point along {name} of the world, "
@@ -74,6 +76,7 @@ def _other_way_up(capture: Capture) -> Iterator[Problem]:
 
 
 def _missing_masks(capture: Capture) -> Iterator[Problem]:
+    """Find images without a mask; a capture without any mask is one problem."""
     images, masks = capture.presence(), capture.presence("mask")
     if not masks.any():
         if images.any():
@@ -87,6 +90,7 @@ def _missing_masks(capture: Capture) -> Iterator[Problem]:
 
 
 def _parameters(capture: Capture) -> Iterator[Problem]:
+    """Find frames whose body parameters are missing or cannot be read."""
     source = capture.recording.params
     if source is None:
         return
@@ -106,7 +110,7 @@ def _parameters(capture: Capture) -> Iterator[Problem]:
 
 
 def _keypoints(capture: Capture) -> Iterator[Problem]:
-    """Files of keypoints that cannot be read; their cameras' images are good."""
+    """Find keypoint files that cannot be read; the images of these cameras stay usable."""
     for name in capture.cameras:
         try:
             capture.keypoints(name)
@@ -115,6 +119,7 @@ def _keypoints(capture: Capture) -> Iterator[Problem]:
 
 
 def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:
+    """Decode all files of a view, and find the damaged ones."""
     reader = capture.reader(camera)
     image, mask = capture.file(camera, frame), capture.file(camera, frame, "mask")
     if image is not None:
@@ -134,14 +139,11 @@ def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:
                 yield Problem(str(error), camera, frame)
 
 
-_GRID = 64
-# Losses below this share are margins; every undistortion has them.
-_LEAST_SHARE = 0.05
-
-
 def lost_share(camera: Camera, distortion: Distortion) -> float:
-    """The share, from 0 to 1, of a distorted picture that lies outside of `camera`'s undistorted one."""
-    middles = (np.arange(_GRID) + 0.5) / _GRID
+    """Return the fraction of a distorted image that its undistorted image, of the same K and size, cuts off."""
+    # Undistort the centres of a grid of 64 x 64 cells, and count those that fall outside.
+    grid = 64
+    middles = (np.arange(grid) + 0.5) / grid
     x, y = np.meshgrid(middles * camera.width, middles * camera.height)
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
     K, size = camera.K, (camera.width, camera.height)
@@ -151,7 +153,11 @@ def lost_share(camera: Camera, distortion: Distortion) -> float:
 
 
 def lens_problems(cameras: Mapping[str, Camera], distortions: Mapping[str, Distortion]) -> list[Problem]:
-    """Say which fisheye lenses lose more than their margins to the pinhole that keeps their focal length and size."""
+    """Find wide-angle lenses whose undistorted images cut off more than 5 % of the distorted ones.
+
+    Smaller losses are margins that every undistortion has.
+    """
+    # One computation for all cameras of the same lens and intrinsics.
     alike: dict[tuple, list[str]] = {}
     for name, distortion in distortions.items():
         if name in cameras and not isinstance(distortion, RationalDistortion):
@@ -161,7 +167,7 @@ def lens_problems(cameras: Mapping[str, Camera], distortions: Mapping[str, Disto
     found = []
     for (distortion, *_), names in alike.items():
         share = lost_share(cameras[names[0]], distortion)
-        if share >= _LEAST_SHARE:
+        if share >= 0.05:
             shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
             found.append(Problem(f"camera {shown}: {share:.0%} of the picture is outside of the undistorted one"))
     return found

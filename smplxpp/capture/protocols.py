@@ -1,7 +1,7 @@
-"""Protocols of a capture: which of its files are read, by a name.
+"""Choose the files of a capture by a named protocol.
 
-A capture made for measuring has several files of one kind, exact parameters and a tracker's, true label maps and
-estimated ones. A protocol names one of each, so that nothing of the others is read by mistake.
+A capture for evaluation has several files of one kind: exact parameters and those of a tracker, true label maps and
+estimated ones. A protocol names one of each kind, so that the others are not read by mistake.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import read_json
 
 DESCRIPTIONS = ("capture.json", "manifest.json")
-"""Files that describe a capture of our layout: written by hand, or by the tool that made it. The first counts."""
+"""Files that describe a capture of the simple layout, by hand or by a tool; the first that exists is read."""
 EXACT, TRACKED = "exact", "tracked"
-"""Protocols whose names say what their files are: the truth, and what trackers and estimators give."""
+"""Names of the protocols of the true inputs, and of the outputs of trackers and estimators."""
 _KEYS = ("parameters", "labels", "scan_labels", "normals", "keypoints")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolFiles:
-    """The files of a capture of our layout that are read; without a name, those that are read where nobody chooses.
+    """Files of a capture of the simple layout that are read; the defaults are those without a protocol.
 
     Attributes:
-        name: of the protocol, None without one.
-        parameters: a file in `params/`. With a name, None: the capture has no parameters; without one, None: those
-            that are found there.
-        labels, normals, keypoints: folders of the capture with the naming of our layout inside; None: none are read.
+        name: name of the protocol; None without one.
+        parameters: name of a file in `params/`. None means no parameters in a protocol, and those found there without.
+        labels: folder of label maps, named as in the simple layout; None: none are read.
+        normals: folder of normal maps; None: none are read.
+        keypoints: folder of keypoints; None: none are read.
         scan_labels: whether labels that come with a scan may be used.
     """
 
@@ -41,20 +42,20 @@ class ProtocolFiles:
     keypoints: str | None = "keypoints"
 
     def parameter_file(self, root: Path) -> Path | None:
-        """The file of parameters that is named, None where none is."""
+        """Return the path of the named file of parameters; None without a name."""
         return None if self.parameters is None else root / "params" / self.parameters
 
 
 def description_file(root: Path) -> Path | None:
-    """The file that describes a capture, None where there is none."""
+    """Return the description file of a capture; None without one."""
     return next((root / name for name in DESCRIPTIONS if (root / name).is_file()), None)
 
 
 def read_description(root: Path) -> Mapping[str, Any]:
-    """What a capture of our layout says of itself, empty where it says nothing.
+    """Return the description of a capture of the simple layout; empty without a file.
 
     Raises:
-        InputError: a broken file, or one that holds no object.
+        InputError: a broken file, or JSON that is not an object.
     """
     path = description_file(root)
     content = {} if path is None else read_json(path)
@@ -66,10 +67,10 @@ def read_description(root: Path) -> Mapping[str, Any]:
 
 
 def read_protocols(description: Mapping[str, Any]) -> dict[str, ProtocolFiles]:
-    """The protocols that a capture has, by name. What a protocol does not name, it has not.
+    """Return the protocols of a capture by name; kinds that a protocol does not name are not read.
 
     Raises:
-        InputError: another key, or a value that is no plain name.
+        InputError: an unknown key, or a value that is not a plain name.
     """
     found = description.get("protocols", {})
     if not isinstance(found, Mapping):
@@ -78,10 +79,10 @@ def read_protocols(description: Mapping[str, Any]) -> dict[str, ProtocolFiles]:
 
 
 def choose_protocol(root: Path, description: Mapping[str, Any], name: str | None) -> ProtocolFiles:
-    """The files of a protocol, all of which are there; of no name, those that are read without one.
+    """Return the files of a protocol after checking that they exist; without a name, the defaults.
 
     Raises:
-        InputError: an unknown protocol, or files of it that are missing; both name the protocols that there are.
+        InputError: an unknown protocol, or missing files; the message lists the protocols of the capture.
     """
     protocols = read_protocols(description)
     if name is None:

@@ -1,4 +1,4 @@
-"""Recording: what a reader finds in a data set's folder, with nothing decoded yet."""
+"""Define Recording, the files and calibration that a reader finds in the folder of a data set."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 
-_SHOWN_SIZES = 3
 KINDS = ("image", "mask", "label", "normal")
+"""Kinds of image files of a view."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something wrong in a capture that does not stop it from being used.
+    """A defect of a capture that does not make the whole capture unusable.
 
     Attributes:
-        message: what is wrong, with the file's name.
-        camera, frame: what it concerns; None: all.
+        message: description with the name of the file.
+        camera: name of the camera concerned; None: all.
+        frame: number of the frame concerned; None: all.
     """
 
     message: str
@@ -37,51 +38,56 @@ class Problem:
 
 
 class ParamSource(Protocol):
-    """Body parameters by frame."""
+    """Source of body parameters by frame number."""
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """The frames that have parameters, ascending."""
+        """Return the frames with parameters, ascending."""
 
     def read(self, frame: int) -> BodyParams:
-        """Read one frame that is among `frames()`."""
+        """Read the parameters of one of `frames()`."""
 
 
 class MeshSource(Protocol):
-    """Meshes by frame."""
+    """Source of meshes by frame number."""
 
     def read(self, frame: int) -> TriangleMesh | None:
-        """The frame's mesh, None where there is none."""
+        """Read the mesh of a frame; None without one."""
 
 
 class KeypointSource(Protocol):
-    """Keypoints by camera."""
+    """Source of detected keypoints by camera."""
 
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that have keypoints."""
+        """Return the names of the cameras with keypoints."""
 
     def read(self, camera: str) -> Keypoints2D | None:
-        """Read a camera's keypoints, in pixels of the images on disk; None where there are none."""
+        """Read the keypoints of a camera in pixels of the images on disk; None without any."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A data set's folder, found by its reader.
+    """Files and calibration of a data set, as its reader finds them, with nothing decoded.
 
     Attributes:
-        name, root, format: the folder's name, the folder, the reader's name.
-        cameras: by name, in the set's order, for whole images of the sizes on disk.
-        distortions: lenses of the cameras whose images are distorted on disk; `cameras` holds the pinhole cameras of
-            the undistorted images, which keep the intrinsics and the size of the distorted ones.
-        files: for each kind ("image", "mask", "label", "normal") the series of each camera that has one. A mask's file
-            may be the image's: then its alpha channel counts.
-        background: (3,) sRGB in [0, 1] that the images are already composited on; None: photographs.
-        splits: as the set states them, or None.
-        label_set: numbers of the label maps, a name known to `smplxpp.segment.map_labels`.
-        params, meshes, keypoints: or None.
-        fps: frames a second, or None where the set does not say.
-        problems: what the reader had to leave out.
-        protocol: name of the protocol whose files these are, None without one. protocols: names of those that the
-            capture has.
+        name: name of the folder or of its description.
+        root: folder of the data set.
+        format: name of the reader.
+        cameras: pinhole cameras by name, in the order of the data set, for whole undistorted images of the sizes on
+            disk.
+        files: for each kind ("image", "mask", "label", "normal") the files of each camera that has any. A mask's file
+            may be the image; then its alpha channel is the mask.
+        distortions: distortion of the cameras whose images are distorted on disk. The undistorted images keep their
+            intrinsics and size.
+        background: (3,) sRGB in [0, 1] that the images are composited on; None: photographs.
+        splits: splits that the data set states, or None.
+        label_set: label set of the label maps, a name known to `smplxpp.segment.map_labels`.
+        params: source of body parameters, or None.
+        meshes: source of true meshes, or None.
+        keypoints: source of keypoints, or None.
+        fps: frames per second; None if the data set does not state them.
+        problems: defects that the reader found.
+        protocol: name of the protocol whose files these are; None without one.
+        protocols: names of the protocols of the capture.
     """
 
     name: str
@@ -106,10 +112,10 @@ class Recording:
         return f"Recording({self.summary()})"
 
     def summary(self) -> str:
-        """What there is, in a sentence: name, layout, folder, cameras, sizes, frames, and how many files of a kind."""
+        """Return a summary in one sentence: name, layout, folder, cameras, sizes, frames, and numbers of files."""
         frames = self.frames()
         sizes = sorted({(camera.width, camera.height) for camera in self.cameras.values()})
-        shown = [f"{width} x {height}" for width, height in sizes[:_SHOWN_SIZES]]
+        shown = [f"{width} x {height}" for width, height in sizes[:3]]
         shown += [f"and {len(sizes) - len(shown)} other sizes"] if len(sizes) > len(shown) else []
         there = [
             f"{sum(map(len, series.values()))} {kind}s" for kind, series in self.files.items() if any(series.values())
@@ -117,20 +123,20 @@ class Recording:
         there += [name for name in ("params", "meshes", "keypoints") if getattr(self, name) is not None]
         there += [f"protocol {self.protocol}"] if self.protocol else []
         there += [f"{len(self.problems)} problems"] if self.problems else []
-        said = [
+        parts = [
             f"{self.name!r}, {self.format}, {str(self.root)!r}",
             f"{len(self.cameras)} cameras" + (f" of {', '.join(shown)} pixels" if shown else ""),
             f"{len(frames)} frames" + (f" {frames[0]} to {frames[-1]}" if frames else ""),
             ", ".join(there) or "nothing else",
         ]
-        return "; ".join(said)
+        return "; ".join(parts)
 
     def series(self, kind: str, camera: str) -> FileSeries | None:
-        """The files of a kind for a camera."""
+        """Return the files of a kind of a camera; None without any."""
         return self.files.get(kind, {}).get(camera)
 
     def frames(self) -> tuple[int, ...]:
-        """All frames with an image in any camera; without any image, those with parameters."""
+        """Return all frames with an image in any camera; without any image, those with parameters."""
         images = [series.numbers for series in self.files.get("image", {}).values()]
         if images:
             return tuple(np.unique(np.concatenate(images)).tolist())

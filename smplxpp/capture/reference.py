@@ -1,4 +1,4 @@
-"""The reference frame of a capture: its scan, body parameters and labels."""
+"""Find the files of a capture's reference frame: its scan, body parameters and labels."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ _MAPS = (".png", ".npy")
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Files of one frame, found by name; nothing is read yet.
+    """Files of one frame, found by name and not yet read.
 
     Attributes:
         subject: name of the capture's folder.
         frame: number of the frame.
-        scan, params: files; None where there are none and none are needed. `params_frame` is the row of `params` that
-            belongs to the frame.
-        motion: parameters of the capture's frames from the same source as `params`, or None.
+        scan: file of the scan; None if there is none and none is needed.
+        params: file of parameters; None if there is none and none is needed.
+        params_frame: row of `params` of this frame.
+        motion: parameters of all frames from the same source as `params`, or None.
         scan_labels: labels of the scan's vertices, or None.
-        label_maps: label image of each camera by name, without those that the capture holds out; with `cameras_file`
-            their cameras.
-        photographs: the same of the images.
+        label_maps: label image by camera, without held-out cameras.
+        photographs: image by camera, without held-out cameras.
+        cameras_file: camera file of the capture, or None.
     """
 
     subject: str
@@ -51,14 +52,19 @@ def find_reference(
     fitted: bool = True,
     scanned: bool = True,
 ) -> ReferenceFrame:
-    """Find frame `frame` in a capture folder of our simple layout.
+    """Find the files of a frame in a capture folder of the simple layout.
 
     The layout: `scans/scan_FFFFFF.ply` (`.obj`), `scans/scan_FFFFFF_labels.npz`, `params/params.npz` (stacked) or
     `params/FFFFFF.npz`, `labels/CAM/CAM_labelFFFFFF.png`, `rgbs/CAM/CAM_rgbFFFFFF.jpg`, `cameras.json` or
-    `calibration.csv`. `params` names another stacked parameter file (for instance a tracker's), whose rows are the
-    motion then; `protocol` names the protocol whose parameters and labels are taken, the scan's own labels only if it
-    allows them. Without `fitted` there need be no parameters: a registration is to make them; without `scanned` there
-    need be no scan: it is to be reconstructed.
+    `calibration.csv`.
+
+    Args:
+        capture: folder of the capture.
+        frame: number of the frame.
+        params: another stacked parameter file (such as a tracker's), whose rows are then the motion.
+        protocol: protocol whose parameters and labels are taken, with the scan's own labels only if it allows them.
+        fitted: whether parameters are required; False where a registration makes them.
+        scanned: whether a scan is required; False where it is reconstructed.
 
     Raises:
         InputError: no such folder, no such protocol, or scan or parameters missing.
@@ -69,6 +75,7 @@ def find_reference(
     description = read_description(root)
     files = choose_protocol(root, description, protocol)
     number = f"{frame:06d}"
+    # The scan, unless it is reconstructed.
     scan = _first(root / "scans", [f"scan_{number}{suffix}" for suffix in (".ply", ".obj", ".glb")])
     if scan is None and scanned:
         have = sorted(p.name for p in (root / "scans").glob("scan_*") if not p.name.endswith("_labels.npz"))
@@ -78,6 +85,7 @@ def find_reference(
             received=f"scans of {', '.join(have[:5]) or 'no frame'}",
             remedy="choose another frame with --frame, or build with --scan, --params and --labels",
         )
+    # The parameters, unless the body is registered.
     params_file, row, motion = _parameters(root, files, params, frame)
     if fitted and params_file is None:
         raise InputError(
@@ -93,6 +101,7 @@ def find_reference(
             received="neither" if params is None else str(params_file),
             remedy="convert your fit with `smplxpp params convert`",
         )
+    # Label maps and images without the cameras that evaluations hold out.
     held_out = set(map(str, description.get("novel_views", ())))
     return ReferenceFrame(
         subject=root.resolve().name,
@@ -111,7 +120,7 @@ def find_reference(
 def _parameters(
     root: Path, files: ProtocolFiles, given: str | Path | None, frame: int
 ) -> tuple[Path | None, int, Path | None]:
-    """Return the file that holds the frame, the frame's row in it, and the file with all frames, as far as named."""
+    """Return the file of the frame's parameters, the row in it, and the file of all frames (None if unknown)."""
     if given is not None:
         named = stacked_params(root, given)
         return named, frame, named if named.is_file() else None
@@ -124,7 +133,7 @@ def _parameters(
 
 
 def _by_camera(folder: Path, tag: str, suffixes: Sequence[str], held_out: set[str]) -> dict[str, Path]:
-    """The file `CAM/CAM_TAG` of each camera that is not held out."""
+    """Return the file `CAM/CAM_TAG` of each camera that is not held out."""
     found = {
         path.stem.removesuffix(f"_{tag}"): path
         for path in sorted(folder.glob(f"*/?*_{tag}.*"))
@@ -138,7 +147,7 @@ def _first(folder: Path, names: list[str]) -> Path | None:
 
 
 def find_scans(capture: str | Path) -> dict[int, Path]:
-    """Find the scans of a capture folder of our simple layout, `scans/scan_FFFFFF.ply` (`.obj`, `.glb`), by frame."""
+    """Find the scans of a capture folder of the simple layout, `scans/scan_FFFFFF.ply` (`.obj`, `.glb`), by frame."""
     return scans_in(Path(capture) / "scans")
 
 

@@ -1,4 +1,4 @@
-"""open_capture: which reader a folder is for."""
+"""Open a capture with the reader of its layout."""
 
 from __future__ import annotations
 
@@ -47,27 +47,26 @@ def open_capture(
     protocol: str | None = None,
     cache_bytes: int = 1 << 30,
 ) -> Capture:
-    """Open a capture of any known layout; nothing but calibration and lists of files is read.
+    """Open a capture of any known layout, reading only calibration and lists of files.
 
     Args:
-        path: the folder (docs/captures.md says which, for each data set).
-        format: name of the layout; None: told by the files that are there.
-        masks: a folder of mattes to take instead of the capture's own masks, matched to the images by their names.
-        params: body parameters to take instead of the capture's own (a tracker's, say).
-        keypoints: a folder of keypoints of any tool to take instead of the capture's own: a file or a folder for each
-            camera, in a layout of docs/captures.md.
-        person: whose keypoints, where there are several people; None: in each frame the surest.
-        body: the body model that the parameters are for, where a layout moves it about the origin; None: the open body.
+        path: folder of the capture; docs/captures.md names it for each data set.
+        format: name of the layout; None: recognised by its files.
+        masks: folder of mattes that replace the capture's masks, matched to the images by their names.
+        params: body parameters that replace the capture's (such as a tracker's).
+        keypoints: folder of keypoints that replace the capture's, with a file or a folder for each camera in a layout
+            of docs/captures.md.
+        person: person whose keypoints are taken; None: in each frame the one of most confidence.
+        body: body model of the parameters, for layouts that rotate it about the origin; None: open body.
         hold_out_every: hold out every n-th training camera as a novel view.
-        protocol: name of the protocol whose files are read, of those that the capture has; `params` goes before its
-            parameters.
-        cache_bytes: bound of the decoded images kept, in each process that reads.
+        protocol: name of the capture's protocol whose files are read; `params` replaces its parameters.
+        cache_bytes: bound of the cache of decoded images in each process.
 
     Raises:
-        InputError: no such folder, no layout that fits or several, a protocol that the capture has not or whose files
-            are missing, or what the reader refuses.
+        InputError: no such folder, no matching layout or several, an unknown protocol or one with missing files, or
+            what the reader refuses.
     """
-    # Absolute: a loader's worker may have another working directory.
+    # Absolute, because a worker of a data loader may have another working directory.
     root = Path(path).absolute()
     if not root.is_dir():
         raise InputError("capture", expected="an existing folder", received=str(path))
@@ -101,10 +100,10 @@ def open_capture(
 
 
 def detect_format(path: str | Path) -> str:
-    """Name of the one layout that a folder is in.
+    """Return the name of the only layout that matches a folder.
 
     Raises:
-        InputError: none fits, or several.
+        InputError: no layout matches, or several do.
     """
     root = Path(path)
     fitting = [name for name, reader in READERS.items() if reader.detect(root)]

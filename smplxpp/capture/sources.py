@@ -1,4 +1,4 @@
-"""Where a capture's body parameters are, read when they are asked for."""
+"""Read the body parameters and true meshes of a capture from their files, on request."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
-# What has a row a frame, in the layouts that stack frames.
+# Arrays with a row for each frame in the layouts that stack frames.
 _STACKED = (*ARRAY_NAMES, "poses", "trans")
-DAMAGED, ABSENT = -1, -2
+# Row indices of frames whose row is damaged, or empty.
+_DAMAGED, _ABSENT = -1, -2
 
 
 @dataclass(frozen=True, eq=False)
 class StackedParams:
-    """An npz file whose row is the frame's number. Rows with NaN or infinity spoil themselves alone.
+    """An npz file whose row index is the frame number.
 
-    A row that is NaN throughout, as `smplxpp register` and refined poses have for frames that they were not asked for,
-    is no damage: the frame has no parameters.
+    NaN or infinity make only their own row unusable. A row of NaN only is not damaged but empty, as `smplxpp register`
+    and pose refinement write it for frames without parameters.
 
     Attributes:
-        path: the file.
-        layout: as `load_params` takes it.
-        body: gives the root joint where a layout needs it.
+        path: path of the file.
+        layout: layout for `load_params`.
+        body: body model with the root joint that some layouts need.
     """
 
     path: Path
@@ -42,9 +43,10 @@ class StackedParams:
 
     @cached_property
     def _rows(self) -> tuple[BodyParams, np.ndarray]:
-        """The good rows, and for every row its index among them (`DAMAGED`, `ABSENT`: none)."""
+        """The valid rows, and for every row its index among them (`_DAMAGED`, `_ABSENT`: none)."""
         arrays = safe_npz(self.path)
         matrices = {name: arrays[name] for name in _STACKED if name in arrays and np.ndim(arrays[name]) == 2}
+        # A row is good if it is finite in all arrays, and present if it is not NaN throughout.
         rows = max(map(len, matrices.values()), default=1)
         stacked = {name: array for name, array in matrices.items() if len(array) == rows and array.dtype.kind == "f"}
         good, there = np.ones(rows, dtype=bool), np.full(rows, not stacked)
@@ -59,17 +61,17 @@ class StackedParams:
         if not good.any():
             raise InputError(f"file {self.path}", expected="finite values", received="NaN or infinity in every row")
         params = params_from_content(kept, source=f"file {self.path}", layout=self.layout, body=self.body)
-        return params, np.where(good, np.cumsum(good) - 1, np.where(there, DAMAGED, ABSENT))
+        return params, np.where(good, np.cumsum(good) - 1, np.where(there, _DAMAGED, _ABSENT))
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """The frames that there are, ascending."""
-        return np.flatnonzero(self._rows[1] != ABSENT)
+        """Return the frames with parameters, ascending."""
+        return np.flatnonzero(self._rows[1] != _ABSENT)
 
     def read(self, frame: int) -> BodyParams:
-        """Read the parameters of one frame.
+        """Read the parameters of one frame with parameters.
 
         Raises:
-            InputError: NaN or infinity in it, or nothing else.
+            InputError: NaN or infinity in the row, or in all rows.
         """
         params, index = self._rows
         if index[frame] < 0:
@@ -79,7 +81,14 @@ class StackedParams:
 
 @dataclass(frozen=True, eq=False)
 class ParamFiles:
-    """A file of parameters for each frame; see `StackedParams`. `up` as `load_params` takes it."""
+    """A file of parameters for each frame.
+
+    Attributes:
+        files: files by frame.
+        layout: layout for `load_params`.
+        body: body model with the root joint that some layouts need.
+        up: up axis for `load_params`; None: that of the layout.
+    """
 
     files: FileSeries
     layout: LayoutName = "auto"
@@ -87,11 +96,11 @@ class ParamFiles:
     up: UpAxis | None = None
 
     def frames(self) -> Int64[np.ndarray, " F"]:
-        """The frames that there are, ascending."""
+        """Return the frames with parameters, ascending."""
         return self.files.numbers
 
     def read(self, frame: int) -> BodyParams:
-        """Read the parameters of one frame."""
+        """Read the parameters of one frame with a file."""
         return load_params(self.files.required(frame), layout=self.layout, body=self.body, up=self.up)
 
 
@@ -117,10 +126,10 @@ class FrameParams:
 
 
 def find_params(path: Path, *, body: BodyModel | None, layout: LayoutName = "auto") -> StackedParams | ParamFiles:
-    """Parameters that the user names: an npz file with a row a frame, or a folder with a numbered file a frame.
+    """Find parameters at a path: an npz file with a row for each frame, or a folder with a numbered file for each.
 
     Raises:
-        InputError: neither.
+        InputError: neither of them.
     """
     if path.is_dir():
         files = FileSeries.find(path, r"\D*(?P<frame>\d+)\D*\.(json|npz|pkl)")
@@ -138,21 +147,21 @@ def find_params(path: Path, *, body: BodyModel | None, layout: LayoutName = "aut
 
 @dataclass(frozen=True, eq=False)
 class MeshFiles:
-    """A mesh file for each frame."""
+    """Mesh files, one for each frame."""
 
     files: FileSeries
 
     def read(self, frame: int) -> TriangleMesh | None:
-        """The frame's mesh, None where there is none."""
+        """Read the mesh of a frame; None without one."""
         path = self.files.path(frame)
         return None if path is None else read_mesh(path).mesh
 
 
 @dataclass(frozen=True, eq=False)
 class PosedTopology:
-    """One topology (`faces`, `face_hidden`) and, in a file each, the vertices (`verts`) of the frames.
+    """One topology file (`faces`, `face_hidden`) and a file of vertices (`verts`) for each frame.
 
-    Faces that `face_hidden` marks (skin under clothes) are left out: the mesh is what the images show.
+    Faces marked by `face_hidden` (skin under clothes) are left out, so that the mesh is the visible surface.
     """
 
     topology: Path
@@ -167,7 +176,7 @@ class PosedTopology:
         return faces[~arrays["face_hidden"]] if "face_hidden" in arrays else faces
 
     def read(self, frame: int) -> TriangleMesh | None:
-        """The frame's mesh, None where there is none."""
+        """Read the mesh of a frame; None without one."""
         path = self.files.path(frame)
         if path is None:
             return None

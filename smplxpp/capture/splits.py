@@ -1,4 +1,4 @@
-"""Which cameras and frames are for training, and which are held out."""
+"""Split cameras and frames into training and held-out sets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from smplxpp.core.errors import InputError
 
 @dataclass(frozen=True)
 class Splits:
-    """The four sets of a capture.
+    """Training and held-out cameras and frames of a capture.
 
     Attributes:
         train_cameras: names of the cameras that training sees.
@@ -39,11 +39,11 @@ class Splits:
 
     @staticmethod
     def all_train(cameras: Iterable[str], frames: Iterable[int]) -> Splits:
-        """Everything is trained on."""
+        """Return splits that train on all cameras and frames."""
         return Splits(tuple(cameras), (), tuple(frames), ())
 
     def hold_out_cameras(self, every: int) -> Splits:
-        """Every n-th training camera, from the n-th on, becomes a novel view.
+        """Return splits in which every n-th training camera, from the n-th on, is a novel view.
 
         Raises:
             InputError: `every` below 2, or no training camera would be left to hold out.

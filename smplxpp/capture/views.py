@@ -1,4 +1,4 @@
-"""From files to the arrays that a capture gives out: decoded, checked, undistorted, cut and resampled."""
+"""Read images, masks, label and normal maps of a view: decode, check, undistort, crop and resample."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from smplxpp.core.files.image_file import open_image
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_REMEDY = "copy the file anew from its source, or remove it: the frame is then left out"
+_REMEDY = "copy the file from its source again, or remove it to leave the frame out"
 
 
 def read_color(path: Path) -> Image:
-    """An RGB image of 8 bits a channel; an alpha channel is dropped, not applied."""
+    """Read an 8-bit RGB image; an alpha channel is dropped, not applied."""
     image = open_image(path, remedy=_REMEDY)
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
 def read_alpha(path: Path) -> Image:
-    """An 8-bit mask ("L"): the alpha channel where the file has one (mattes, cut-outs), else its brightness."""
+    """Read an 8-bit mask ("L"): the alpha channel if the file has one (mattes, cut-outs), else its brightness."""
     image = open_image(path, remedy=_REMEDY)
     if image.mode in ("RGBA", "LA", "PA"):
         return image.getchannel("A")
@@ -40,7 +40,7 @@ def read_alpha(path: Path) -> Image:
 
 
 def read_labels(path: Path) -> Image:
-    """An index map ("L"): the values of a grey or palette image, or of an integer `.npy`."""
+    """Read an index map ("L"): the values of a grey or palette image, or of an integer `.npy`."""
     if path.suffix.lower() == ".npy":
         return _from_array(_read_npy_labels(path))
     image = open_image(path, remedy=_REMEDY)
@@ -54,16 +54,16 @@ def read_labels(path: Path) -> Image:
 
 
 def read_normals(path: Path) -> tuple[Image, bool]:
-    """An RGB image of encoded normals, and whether the file has 16 bits a channel (Pillow gives the upper 8)."""
+    """Read encoded normals as 8-bit RGB, and whether the file has 16 bits (of which Pillow returns the upper 8)."""
     image = open_image(path, remedy=_REMEDY)
     return image.convert("RGB"), "16" in image.info["raw_mode"]
 
 
 def check_size(image: Image, path: Path, size: tuple[int, int], *, of: str) -> Image:
-    """The image, if it has the expected width and height.
+    """Return the image if it has the expected width and height.
 
     Raises:
-        InputError: another size.
+        InputError: another size than expected.
     """
     if image.size != size:
         raise InputError(
@@ -92,20 +92,15 @@ def _from_array(array: np.ndarray) -> Image:
     return PIL.Image.fromarray(array)
 
 
-# Median difference, of 255, between the declared background and the pixels without any opacity: JPEG's is about 1.
-_BACKGROUND_TOLERANCE = 16
-_BACKGROUND_GRID = 128
-
-
 @dataclass(frozen=True)
 class ViewReader:
-    """Reads the images of one camera into its window.
+    """Reads the image files of one camera into its window.
 
     Attributes:
-        camera: of the whole image on disk, as a pinhole.
-        window: what is shown of it.
-        distortion: the lens that drew the image; None where it is a pinhole's already.
-        background: (3,) in [0, 1] that images are already composited on; None: photographs.
+        camera: pinhole camera of the whole image on disk.
+        window: shown part of the image.
+        distortion: distortion of the image on disk; None for a pinhole image.
+        background: (3,) colour in [0, 1] that images are composited on; None: photographs.
     """
 
     camera: Camera
@@ -114,22 +109,22 @@ class ViewReader:
     background: tuple[float, float, float] | None = None
 
     def color(self, path: Path) -> UInt8[np.ndarray, "H W 3"]:
-        """Read an image's colours."""
+        """Read the colours of an image into the window."""
         return self._shown(self._sized(read_color(path), path))
 
     def alpha(self, path: Path) -> UInt8[np.ndarray, "H W"]:
-        """Read a mask's opacity."""
+        """Read the opacity of a mask into the window."""
         return self._shown(self._sized(read_alpha(path), path))
 
     def labels(self, path: Path) -> UInt8[np.ndarray, "H W"]:
-        """Read a label map."""
+        """Read a label map into the window, nearest neighbour."""
         return self._shown(self._sized(read_labels(path), path), labels=True)
 
     def normals(self, path: Path) -> Float32[np.ndarray, "H W 3"]:
-        """Read a normal map, resampled to the nearest pixel, as labels: an average over an edge is no normal."""
+        """Read a normal map, nearest neighbour, because an average over an edge is not a normal."""
         image, deep = read_normals(path)
         value = self._shown(self._sized(image, path), labels=True).astype(np.float32)
-        # Of 16-bit files Pillow gives the upper byte: the middle of its range is 0.2 degrees off at most.
+        # Of 16-bit files Pillow returns the upper byte; the middle of its range is off by at most 0.2 degrees.
         normal = (value + 0.5) / 128.0 - 1.0 if deep else value / 127.5 - 1.0
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         seen = value.any(axis=-1, keepdims=True)
@@ -138,14 +133,15 @@ class ViewReader:
     def foreground(
         self, image_path: Path, mask_path: Path
     ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
-        """Colour times opacity (H, W, 3) uint8 and opacity (H, W) uint8.
+        """Read colour times opacity, (H, W, 3) uint8, and opacity, (H, W) uint8.
 
-        The product is formed on the full image: resampled apart, a photograph's background would bleed into the edges.
+        The product is formed on the full image, because separate resampling would mix the background into the edges.
         """
         import PIL.Image
 
         image = self._sized(read_color(image_path), image_path)
         opacity = self._sized(read_alpha(mask_path), mask_path)
+        # Photographs: multiply by opacity. Images on a colour c already are F + (1 - a) c: subtract the second term.
         if self.background is None:
             product = PIL.Image.new("RGB", image.size)
             box = opacity.getbbox()
@@ -169,8 +165,8 @@ class ViewReader:
     def _shown(self, image: Image, *, labels: bool = False) -> np.ndarray:
         if self.distortion is None:
             return np.asarray(self.window.apply(image, labels=labels))
-        # Where the window shrinks, the distorted image is shrunk first, as a whole: the lens works on the plane z = 1
-        # and does not mind, and the bilinear look-up then skips no pixel.
+        # For a smaller window the distorted image is downsampled first, so that the bilinear look-up skips no pixel.
+        # The distortion acts on the plane z = 1, which does not depend on the resolution.
         whole = Window.full(self.camera)
         if not labels and min(self.window.scale) < 1:
             sx, sy = (min(scale, 1.0) for scale in self.window.scale)
@@ -186,18 +182,21 @@ class ViewReader:
         )
 
     def _check_background(self, image: Image, opacity: Image, path: Path) -> None:
-        """An image that is not on the declared colour would be composited wrong without a sign of it."""
-        # A median needs few pixels: the nearest of a coarse grid.
+        """Refuse an image that is not on the declared colour, because compositing would be silently wrong.
+
+        The median colour outside of the mask may differ by 16 of 255; JPEG differs by about 1.
+        """
+        # The nearest pixels of a grid of 128 x 128 suffice for a median.
         from PIL.Image import Resampling
 
-        grid = (min(image.width, _BACKGROUND_GRID), min(image.height, _BACKGROUND_GRID))
+        grid = (min(image.width, 128), min(image.height, 128))
         coarse, share = (np.asarray(i.resize(grid, Resampling.NEAREST)) for i in (image, opacity))
         outside = coarse[share == 0]
         if not len(outside):
             return
         found = np.median(outside, axis=0)
         declared = np.asarray(self.background) * 255.0
-        if np.abs(found - declared).max() > _BACKGROUND_TOLERANCE:
+        if np.abs(found - declared).max() > 16:
             raise InputError(
                 f"image file {path}",
                 expected=f"an image composited on RGB {declared.round().astype(int).tolist()}, as the capture declares",

@@ -1,4 +1,4 @@
-"""The part of an image that a capture shows, and its resolution: pixels and intrinsics change together."""
+"""Crop and resample images together with their cameras."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of the full image, resampled to a size.
+    """A rectangle of the full image that is resampled to a size.
 
     Principal point and focal lengths follow as in `Camera.cropped`.
 
     Attributes:
         box: x0, y0, x1, y1 in pixels of the full image.
-        width, height: of the result.
+        width: width of the result in pixels.
+        height: height of the result in pixels.
     """
 
     box: tuple[float, float, float, float]
@@ -29,12 +30,12 @@ class Window:
 
     @staticmethod
     def full(camera: Camera) -> Window:
-        """The whole image as it is."""
+        """Return the window of the whole image at full resolution."""
         return Window((0.0, 0.0, float(camera.width), float(camera.height)), camera.width, camera.height)
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Pixels of the result a pixel of the full image, in x and y."""
+        """Pixels of the result per pixel of the full image, in x and y."""
         x0, y0, x1, y1 = self.box
         return self.width / (x1 - x0), self.height / (y1 - y0)
 
@@ -46,7 +47,7 @@ class Window:
         return replace(self, width=size[0], height=size[1])
 
     def cropped(self, box: tuple[int, int, int, int]) -> Window:
-        """The rectangle x0, y0, x1, y1 in pixels of this window, which must hold it."""
+        """Return the window of a rectangle x0, y0, x1, y1 in pixels of this window, which must contain it."""
         x0, y0, x1, y1 = map(int, box)
         if not (0 <= x0 < x1 <= self.width and 0 <= y0 < y1 <= self.height):
             raise InputError(
@@ -59,12 +60,14 @@ class Window:
         return Window((left + x0 / sx, top + y0 / sy, left + x1 / sx, top + y1 / sy), x1 - x0, y1 - y0)
 
     def camera(self, full: Camera) -> Camera:
-        """The camera of the window's pixels."""
+        """Return the camera of the window's pixels."""
         return full.cropped(self.box, size=(self.width, self.height))
 
     def apply(self, image: Image, *, labels: bool = False) -> Image:
-        """Cut and resample an image: the mean over the area of a pixel where that is a whole number of pixels each way
-        (what a coarser sensor would have seen), else Lanczos; labels take the nearest pixel."""
+        """Crop and resample an image: area averages for whole reduction factors, else Lanczos; nearest for labels.
+
+        An area average is what a coarser sensor would have measured.
+        """
         from PIL.Image import Resampling
 
         if self == Window((0.0, 0.0, float(image.width), float(image.height)), image.width, image.height):

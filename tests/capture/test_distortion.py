@@ -125,7 +125,7 @@ def test_what_no_pinhole_sees_has_no_place():
     assert np.isnan(whole.undistort(np.array([[np.pi / 2, 0.0]]))).all()
     folding = Distortion.from_opencv([-0.3, 0, 0, 0], subject="", model=FISHEYE)
     turn = np.sqrt(1 / 0.9)  # 1 - 0.9 theta^2 = 0
-    assert folding.reach == pytest.approx(turn)
+    assert folding.max_angle == pytest.approx(turn)
     seen = folding.distort(np.tan([[turn - 0.01, 0.0], [turn + 0.01, 0.0]]))
     assert np.isfinite(seen[0]).all() and np.isnan(seen[1, 0])
     picture = undistort(
