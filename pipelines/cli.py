@@ -41,14 +41,14 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "photographs, cameras and masks of a capture in; a closed, coloured surface of one frame or of all out",
     ),
     "label": (
-        "pipelines.commands.label",
+        "pipelines.commands.view",
         "Label",
         "labels and landmarks of a run's scan, corrected by hand in the browser and kept",
     ),
     "view": (
         "pipelines.commands.view",
         "View",
-        "a run in the browser: layers, weights, Gaussians, photographs, frames, and a training while it goes on",
+        "a run in the browser: layers, weights, Gaussians, photographs, frames, and a running training",
     ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
     "fit": (
@@ -79,12 +79,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "talk": (
         "pipelines.commands.talk",
         "Talk",
-        "an avatar that says a text or a recording: a film with sound, a page, or the motion",
+        "an avatar that speaks a text or a recording: a film with sound, a page, or the motion",
     ),
     "chat": (
         "pipelines.commands.chat",
         "Chat",
-        "a page in which the avatar answers what is typed or said, with voice, face and hands",
+        "a page in which the avatar answers typed or spoken messages with voice, face and hands",
     ),
     "export": (
         "pipelines.commands.export",
@@ -101,7 +101,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "capture check": (
         "pipelines.commands.capture",
         "CaptureCheckCommand",
-        "what is wrong with a capture's files, masks, parameters and calibration, and what to do",
+        "faults of a capture's files, masks, parameters and calibration, with remedies",
     ),
     "capture convert": (
         "pipelines.commands.capture",
@@ -109,12 +109,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
     "capture masks": (
-        "pipelines.commands.masks",
+        "pipelines.commands.capture",
         "CaptureMasks",
         "masks of a capture's images by a matting model, empty plates or MediaPipe",
     ),
     "capture degrade": (
-        "pipelines.commands.degrade",
+        "pipelines.commands.capture",
         "CaptureDegradeCommand",
         "a capture with exact inputs to one with a tracker's: noisy parameters, keypoints, estimated labels",
     ),

@@ -98,8 +98,8 @@ class ClothMotions:
             last = frame
             if frame in wanted:
                 self._shapes[frame] = shape
-        for said in driver.said:
-            warnings.warn(f"simulated clothes: {said}", GeometryWarning, stacklevel=2)
+        for note in driver.notes:
+            warnings.warn(f"simulated clothes: {note}", GeometryWarning, stacklevel=2)
 
     def _skinned(self) -> ClothShape:
         vertices = np.concatenate([garment.vertices for garment in self.garments])

@@ -33,9 +33,9 @@ class Clothes:
         self._place[at] = np.arange(len(at))
 
     @property
-    def said(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What went otherwise than asked for."""
-        return self._driver.said
+        return self._driver.notes
 
     def step(self, params: BodyParams, seconds: float, way: Sequence[BodyParams] = ()) -> ClothShape:
         """Go on to a pose, along a way to it if there is one; see `ClothDriver.step` and `follow`."""

@@ -121,9 +121,9 @@ class AvatarPlayer:
         return self._clothes is not None
 
     @property
-    def said(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What went otherwise than asked for with the loose clothes, a sentence each."""
-        return [] if self._clothes is None else self._clothes.said
+        return [] if self._clothes is None else self._clothes.notes
 
     @property
     def skinned_clothes(self) -> ClothShape | None:

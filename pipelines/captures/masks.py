@@ -21,17 +21,17 @@ from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.detect.plates import PlateConfig, PlateModel
 
-Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
-"""Gives the opacity of the person in an sRGB image."""
+MatteModel = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
+"""Returns the matte of an sRGB image: the opacity of the person, 0 to 255."""
 _RECORD = "masks.json"
 _MOST_PLATES = 64
 
 
 class Plates:
-    """A matter a camera, of its empty plates; made when the camera is asked for.
+    """Matte models of cameras from their empty plates, each made when its camera is needed.
 
-    Plates lie in the folder as images of the cameras' names (`CAM.png`, `CAM_empty.jpg`), or as a folder a camera with
-    one or several. Several tell the camera's noise.
+    Plates are images with the cameras' names in the folder (`CAM.png`, `CAM_empty.jpg`), or a folder a camera with one
+    or several images. Several give the camera's noise.
 
     Raises:
         InputError: no such folder, or no plate of some camera.
@@ -55,14 +55,14 @@ class Plates:
                 digest.update(f"{camera} {hashlib.sha256(read_bytes(path)).hexdigest()}".encode())
         self.identity = f"plates {digest.hexdigest()}"
 
-    def of_camera(self, camera: str) -> Matter:
-        """The matter of a camera."""
+    def of_camera(self, camera: str) -> MatteModel:
+        """Return the matte model of a camera."""
         return PlateModel([np.asarray(read_color(path)) for path in self.files[camera]], self.config)
 
 
 def write_masks(
     capture: Capture,
-    matter_of: Callable[[str], Matter],
+    model_of: Callable[[str], MatteModel],
     folder: Path,
     *,
     identity: str,
@@ -73,7 +73,7 @@ def write_masks(
     stand there are kept.
 
     Args:
-        matter_of: the matter of a camera.
+        model_of: returns the matte model of a camera.
         identity: of the matters; the folder remembers it.
         cameras, frames: None: all, held-out ones too: their masks are what results are measured in.
 
@@ -87,7 +87,7 @@ def write_masks(
     for camera in capture.cameras if cameras is None else cameras:
         views = capture.views([camera], frames)
         if views:
-            yield from write_mattes(capture, matter_of(camera), folder, views=views)
+            yield from write_mattes(capture, model_of(camera), folder, views=views)
 
 
 def _own_folder(folder: Path, identity: str) -> None:

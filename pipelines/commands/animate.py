@@ -17,8 +17,7 @@ from rich.progress import track
 from pipelines.commands.animate_student import StudentFilm, open_student, student_frames
 from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
-from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt
+from pipelines.commands.options import ClothMode, Lighting, OptionalFloat, OptionalInt
 from pipelines.commands.templates import load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
@@ -89,7 +88,7 @@ class Animate:
     """The light that the person is shown in."""
     json: bool = False
     """Print what was written as JSON."""
-    _said: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
+    _notes: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
 
     def run(self) -> dict:
         """Pose the template frame by frame and write the result, whole or not at all."""
@@ -114,7 +113,7 @@ class Animate:
         simulated = [garment.part for garment in garments]
         if not self.json:
             self._tell(len(params), fps, simulated)
-        return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "said": self._said}
+        return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "notes": self._notes}
 
     @property
     def _of_student(self) -> bool:
@@ -152,7 +151,7 @@ class Animate:
             numbered_from=begin if self.codes == "trained" else None,
             relighting=self.lighting.relighting(),
         )
-        cameras, frames = student_frames(bundle, motion, shown, film, self._said)
+        cameras, frames = student_frames(bundle, motion, shown, film, self._notes)
         shown_frames = track(
             frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json
         )
@@ -164,13 +163,13 @@ class Animate:
             "frames": len(shown),
             "fps": fps,
             "simulated": simulated,
-            "said": self._said,
+            "notes": self._notes,
         }
 
     def _tell(self, frames: int, fps: float, simulated: list[str]) -> None:
         moved = f", simulated: {', '.join(simulated)}" if simulated else ""
         Console().print(f"{self.out}: {frames} frames at {fps:g} a second{moved}", markup=False)
-        for sentence in self._said:
+        for sentence in self._notes:
             Console(stderr=True).print(sentence, markup=False)
 
     def _check_options(self, suffix: str) -> None:
@@ -254,7 +253,7 @@ class Animate:
         if not garments:
             yield from _pose_blocks(template, chosen)
             return
-        surfaces = play(template, garments, whole, fps=fps * self.step, said=self._said)
+        surfaces = play(template, garments, whole, fps=fps * self.step, notes=self._notes)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
         for k, vertices in enumerate(surfaces):
             if k >= first and (k - first) % self.step == 0:

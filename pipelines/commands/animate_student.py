@@ -89,13 +89,13 @@ def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:
 
 
 def student_frames(
-    bundle: AvatarBundle, motion: BodyParams, shown: range, film: StudentFilm, said: list[str]
+    bundle: AvatarBundle, motion: BodyParams, shown: range, film: StudentFilm, notes: list[str]
 ) -> tuple[list[Camera], Iterator[UInt8[np.ndarray, "H W 3"]]]:
     """Return the cameras of a film and its pictures, drawn as they are asked for.
 
     Args:
         motion: all frames that loose clothes follow, at the rate that it says. shown: those of the film.
-        said: takes what went otherwise than asked for.
+        notes: list to which remarks are added.
     """
     from avatar.runtime import AvatarPlayer
     from avatar.runtime.motion import pose_range
@@ -105,14 +105,14 @@ def student_frames(
         outside = limits.outside(motion)[list(shown)].any(axis=1)
         if outside.any():
             done = "they were held back" if film.clamp else "`--outside clamp` holds them back"
-            said.append(
+            notes.append(
                 f"{int(outside.sum())} of {len(shown)} frames, the first at {int(np.argmax(outside))}, turn joints "
                 f"more than 10 degrees farther than training saw: {done}"
             )
         motion = limits.clamped(motion) if film.clamp else motion
     player = AvatarPlayer(bundle)
     cameras = _cameras(player, motion.select(list(shown)), film)
-    return cameras, _pictures(player, motion, shown, cameras, film, said)
+    return cameras, _pictures(player, motion, shown, cameras, film, notes)
 
 
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
@@ -133,7 +133,7 @@ def _pictures(
     shown: range,
     cameras: list[Camera],
     film: StudentFilm,
-    said: list[str],
+    notes: list[str],
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     picture = dict(zip(shown, cameras, strict=True))
     coded = set() if film.numbered_from is None else set(player.bundle.about.frames)
@@ -150,4 +150,4 @@ def _pictures(
             player.pose(motion.frame(k), frame=number if number in coded else None, cloth=skinned)
         image, _ = player.draw(picture[k], background=_BACKGROUND, relighting=film.relighting)
         yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-    said += player.said
+    notes += player.notes

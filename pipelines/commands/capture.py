@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,7 +15,9 @@ from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
+    from pipelines.captures.masks import MatteModel
     from smplxpp.capture import Capture
+
 
 FormatName = Literal[
     "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap"
@@ -25,7 +28,7 @@ _FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included),
 
 @dataclass(frozen=True)
 class CaptureCheckCommand:
-    """Options of the command."""
+    """Options of `smplxpp capture degrade`."""
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the capture, in any layout of docs/captures.md."""
@@ -83,7 +86,7 @@ class CaptureCheckCommand:
 
 @dataclass(frozen=True)
 class CaptureConvertCommand:
-    """Options of the command."""
+    """Options of `smplxpp capture degrade`."""
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the capture, in any layout of docs/captures.md."""
@@ -205,3 +208,114 @@ def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | Non
             raise InputError("--frames", expected=f"frames that the capture has ({have})", received=part)
         chosen |= found
     return tuple(sorted(chosen))
+
+
+@dataclass(frozen=True)
+class CaptureDegradeCommand:
+    """Options of `smplxpp capture degrade`."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of a capture in our layout whose parameters and label maps are exact."""
+    out: Path
+    """New folder to write."""
+    seed: int = 0
+    """Seed of all errors."""
+    copy: bool = False
+    """Copy the old capture's files; by default they are linked."""
+    rig: int = 0
+    """Cameras of a synthetic ring for the keypoints, where the capture has no cameras."""
+    size: int = 640
+    """Height in pixels of the ring's images."""
+    body: OptionalPath = None
+    """Body model file of the parameters; the open body by default."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Degrade the capture and return a summary."""
+        from pipelines.synth.degrade import DegradeConfig, degrade_capture
+        from smplxpp.body import load_body
+
+        config = DegradeConfig(seed=self.seed, copy=self.copy, rig=self.rig, size=self.size)
+        body = None if self.body is None else load_body(self.body)
+        made = degrade_capture(self.capture, self.out, config, body=body)
+        if not self.json:
+            console = Console()
+            for words in made.left_out:
+                console.print(f"[yellow]left out[/]  {escape(words)}", soft_wrap=True, highlight=False)
+            labels = f"{100 * made.labels_wrong:.1f} % of the labels wrong"
+            line = f"{made.out}: {made.frames} frames, keypoints of {made.cameras} cameras, {labels}"
+            console.print(line, soft_wrap=True, highlight=False)
+        return {**vars(made), "out": str(made.out)}
+
+
+@dataclass(frozen=True)
+class CaptureMasks:
+    """Options of `smplxpp capture masks`. Give one of --matting, --plates and --mediapipe."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of the capture, in any layout of docs/captures.md."""
+    out: Path
+    """Folder to write CAM/CAM_maskFFFFFF.png into, for --masks of the other commands, or `masks` of the capture itself;
+    existing ones are kept."""
+    matting: OptionalPath = None
+    """ONNX model of your own (BiRefNet, ISNet, ...), the best choice."""
+    plates: OptionalPath = None
+    """Folder with photographs of the empty rig: CAM.png, or a folder for each camera with one or several."""
+    mediapipe: bool = False
+    """MediaPipe's segmentation (extra `detect`): rough, without any file of yours."""
+    cameras: OptionalText = None
+    """Names of cameras with commas between; by default all."""
+    frames: OptionalText = None
+    """Frames: numbers and ranges START:STOP:STEP with commas between; by default all."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict:
+        """Write the masks and return how many there are."""
+        from pipelines.captures.masks import write_masks
+        from pipelines.commands.progress import shared_progress
+        from pipelines.runs.folders import keep_out_of_capture
+        from smplxpp.capture import open_capture
+        from smplxpp.core.files.paths import same_place
+
+        if not same_place(self.out, self.capture / "masks"):
+            keep_out_of_capture(self.out, self.capture)
+        capture = open_capture(self.capture, cache_bytes=0)
+        names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
+        frames = selected_frames(self.frames, capture)
+        views = capture.views(names, frames)
+        if not views:
+            raise InputError(f"capture {capture.name}", expected="images to make masks of", received="none")
+        cameras = tuple(dict.fromkeys(camera for camera, _ in views))
+        model_of, identity = self._matte_models(capture, cameras)
+        written = write_masks(capture, model_of, self.out, identity=identity, cameras=cameras, frames=frames)
+        with shared_progress(enabled=not self.json) as progress:
+            for done, _ in enumerate(written, start=1):
+                progress("masks", done / len(views))
+        return {"out": str(self.out), "masks": len(views), "cameras": list(cameras)}
+
+    def _matte_models(self, capture: Capture, cameras: tuple[str, ...]) -> tuple[Callable[[str], MatteModel], str]:
+        """Return the chosen matte model of each camera and its identity for the record."""
+        given = [name for name in ("matting", "plates", "mediapipe") if getattr(self, name)]
+        if len(given) != 1:
+            raise InputError(
+                "options", expected="one of --matting, --plates and --mediapipe", received=" and ".join(given) or "none"
+            )
+        if self.plates is not None:
+            from pipelines.captures.masks import Plates
+
+            plates = Plates(self.plates, cameras)
+            return plates.of_camera, plates.identity
+        model: MatteModel
+        if self.matting is not None:
+            from pipelines.runs.code import sha256_file
+            from smplxpp.capture.masks import MattingModel
+
+            model, identity = MattingModel(self.matting), f"matting model {sha256_file(self.matting)}"
+        else:
+            from smplxpp.detect.person_mask import PersonSegmenter
+
+            model = segmenter = PersonSegmenter()
+            identity = segmenter.identity
+        return lambda camera: model, identity

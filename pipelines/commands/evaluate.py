@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import ClothMode, OptionalPath, OptionalText, require_avatar
+from pipelines.commands.options import ClothMode, Lighting, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import shared_progress
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError

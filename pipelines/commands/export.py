@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.export_bundle import export_bundle
-from pipelines.commands.export_files import FileRequest, export_file, format_of
+from pipelines.commands.export_request import FileRequest, export_file, format_of
 from pipelines.commands.export_solid import SolidRequest, export_solid, tell_solid
 from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from smplxpp.core.errors import InputError
@@ -110,7 +110,7 @@ class Export:
         if not self.json:
             frames = f", {report['frames']} frames" if report["frames"] > 1 else ""
             Console().print(f"{out}: {report['bytes'] / 1e6:.2f} MB{frames}", markup=False, soft_wrap=True)
-            for sentence in report["said"]:
+            for sentence in report["notes"]:
                 Console(stderr=True).print(sentence, markup=False, soft_wrap=True)
         return report
 

@@ -1,21 +1,26 @@
-"""What a file of another program is asked for, and what all kinds of them share."""
+"""Export a run or a bundle to a file or a series of files: options, formats, and the module that writes each."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from pipelines.commands.options import ClothMode
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 SERIES = ""
-"""The suffix of a folder with a file a frame."""
+"""Suffix of a folder with a file a frame."""
 SERIES_FILE = "sequence.json"
-"""Says when each of its files is shown."""
+"""File of a series that gives the time of each frame."""
 PRE_ROLL = 0.7
-"""Seconds of a motion before its first frame that loose clothes follow."""
-# Of the formats that a suffix names, or that stand behind others' suffixes.
+"""Seconds of motion before the first exported frame that loose clothes follow, so that they swing from the start."""
+# Suffixes by format; a suffix of several formats needs --format.
 SUFFIXES: dict[str, tuple[str, ...]] = {
     "avatar": (".avatar",),
     "ply": (".ply",),
@@ -35,14 +40,19 @@ IN_SERIES = ("ply", "spz", "sog", "glb", "obj")
 
 @dataclass(frozen=True, kw_only=True)
 class FileRequest:
-    """What `smplxpp export --out` is asked for.
+    """Options of `smplxpp export --out`.
 
     Attributes:
-        source: a run, or a bundle of its student. out: the file, or the folder of a series. format: one of `SUFFIXES`.
+        source: a run, or a bundle of its student.
+        out: the file, or the folder of a series.
+        format: one of `SUFFIXES`.
         model: "student" or "template", for formats that hold either.
-        params: of the pose or the motion; None: those of the source.
-        rows: of the parameters: the first, the one after the last (None: to the end), and the step.
-        cloth: what moves loose clothes along params. full_harmonics, up: of a PLY. quiet: no bar of progress.
+        params: parameters of the pose or the motion; None takes those of the source.
+        rows: rows of the parameters: the first, the one after the last (None for the end), and the step.
+        cloth: what moves loose clothes along the parameters.
+        full_harmonics: whether a PLY has all harmonics.
+        up: upward axis of a PLY.
+        quiet: whether to hide the progress bar.
     """
 
     source: Path
@@ -58,14 +68,14 @@ class FileRequest:
 
     @property
     def is_series(self) -> bool:
-        """Whether a folder is asked for."""
+        """Return whether the output is a folder with a file a frame."""
         return self.out.suffix == SERIES
 
     def chosen(self, count: int, *, moves: bool) -> range:
-        """Return the rows of `count` that are asked for: of what does not move the first one.
+        """Return the chosen rows of `count`, only the first one for outputs that do not move.
 
         Raises:
-            InputError: none of them.
+            InputError: no row is left.
         """
         first, stop, step = self.rows
         if step < 1:
@@ -78,7 +88,7 @@ class FileRequest:
         return rows if moves else rows[:1]
 
     def rate(self, params: BodyParams) -> float:
-        """Frames a second of what is written."""
+        """Return the frame rate of the output."""
         return frames_a_second(params) / self.rows[2]
 
 
@@ -91,10 +101,11 @@ def format_of(out: Path, named: str) -> str:
     """Return the format of an output.
 
     Args:
-        named: by the user, or "auto".
+        out: output path.
+        named: format chosen by the user, or "auto".
 
     Raises:
-        InputError: a suffix that names none, or another than the format has; a folder of a format that moves by itself.
+        InputError: an unknown suffix, one that the format does not have, or a folder for a format that holds a motion.
     """
     suffix = out.suffix.lower()
     fitting = [name for name, suffixes in SUFFIXES.items() if suffix in suffixes]
@@ -140,3 +151,71 @@ def check_series(out: Path) -> None:
 def series_name(number: int, format: str) -> str:
     """Return the name of a series' file."""
     return f"frame_{number:06d}{SUFFIXES[format][0]}"
+
+
+# Module and function that return the writers of a format, by model; modules are imported when they are needed.
+_SPLATS = ("pipelines.commands.export_splats", "splat_writers")
+_TEMPLATE = ("pipelines.commands.export_template", "template_writers")
+_BY_MODEL = {
+    **{("student", name): _SPLATS for name in ("ply", "spz", "sog", "glb", "usd")},
+    **{("template", name): _TEMPLATE for name in ("glb", "usd", "obj")},
+}
+_STEP = ("pipelines.commands.export_splats", "step_writers")
+_MOTION = ("pipelines.commands.export_template", "motion_writers")
+_FOR_ANY_MODEL = {"onnx": _STEP, "webavatar": _STEP, "bvh": _MOTION, "amass": _MOTION}
+Write = Callable[[Path], None]
+
+
+def export_file(request: FileRequest) -> dict[str, Any]:
+    """Write a file or a series of them, whole or not at all.
+
+    Returns:
+        "out", "format", "frames", "fps" (None for a single pose), "bytes" and "notes", remarks on what was not kept.
+
+    Raises:
+        InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
+        MissingExtraError: a package of an extra that is not installed.
+    """
+    model = "template" if request.format == "obj" else request.model
+    writers = _FOR_ANY_MODEL.get(request.format) or _BY_MODEL.get((model, request.format))
+    if writers is None:
+        raise InputError(
+            f"output {request.out}",
+            expected=f"--model {'template' if model == 'student' else 'student'} for {request.format}",
+            received=f"--model {model}",
+        )
+    for option, given in (("full-harmonics", request.full_harmonics), ("up", request.up != "y")):
+        if given and request.format != "ply":
+            raise InputError(f"option {option}", expected="a PLY", received=request.format)
+    if request.is_series:
+        check_series(request.out)
+    module, function = writers
+    fps, frames, notes = getattr(import_module(module), function)(request)
+    count = _write_series(request, fps, frames) if request.is_series else _write_one(request, frames)
+    return {
+        "out": str(request.out),
+        "format": request.format,
+        "frames": count,
+        "fps": fps,
+        "bytes": sum(path.stat().st_size for path in (request.out.iterdir() if request.is_series else [request.out])),
+        "notes": notes,
+    }
+
+
+def _write_one(request: FileRequest, frames: Iterator[tuple[int, Write]]) -> int:
+    count, write = next(frames)
+    write(request.out)
+    return count
+
+
+def _write_series(request: FileRequest, fps: float | None, frames: Iterator[tuple[int, Write]]) -> int:
+    shown = []
+    # The first frame is made before any file is touched, so that parameters of another body are refused early.
+    first = next(frames)
+    with atomic_folder(request.out) as folder:
+        for k, (_, write) in enumerate(one for part in ([first], frames) for one in part):
+            name = series_name(k, request.format)
+            write(folder / name)
+            shown.append({"file": name, "seconds": k / (fps or 1.0)})
+        (folder / SERIES_FILE).write_text(json.dumps({"fps": fps, "frames": shown}, indent=1))
+    return len(shown)

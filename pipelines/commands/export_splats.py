@@ -1,4 +1,4 @@
-"""A student's splats in files: one pose, a file a frame, or a USD that moves."""
+"""Export a student's splats: one pose, a file a frame, a USD that moves, or the step from pose to Gaussians."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ if TYPE_CHECKING:
     from avatar.formats import Splats
     from avatar.runtime import AvatarBundle, AvatarPlayer
 
-# What turns +y to the axis that is to point up.
+
+# Rotations from +y to the upward axis of the file.
 _TURNS = {"-y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 
-def writers(
+def splat_writers(
     request: FileRequest,
 ) -> tuple[float | None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]:
-    """Return frames a second, what writes each file with the number of frames in it, and what went otherwise.
+    """Return frames a second, what writes each file with the number of frames in it, and remarks.
 
     Raises:
         InputError: no student, parameters of another body, rows that are not there.
@@ -42,9 +43,9 @@ def writers(
     moves = request.is_series or (request.format == "usd" and request.params is not None)
     rows = request.chosen(len(motion), moves=moves)
     fps = request.rate(motion) if moves and len(rows) > 1 else None
-    said = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
+    notes = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
     cloth = request.cloth if request.params is not None or request.cloth != "simulate" else "field"
-    splats = _posed(player, motion, rows, cloth=cloth, said=said)
+    splats = _posed(player, motion, rows, cloth=cloth, notes=notes)
     shown = track(
         splats,
         total=len(rows),
@@ -55,13 +56,13 @@ def writers(
     if request.format == "usd":
         from avatar.formats.splat_usd import write_splat_usd
 
-        return fps, iter([(len(rows), partial(write_splat_usd, frames=shown, fps=fps))]), said
+        return fps, iter([(len(rows), partial(write_splat_usd, frames=shown, fps=fps))]), notes
     write = _writer(request)
-    return fps, ((1, partial(write, splats=one)) for one in shown), said
+    return fps, ((1, partial(write, splats=one)) for one in shown), notes
 
 
 def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
-    """Say how many of the poses training did not see."""
+    """Return a note on the number of poses far from those of the training, if there are any."""
     from avatar.runtime.motion import pose_range
 
     limits = pose_range(bundle)
@@ -75,9 +76,9 @@ def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
 
 
 def _posed(
-    player: AvatarPlayer, motion: BodyParams, rows: range, *, cloth: ClothMode, said: list[str]
+    player: AvatarPlayer, motion: BodyParams, rows: range, *, cloth: ClothMode, notes: list[str]
 ) -> Iterator[Splats]:
-    """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
+    """Yield the splats of the chosen rows; loose clothes are simulated from `PRE_ROLL` before the first."""
     from avatar.formats import world_splats
 
     rate = frames_a_second(motion)
@@ -91,11 +92,11 @@ def _posed(
         posed = player.step(motion.frame(k), 1.0 / rate, way=way)
         if k in rows:
             yield world_splats(posed)
-    said += player.said
+    notes += player.notes
 
 
 def _writer(request: FileRequest) -> Callable[..., None]:
-    """Return what writes one pose: `write(path, splats=...)`."""
+    """Return the function that writes one pose: `write(path, splats=...)`."""
     from avatar import formats
 
     if request.format != "ply":
@@ -110,3 +111,21 @@ def _writer(request: FileRequest) -> Callable[..., None]:
         formats.write_splat_ply(path, turned.padded() if request.full_harmonics else turned)
 
     return write
+
+
+def step_writers(request: FileRequest) -> tuple[None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]:
+    """Return the function that writes the step from pose to Gaussians as ONNX or for WebAvatar's players, and notes.
+
+    Raises:
+        InputError: no student.
+    """
+    bundle = open_student(request.source, exact=True)
+    if request.format == "onnx":
+        from avatar.formats.onnx_step import write_onnx
+
+        return None, iter([(1, partial(write_onnx, bundle=bundle))]), []
+    from avatar.formats.webavatar import NOT_FILLED, write_webavatar
+    from avatar.runtime import AvatarPlayer
+
+    notes = [f"left out: {sentence}" for sentence in NOT_FILLED]
+    return None, iter([(1, partial(write_webavatar, player=AvatarPlayer(bundle)))]), notes

@@ -1,4 +1,4 @@
-"""A run's template in files: rigged as GLB or USD, its surface as OBJ, a file a frame where it moves."""
+"""Export a template as rigged GLB or USD or as OBJ, a file a frame where it moves, and motions as BVH or AMASS."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
+from pipelines.commands.animate_student import motion_for, open_student
+from pipelines.commands.export_bundle import SUFFIX
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
 from pipelines.commands.templates import load_params_for, load_run_template
 from pipelines.runs.layout import GARMENTS
@@ -19,13 +21,15 @@ from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
+from smplxpp.export.amass import write_amass
+from smplxpp.export.bvh import write_bvh
 from smplxpp.template.template import Template
 
 Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]
 
 
-def writers(request: FileRequest) -> Writers:
-    """Return frames a second, what writes each file with the number of frames in it, and what went otherwise.
+def template_writers(request: FileRequest) -> Writers:
+    """Return frames a second, what writes each file with the number of frames in it, and remarks.
 
     Raises:
         InputError: no template, parameters of another body, rows that are not there, a series without a motion.
@@ -59,22 +63,22 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
             raise InputError("option params", expected="a motion, for a file a frame", received="none")
         return None, iter([(1, partial(write_obj, template=template))]), []
     rows = request.chosen(len(params), moves=request.is_series)
-    said: list[str] = []
+    notes: list[str] = []
     surfaces = track(
-        _posed(request, template, params, rows, said),
+        _posed(request, template, params, rows, notes),
         total=len(rows),
         description="frames",
         console=Console(stderr=True),
         disable=request.quiet or len(rows) == 1,
     )
     files = ((1, partial(write_obj, template=replace(template, vertices=surface))) for surface in surfaces)
-    return request.rate(params) if request.is_series else None, files, said
+    return request.rate(params) if request.is_series else None, files, notes
 
 
 def _posed(
-    request: FileRequest, template: Template, params: BodyParams, rows: range, said: list[str]
+    request: FileRequest, template: Template, params: BodyParams, rows: range, notes: list[str]
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
-    """Pose the chosen rows; loose clothes go through all of them, from a moment before the first."""
+    """Yield the surfaces of the chosen rows; loose clothes are simulated from `PRE_ROLL` before the first."""
     path, rate = request.source / GARMENTS, frames_a_second(params)
     if request.cloth == "field":
         raise InputError("option cloth", expected="simulate or skin for the template", received="field")
@@ -84,7 +88,34 @@ def _posed(
         return
     begin = max(0, rows[0] - round(PRE_ROLL * rate))
     whole = params.select(slice(begin, rows[-1] + 1))
-    surfaces = play(template, load_garments(path, template), whole, fps=rate, said=said)
+    surfaces = play(template, load_garments(path, template), whole, fps=rate, notes=notes)
     for k, surface in enumerate(surfaces, start=begin):
         if k in rows:
             yield surface
+
+
+def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Callable[[Path], None]]], list[str]]:
+    """Return frames a second, what writes the file with the number of frames in it, and no remarks.
+
+    Raises:
+        InputError: no motion, no body, parameters of another body, rows that are not there.
+    """
+    if request.params is None:
+        raise InputError("option params", expected=f"a motion to write as {request.format}", received="none")
+    if request.source.suffix.lower() == SUFFIX:
+        from avatar.runtime.skeleton import skeleton_body
+
+        bundle = open_student(request.source)
+        body = skeleton_body(bundle)
+        joints, params = body.v_template, motion_for(bundle, request.params)
+    else:
+        template = load_run_template(request.source)
+        body, joints, params = template.body, template.joints, load_params_for(template, request.params)
+    rows = request.chosen(len(params), moves=True)
+    fps = request.rate(params)
+    chosen = replace(params.select(list(rows)), fps=fps)
+    if request.format == "bvh":
+        write: Callable[[Path], None] = partial(write_bvh, body=body, params=chosen, joints=joints)
+    else:
+        write = partial(write_amass, body=body, params=chosen)
+    return fps, iter([(len(chosen), write)]), []

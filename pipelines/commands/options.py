@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.files.panorama_file import read_panorama
+from smplxpp.core.light import Irradiance, Relighting
+from smplxpp.core.validation import require_positive
 
 # Help shows them as what they take.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
@@ -34,3 +38,52 @@ def require_avatar(purpose: str) -> None:
     for package in _AVATAR_PACKAGES:
         if find_spec(package) is None:
             raise MissingExtraError(package, extra="avatar", purpose=purpose)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Options of another light."""
+
+    environment: OptionalPath = None
+    """Show the person in the light of this panorama: equirectangular, Radiance (.hdr) or OpenEXR (.exr, extra
+    `exr`), straight up in its first row."""
+    environment_turn: float = 0.0
+    """Degrees about the vertical by which that light is turned."""
+    exposure: OptionalFloat = None
+    """Factor on that light; by default it is as bright in the mean as white light, so that colours keep their level."""
+    capture_light: OptionalPath = None
+    """Panorama of the light of the capture, which is divided out; by default white light, the same from everywhere."""
+
+    def relighting(self) -> Relighting | None:
+        """Read the light; None where none is asked for.
+
+        Raises:
+            InputError: no such picture, no light in it; options of a light without one.
+        """
+        if self.exposure is not None:
+            require_positive("option exposure", self.exposure)
+        if self.environment is None:
+            if self.environment_turn or self.exposure is not None or self.capture_light is not None:
+                raise InputError(
+                    "option environment",
+                    expected="a panorama, for --environment-turn, --exposure and --capture-light",
+                    received="none",
+                )
+            return None
+        light = read_light(self.environment, turn=self.environment_turn).exposed(self.exposure)
+        captured = Irradiance.uniform() if self.capture_light is None else read_light(self.capture_light).exposed()
+        return Relighting(light, captured)
+
+
+def read_light(path: Path, *, turn: float = 0.0) -> Irradiance:
+    """Read a panorama as light.
+
+    Raises:
+        InputError: no such picture, or no light in it.
+    """
+    try:
+        return Irradiance.of_environment(read_panorama(path), turn=turn)
+    except InputError as error:
+        if error.subject != "panorama":
+            raise
+        raise InputError(f"light {path}", expected=error.expected, received=error.received) from None

@@ -12,8 +12,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
-from pipelines.commands.lighting import Lighting
-from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
+from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Lighting, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES
 from pipelines.commands.talking_person import live_lips
 from smplxpp.core.errors import InputError

@@ -75,7 +75,7 @@ class ClothStage(ModelStage):
             "loose": [garment.part for garment in found.garments],
             "particles": {garment.part: len(garment.particles) for garment in found.garments},
             "calibration": {one.part: _numbers_of(one, found.outlines.get(one.part)) for one in found.calibrations},
-            "said": found.notes,
+            "notes": found.notes,
             "mean": {},
             "iterations": self.iterations,
             "iterations_done": self.iterations,

@@ -75,7 +75,7 @@ class ClothDriver:
         config: how motions are followed.
 
     Attributes:
-        said: what went otherwise than asked for, a sentence each, in order.
+        notes: remarks on restarts, gaps and failures, a sentence each, in order.
 
     Raises:
         InputError: no garment, or one of another template.
@@ -91,7 +91,7 @@ class ClothDriver:
             raise InputError(
                 f"garment {unknown[0]!r}", expected="one that was cut from this template", received="another's"
             )
-        self.said: list[str] = []
+        self.notes: list[str] = []
         # Vertices of the template that steps need; the others are not posed.
         self._rows = np.unique(np.concatenate([np.r_[g.collider.vertices, g.particles] for g in garments]))
         self._fine = np.concatenate([g.vertices for g in garments])
@@ -154,7 +154,7 @@ class ClothDriver:
             InputError: several frames, no positive time, parameters that the body refuses.
         """
         if params is None:
-            self.said.append(f"no pose after {self._time:.2f} s: the clothes stay as they are")
+            self.notes.append(f"no pose after {self._time:.2f} s: the clothes stay as they are")
             return self._shape
         if len(params) != 1:
             raise InputError("pose of a step", expected="one frame", received=f"{len(params)} frames")
@@ -165,10 +165,10 @@ class ClothDriver:
         require_positive("seconds of a step", seconds)
         self._time += seconds
         if seconds > LONGEST_STEP:
-            self.said.append(f"{seconds:.2f} s without a pose before {self._time:.2f} s: the clothes start anew")
+            self.notes.append(f"{seconds:.2f} s without a pose before {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
         elif not self._advance(posed, seconds):
-            self.said.append(f"a leap at {self._time:.2f} s: the clothes start anew")
+            self.notes.append(f"a leap at {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
         self._last = params
         return self._shaped(posed)
@@ -189,7 +189,7 @@ class ClothDriver:
             self._advance(posed, _RAMP_STEP, at_any_speed=True)
         for thread in self._threads:
             if buried := thread.buried():
-                self.said.append(
+                self.notes.append(
                     f"{thread.garment.part} at {self._time:.2f} s: {buried} of {len(thread.garment.particles)} "
                     "particles start inside the body; they come out as it moves"
                 )
@@ -207,9 +207,9 @@ class ClothDriver:
         if farthest > self.config.teleport * seconds and not at_any_speed:
             return False
         for thread in self._threads:
-            said = thread.advance(places, seconds, self._threads)
-            if said:
-                self.said.append(f"{thread.garment.part} at {self._time:.2f} s: {said}")
+            note = thread.advance(places, seconds, self._threads)
+            if note:
+                self.notes.append(f"{thread.garment.part} at {self._time:.2f} s: {note}")
         return True
 
     def _places(self, posed: PosedBody) -> Float32[np.ndarray, "R 3"]:

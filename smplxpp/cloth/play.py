@@ -22,14 +22,14 @@ def play(
     fps: float,
     config: DriverConfig | None = None,
     smoothing: float = SMOOTHING,
-    said: list[str] | None = None,
+    notes: list[str] | None = None,
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
     """Yield the posed surface of every frame, metres; the clothes start cold before the first one.
 
     Args:
         params: T frames, evenly spaced. fps: of them.
         config: of the driver. smoothing: of what the clothes follow (`smplxpp.cloth.following`), seconds.
-        said: takes the sentences of the driver on what went otherwise than asked for.
+        notes: list to which the remarks of the driver are added.
     """
     driver = ClothDriver(template, garments, config)
     weights = template.weights.dense()
@@ -42,6 +42,6 @@ def play(
         rest[:count] = posed.rest_vertices[0]
         rest[shape.vertices] += shape.share[:, None] * shape.displacements
         blended = (weights @ posed.posed_from_rest[0, :, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-        if said is not None:
-            said += driver.said[len(said) :]
+        if notes is not None:
+            notes += driver.notes[len(notes) :]
         yield np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]

@@ -52,7 +52,7 @@ def test_a_cold_start_ends_where_cloth_hangs():
     still = one.particles(PART)
     for _ in range(10):
         one.step(standing(at=(0.4, 0.0, 0.2), turned=0.5), 1 / 30)
-    assert one.said == []
+    assert one.notes == []
     assert np.abs(one.particles(PART) - still).max() < 0.05
     assert np.abs(one.particles(PART) - still).mean() < 0.01
     np.testing.assert_array_equal(shape.vertices, garment().vertices)
@@ -134,7 +134,7 @@ def test_a_long_way_is_followed_without_a_jerk():
     walk, still = driver(), driver()
     for k in range(50):
         shapes = [one.step(standing(at=at), 1 / 30) for one, at in ((walk, (0.2 * k, 0.0, 0.0)), (still, (0, 0, 0)))]
-    assert walk.said == []
+    assert walk.notes == []
     place = walk.particles(PART) - np.float32([0.2 * 49, 0.0, 0.0])
     pinned = garment().pinned
     np.testing.assert_allclose(place[pinned], skinned()[pinned], atol=1e-4)
@@ -156,9 +156,9 @@ def test_frames_a_second_hardly_matter():
 )
 def test_a_leap_and_a_gap_start_anew_and_say_so(at, seconds, why):
     one = followed(30.0, 0.3)
-    assert one.said == []
+    assert one.notes == []
     shape = one.step(standing(at=at), seconds)
-    assert len(one.said) == 1 and why in one.said[0] and "start anew" in one.said[0]
+    assert len(one.notes) == 1 and why in one.notes[0] and "restart" in one.notes[0]
     fresh = driver()
     np.testing.assert_array_equal(shape.displacements, fresh.step(standing(at=at), 0.0).displacements)
     # From there on as well.
@@ -172,18 +172,18 @@ def test_restart_forgets():
     np.testing.assert_array_equal(
         one.step(standing(), 1 / 30).displacements, driver().step(standing(), 0.0).displacements
     )
-    assert one.said == []
+    assert one.notes == []
 
 
 def test_a_pose_that_is_not_known_holds_the_cloth_and_is_said():
     one = followed(30.0, 0.3)
     before = one.particles(PART)
     held = one.step(None, 1 / 30)
-    assert "no pose" in one.said[0]
+    assert "no pose" in one.notes[0]
     np.testing.assert_array_equal(one.particles(PART), before)
     assert np.isfinite(held.displacements).all()
     one.step(swaying(0.3 + 2 / 30), 2 / 30)  # seconds since the last step that had one
-    assert len(one.said) == 1
+    assert len(one.notes) == 1
     assert np.abs(one.particles(PART) - followed(30.0, 0.3 + 2 / 30).particles(PART)).mean() < 0.005
 
 
@@ -191,14 +191,14 @@ def test_motion_may_begin_with_unknown_poses():
     one = driver()
     for _ in range(3):
         shape = one.step(None, 1 / 30)
-    assert not shape.displacements.any() and len(one.said) == 3
+    assert not shape.displacements.any() and len(one.notes) == 3
     assert one.step(standing(), 1 / 30).displacements.any()
 
 
 def test_a_simulation_that_breaks_falls_back_to_the_body_and_says_so():
     one = driver(replace(QUICK, most_stretch=0.01))
     shape = one.step(standing(), 0.0)
-    assert one.said and all("broke down" in sentence and PART in sentence for sentence in one.said)
+    assert one.notes and all("broke down" in sentence and PART in sentence for sentence in one.notes)
     np.testing.assert_allclose(one.particles(PART), skinned(), atol=1e-5)
     moving = shape.share > 0
     assert np.linalg.norm(shape.displacements[moving], axis=1).mean() < 0.004  # a coarse mesh carries it
@@ -208,18 +208,18 @@ def test_a_body_that_starts_in_collision_is_said_and_comes_out():
     lifted = standing(lifted=1.0)
     one = driver(DriverConfig(ramp=0.0, hold=0.0))
     one.step(lifted, 0.0)
-    assert any("start inside the body" in sentence for sentence in one.said)
-    count = len(one.said)
+    assert any("start inside the body" in sentence for sentence in one.notes)
+    count = len(one.notes)
     for _ in range(30):
         shape = one.step(lifted, 1 / 30)
-    assert len(one.said) == count  # nothing broke
+    assert len(one.notes) == count  # nothing broke
     assert np.isfinite(shape.displacements).all()
 
 
 def test_surfaces_along_a_motion_are_those_of_the_steps():
     motion = BodyParams.concatenate([swaying(k / 30) for k in range(4)])
-    template, one, said = person(), driver(), []
-    for k, surface in enumerate(play(template, [garment()], motion, fps=30.0, config=QUICK, said=said)):
+    template, one, notes = person(), driver(), []
+    for k, surface in enumerate(play(template, [garment()], motion, fps=30.0, config=QUICK, notes=notes)):
         shape = one.step(motion.frame(k), 1 / 30)
         plain = template.pose(motion.frame(k))[0]
         others = np.setdiff1d(np.arange(template.vertex_count), shape.vertices)
@@ -228,7 +228,7 @@ def test_surfaces_along_a_motion_are_those_of_the_steps():
         np.testing.assert_allclose(surface[at_pins], plain[at_pins], atol=1e-6)
     moving = garment().particles[garment().depth > 0.1]
     assert np.abs(surface[moving] - one.particles(PART)[garment().depth > 0.1]).mean() < 0.003
-    assert said == []
+    assert notes == []
 
 
 def test_what_is_not_asked_for_rightly_is_refused():

@@ -48,9 +48,9 @@ def last(motion: BodyParams, fps: float, **options) -> np.ndarray:
 
 def test_three_frames_a_second_swing_as_thirty_do():
     """Every one of them began anew, and said so: a third of a second was a gap."""
-    said: list[str] = []
-    slow = last(swung(3.0, 3.0), 3.0, said=said)
-    assert said == []
+    notes: list[str] = []
+    slow = last(swung(3.0, 3.0), 3.0, notes=notes)
+    assert notes == []
     fine, skinned = last(swung(30.0, 3.0), 30.0), person().pose(swaying(3.0))[0][garment().vertices]
     assert np.linalg.norm(slow - fine, axis=1).mean() < 0.5 * np.linalg.norm(skinned - fine, axis=1).mean()
 

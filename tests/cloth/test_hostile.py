@@ -66,7 +66,7 @@ def test_particles_put_anywhere_come_back_to_the_body_and_that_is_said(value):
     with np.errstate(all="ignore"):
         shape = one.step(standing(), 1 / 30)
     assert np.isfinite(shape.displacements).all()
-    assert any("broke down" in said for said in one.said)
+    assert any("broke down" in said for said in one.notes)
 
 
 @pytest.mark.parametrize("jump", [0.05, 0.5, 5.0, 500.0])
@@ -77,7 +77,7 @@ def test_motions_that_shake_wildly_keep_the_cloth_finite(jump):
         shape = one.step(standing(at=at, turned=float(rng.normal()), lifted=float(rng.uniform(0, 1))), 1 / 30)
         assert np.isfinite(shape.displacements).all()
         assert np.linalg.norm(shape.displacements, axis=1).max() < 3.0
-    assert bool(one.said) == (jump >= 0.5)  # 12 m a second are a leap
+    assert bool(one.notes) == (jump >= 0.5)  # 12 m a second are a leap
 
 
 def test_frames_of_hostile_numbers_of_a_motion_are_passed_over():
@@ -104,7 +104,7 @@ def test_torn_and_inside_out_garments_are_simulated(damage):
         shape = one.step(standing(lifted=lifted), 1 / 30)
         assert np.isfinite(shape.displacements).all()
         assert np.linalg.norm(shape.displacements, axis=1).max() < 0.6
-    assert not any("broke down" in said for said in one.said)
+    assert not any("broke down" in said for said in one.notes)
 
 
 def test_a_garment_without_a_pinned_particle_falls_and_breaks_nothing():

@@ -46,7 +46,7 @@ def film(run, params, out, **options) -> tuple[dict, np.ndarray]:
 def test_clothes_that_training_found_swing(run, params, tmp_path):
     simulated, moving = film(run, params, tmp_path / "simulated")
     skinned, stiff = film(run, params, tmp_path / "skinned", cloth="skin")
-    assert simulated["simulated"] == [PART] and skinned["simulated"] == [] and simulated["said"] == []
+    assert simulated["simulated"] == [PART] and skinned["simulated"] == [] and simulated["notes"] == []
     changed = (moving != stiff).any(axis=3)
     assert changed.any(axis=(1, 2)).all()
     rows = np.flatnonzero(changed.any(axis=(0, 2)))
@@ -71,7 +71,7 @@ def test_frames_without_a_pose_are_said_and_the_film_goes_on(run, params, tmp_pa
     np.savez(tmp_path / "holes.npz", **arrays)
     with pytest.warns(GeometryWarning, match=f"2 of {FRAMES} frames hold NaN or infinity, the first 2"):
         result, pictures = film(run, tmp_path / "holes.npz", tmp_path / "film")
-    assert result["frames"] == len(pictures) == FRAMES and result["said"] == []
+    assert result["frames"] == len(pictures) == FRAMES and result["notes"] == []
     with pytest.warns(GeometryWarning):
         filled = Driving().load(tmp_path / "holes.npz", person().body)
     np.testing.assert_array_equal(np.delete(filled.transl, [2, FRAMES - 1], 0), np.delete(truth, [2, FRAMES - 1], 0))

@@ -11,7 +11,7 @@ from PIL import Image
 
 from avatar.models.model_file import save_avatar
 from pipelines.commands.animate import Animate
-from pipelines.commands.lighting import Lighting
+from pipelines.commands.options import Lighting
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
 from smplxpp.core.light import panorama_directions
@@ -76,7 +76,7 @@ def test_poses_beyond_the_training_are_said_and_held_back(folder, tmp_path):
         command = Animate(
             folder / "me.avatar", tmp_path / "far.npz", tmp_path / outside, height=64, json=True, outside=outside
         )
-        said[outside] = command.run()["said"]
+        said[outside] = command.run()["notes"]
     assert "of 6 frames" in said["keep"][0] and "--outside clamp" in said["keep"][0]
     assert "held back" in said["clamp"][0]
     kept, held = pictures(tmp_path / "keep"), pictures(tmp_path / "clamp")

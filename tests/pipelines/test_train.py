@@ -113,7 +113,7 @@ def test_the_models_load_and_the_students_blend_shapes_fit_the_template(trained)
 
 def test_a_template_without_loose_clothes_simulates_nothing_and_has_nothing_to_say(trained):
     numbers = read_manifest(trained / "83_cloth")["numbers"]
-    assert numbers["loose"] == numbers["said"] == []
+    assert numbers["loose"] == numbers["notes"] == []
     assert load_garments(trained / "83_cloth" / "garments.npz", template()) == []
 
 
@@ -124,7 +124,7 @@ def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so_f
     with caplog.at_level("INFO"):
         assert train(run, capture, "--until", "cloth") == 0
     words = [(record.levelname, record.message) for record in caplog.records]
-    (said,) = read_manifest(run / "83_cloth")["numbers"]["said"]
+    (said,) = read_manifest(run / "83_cloth")["numbers"]["notes"]
     assert "which pose" in said and words.count(("WARNING", f"loose clothes: {said}")) == 1
     assert words.index(("WARNING", f"loose clothes: {said}")) < min(
         k for k, (_, word) in enumerate(words) if word.startswith("70_fit")

@@ -133,7 +133,7 @@ def test_loose_clothes_are_simulated_as_in_torch(tmp_path):
         splats = player.step(frame, 0.05)
     with torch.no_grad():
         truth = it(it.rig.with_cloth(it.rig.pose(frame), shape), torch.tensor(EYE)[None])
-    assert player.said == driver.said
+    assert player.notes == driver.notes
     off = np.abs(splats.means - truth.gaussians.means[ordered(it)].numpy())
     assert off.max() < 2e-3 and off.mean() < 5e-5  # float32 places of particles come apart a little
     bare = AvatarPlayer(tmp_path / "me.avatar", threads=1).pose(frame).means

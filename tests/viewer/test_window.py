@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipelines.cli import main
-from pipelines.commands import label as label_command
+from pipelines.commands import view as label_command
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.register_config import RegisterInputs

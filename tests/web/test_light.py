@@ -12,7 +12,7 @@ import pytest
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.relighting import facing_normals
 from pipelines.cli import main
-from pipelines.commands.lighting import read_light
+from pipelines.commands.options import read_light
 from pipelines.web.page import PageContent, PageLight, page_files
 from pipelines.web.server import PageServer
 from smplxpp.core.light import Irradiance, Relighting, panorama_directions

@@ -215,7 +215,7 @@ def cloth_section(record: StageRecord) -> Section:
     )
     return Section(
         title="Loose clothes",
-        text=(_WHAT, *numbers["said"]),
+        text=(_WHAT, *numbers["notes"]),
         tables=(
             Table(
                 columns,

@@ -121,9 +121,9 @@ def test_poses_that_training_did_not_see_are_said(folder, tmp_path, capsys):
     far = replace(dance(), body_pose=dance().body_pose + np.linspace(0.0, 2.0, len(dance()))[:, None], fps=20.0)
     far.save(tmp_path / "far.npz")
     options = ("--out", tmp_path / "s", "--format", "spz", "--params", tmp_path / "far.npz")
-    (sentence,) = export(capsys, folder / "me.avatar", *options)["said"]
+    (sentence,) = export(capsys, folder / "me.avatar", *options)["notes"]
     assert "of 6 frames, the first at" in sentence
-    assert export(capsys, folder / "me.avatar", *options, "--stop", 1)["said"] == []
+    assert export(capsys, folder / "me.avatar", *options, "--stop", 1)["notes"] == []
 
 
 def test_the_template_moves_as_glb_and_stands_as_obj(folder, tmp_path, capsys):
@@ -185,7 +185,7 @@ def test_the_step_becomes_onnx(folder, tmp_path, capsys):
 
 def test_webavatars_file_says_what_it_leaves_out(folder, tmp_path, capsys):
     report = export(capsys, folder / "me.avatar", "--out", tmp_path / "a.npz", "--format", "webavatar")
-    assert report["format"] == "webavatar" and any("ctrl_pt_basis" in sentence for sentence in report["said"])
+    assert report["format"] == "webavatar" and any("ctrl_pt_basis" in sentence for sentence in report["notes"])
     with np.load(tmp_path / "a.npz") as stored:
         assert len(stored["_xyz"]) == len(pose(folder, 0))
     report = export(capsys, folder / "me.avatar", "--out", tmp_path / "b.npz")

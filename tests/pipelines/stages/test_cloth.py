@@ -27,7 +27,7 @@ def test_the_report_says_what_was_found_and_what_was_not(tmp_path):
                 replace(found.calibrations[0], part="outer", moves=False, drag_spread=None, pin_spread=None), None
             )
         },
-        "said": ["hair: nothing holds it"],
+        "notes": ["hair: nothing holds it"],
     }
     record = run_stage(tmp_path, stage_of("83_cloth"), lambda folder: StageOutput(_checks(found), numbers))
     section = cloth_section(record)
