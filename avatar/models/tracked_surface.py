@@ -1,4 +1,4 @@
-"""Surfaces followed through a sequence: displacements of control points, frame by frame."""
+"""Tracked surfaces: control points that interpolate displacements to a template, and their values frame by frame."""
 
 from __future__ import annotations
 
@@ -20,22 +20,19 @@ from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose, Rig
 from smplxpp.template.template import Template
 
-HALF = 1e-2
-"""Metres of expected error at which a vertex counts half."""
-STILL = 1e-3
-"""Metres: motion off the clothes much below this costs nearly nothing."""
-SWINGS = 5e-3
-"""Metres of motion at which clothes near the skin are half believed to hang there no longer: more costs little more."""
-
 
 class ControlCage(nn.Module):
     """Interpolates displacements of K control points of a template to its vertices, part by part.
 
     Args:
-        rig: that of the template. count: K.
+        rig: of the template.
+        count: K, at most.
 
     Attributes:
-        vertices: (K,) of the template, those that the control points are.
+        vertices: (K,) vertices of the template that are the control points.
+        off_clothes: (K,) whether a control point lies on body, hair or shoes.
+        from_body: (K,) distance of control points from the naked body in the T-pose, metres.
+        edges: (E, 2) pairs of neighbouring control points.
     """
 
     vertices: Tensor
@@ -53,47 +50,53 @@ class ControlCage(nn.Module):
         self.register_buffer("vertices", torch.tensor(control.vertices, device=rig.device))
         self.register_buffer("off_clothes", ~rig.cloth_mask[torch.as_tensor(control.vertices, device=rig.device)])
         self.register_buffer("from_body", torch.tensor(_from_body(rig.template, control.vertices), device=rig.device))
-        # Two control points are neighbours if some vertex has them as its two nearest.
+        # Edges join two control points that are the two nearest of some vertex.
         pairs = neighbours[:, :2].sort(dim=1).values
         self.register_buffer("edges", torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0))
 
     def forward(self, controls: Float[Tensor, "K C"]) -> Float[Tensor, "V C"]:
-        """Return the displacements of the vertices, metres, or other values, from those of the control points."""
+        """Interpolate displacements, metres, or other values, from control points to vertices."""
         return self.rows(controls)
 
     def roughness(self, controls: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
-        """Return the mean squared difference of neighbours, square metres."""
+        """Return the mean squared difference of neighbouring control points, m^2: a membrane energy."""
         return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
 
     def motion_off_clothes(self, controls: Float[Tensor, "K 3"], *, reach: float = 0.0) -> Float[Tensor, ""]:
-        """Return by how many metres, on average, points of body, hair and shoes leave skinning; 0 without any.
+        """Return the mean displacement from skinning of control points off the clothes, metres; 0 without any.
+
+        Body, hair and shoes have the pseudo-Huber penalty `m = sqrt(|d|^2 + e^2) - e`, linear beyond e = 1 mm. Clothes
+        within `reach` of the skin add the saturating penalty `S m / (S + m)`, S = 5 mm, weighted by `1 - distance /
+        reach`. It holds a shirt on the skin, and costs a skirt that lies on the thighs in the T-pose little more than
+        S when it swings.
 
         Args:
-            reach: metres. Points of the clothes count too, on the skin as much as the body's, less with the distance
-                from it and not at all beyond; 0: none does. Their d counts as `d S / (S + d)`, `S = SWINGS`: a shirt is
-                held, and a skirt that lies on the thighs in the T-pose is let go as soon as it swings.
+            controls: displacements d, metres.
+            reach: distance from the naked body within which clothes count, metres; 0: none does.
         """
+        rounding, saturation = 1e-3, 5e-3  # metres: e and S
         count = max(int(self.off_clothes.sum()), 1)
-        moved = (controls.square().sum(-1) + STILL**2).sqrt() - STILL
+        moved = (controls.square().sum(-1) + rounding**2).sqrt() - rounding
         total = moved[self.off_clothes].sum() / count
         if reach > 0.0:
             tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
-            total = total + (tight * SWINGS * moved / (SWINGS + moved)).sum() / count
+            total = total + (tight * saturation * moved / (saturation + moved)).sum() / count
         return total
 
 
 def _from_body(template: Template, vertices: np.ndarray) -> np.ndarray:
-    """(K,) float32 distance of vertices from the naked body in the T-pose, metres."""
+    """Return the distance (K,) of vertices from the naked body in the T-pose, metres, float32."""
     body = template.part_mesh("body")
     points = template.vertices[vertices]
     return np.sqrt(igl.point_mesh_squared_distance(points, body.vertices, body.faces)[0]).astype(np.float32)
 
 
 class TrackedAvatar(nn.Module):
-    """Gaussians on a mesh that control points move in one frame at a time (an `AvatarModel`).
+    """Gaussians on a mesh that control points displace, one frame at a time (an `AvatarModel`).
 
     Args:
-        rig: that of the template. gaussians: those on it; they stay as they are.
+        rig: of the template.
+        gaussians: on the template; they stay fixed.
         count: number of control points.
         still_body: control points on the body do not move. Not applied to a template that is a body alone.
     """
@@ -106,13 +109,13 @@ class TrackedAvatar(nn.Module):
         self.gaussians = LearnedGaussians(gaussians)
         self.cage = ControlCage(rig, count)
         self.controls = nn.Parameter(torch.zeros(self.cage.count, 3))
-        """Displacements (K, 3), metres, in the frame that is being followed."""
+        """Displacements (K, 3), metres, in the frame that is being tracked."""
         moves = ~rig.body_mask if still_body and not rig.body_mask.all() else torch.ones_like(rig.body_mask)
         self.register_buffer("moves", moves[self.cage.vertices, None].float(), persistent=False)
         self.to(rig.device)
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
-        """Pose the avatar, displaced by the control points as they stand."""
+        """Pose the avatar with the current displacements of its control points."""
         displacements = self.cage(self.moves * self.controls)
         vertices = self.rig.skin(pose, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
@@ -124,13 +127,14 @@ class TrackedAvatar(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A surface followed through frames.
+    """A surface tracked through T frames.
 
     Attributes:
-        row: each frame's row of the controls. cage: interpolates them.
-        controls: metres, 0 in a frame whose surface the template is.
-        sigma: distance of the control points from the truth that is to be expected, metres; None: nobody knows.
-        drift: of the control points: how far from its start a way back ended, metres; None: nobody went back.
+        row: row of the controls, by frame.
+        controls: displacements of control points, metres; 0 in the reference frame.
+        cage: interpolates control points to vertices.
+        sigma: expected error of the control points, metres; None: unknown.
+        drift: round-trip error of the control points, metres; None: not measured.
     """
 
     row: dict[int, int]
@@ -140,23 +144,24 @@ class Track:
     drift: Float[Tensor, " K"] | None = None
 
     def displacements(self, frame: int) -> Float[Tensor, "V 3"]:
-        """Return the displacements of a frame, metres along the axes of the T-pose."""
+        """Return the displacements of all vertices in a frame, metres along the axes of the T-pose."""
         return self.cage(self.controls[self.row[frame]])
 
     def expected_error(self, frame: int) -> Float[Tensor, " V"]:
-        """Return how far from the truth the vertices of a frame are to be expected, metres; 0 where nobody knows."""
+        """Return the expected error of the vertices in a frame, metres; 0 if it is unknown."""
         sigma = (
             torch.zeros_like(self.controls[0, :, :1]) if self.sigma is None else self.sigma[self.row[frame], :, None]
         )
         return self.cage(sigma)[:, 0]
 
     def confidence(self, frame: int) -> Float[Tensor, " V"]:
-        """Return in (0, 1] how much a frame's vertices count in what learns from them: `1 / (1 + (e / HALF)^2)`."""
-        return 1.0 / (1.0 + (self.expected_error(frame) / HALF).square())
+        """Return the weight of a frame's vertices as training data, in (0, 1]: `1 / (1 + (e / 1 cm)^2)`."""
+        half_error = 1e-2  # metres of expected error at which a vertex has half the weight
+        return 1.0 / (1.0 + (self.expected_error(frame) / half_error).square())
 
     def errors_of_clothes(self) -> dict[str, float]:
-        """Return the mean `expected_error` and `drift`, metres, of control points on clothes, of all where none are."""
+        """Return mean `expected_error` and `drift`, metres, of control points on clothes, or of all without clothes."""
         clothes = ~self.cage.off_clothes
         clothes = clothes if bool(clothes.any()) else ~clothes
-        told = {"expected_error": self.sigma, "drift": self.drift}
-        return {name: float(value[..., clothes].mean()) for name, value in told.items() if value is not None}
+        values = {"expected_error": self.sigma, "drift": self.drift}
+        return {name: float(value[..., clothes].mean()) for name, value in values.items() if value is not None}

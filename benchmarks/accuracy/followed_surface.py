@@ -93,8 +93,8 @@ class FollowedSurface:
             "halvings": [level.halvings for level in config.levels],
             "rows": {},
         }
-        for every, simulate, held in product(self.every, self.simulate, self.held or (config.held,)):
-            own = replace(config, simulate=simulate, held=held)
+        for every, simulate, held in product(self.every, self.simulate, self.held or (config.prior_weight,)):
+            own = replace(config, simulate=simulate, prior_weight=held)
             row = bench.row(own, every, seconds=self.seconds)
             name = f"photographs, every {every}, {'foreseen' if simulate else 'carried on'}"
             name += f", held {held:g}" if self.held else ""

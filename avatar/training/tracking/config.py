@@ -1,4 +1,4 @@
-"""What decides how a surface is followed."""
+"""Configuration of the surface tracking: resolution levels, weights of the loss, predictions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from smplxpp.core.validation import require_at_least
 
 @dataclass(frozen=True)
 class Level:
-    """A part of the steps of a frame.
+    """A resolution of the photographs and the steps of a frame at it.
 
     Attributes:
-        halvings: of the images. steps: of Adam. lr: metres, at its first step; it falls to `LEVEL_END` of that.
+        halvings: of the photographs' size.
+        steps: of Adam.
+        lr: learning rate at the first step, metres; it falls exponentially to a tenth (`track.LEVEL_DECAY`).
     """
 
     halvings: int
@@ -22,35 +24,30 @@ class Level:
     lr: float
 
 
-LEVEL_END = 0.1
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrackConfig:
-    """Choices of the tracking.
+    """Choices of the tracking. The loss and its terms are described in `avatar.training.tracking`.
 
     Attributes:
-        levels: from coarse to fine. Stripes melt into one colour in coarse images, and silhouettes lead.
-        control_points: on the template. views: cameras a step.
-        smoothness: weight of the mean squared difference of neighbouring control points' displacements from the shape
-            that is foreseen, a square metre.
-        held: weight of the mean squared distance of simulated clothes from where they were foreseen, a square metre, in
-            the directions along the surface in which pictures do not tell: along stripes, and any on plain cloth.
-        body_motion_weight: weight of the mean distance that control points off the clothes move, a metre:
-            parameters say where the body is, and few pixels cannot tell better. Not applied to a template without
-            clothes.
-        still_body: the body's own surface follows its joints alone: poses say better where it is than photographs of a
-            few hundred pixels do. Not applied to a template that is a body alone.
-        tight_reach: metres from the skin, in the T-pose, within which clothes take part in that, the more the nearer:
-            what lies on the body goes where the body goes. 0: no clothes do.
-        extrapolation: share of the motion between the two frames before that a frame starts with.
-        simulate: let simulated clothes say where frames start and what shape they are smooth about, the more the better
-            they told the frames before; where `reference` and the capture's frames a second are known.
-        weights: of the losses.
-        back: follow the surface back from the last frames to the first too, in all sizes of images but the finest, and
-            measure how far from its start it ends.
-        reference: frame whose surface the template is, to begin with; None: no training frame's, and the first one
-            comes first.
+        levels: from coarse to fine. In coarse images stripes melt into one colour, so that silhouettes dominate.
+        control_points: K, number of control points on the template.
+        views: cameras a step.
+        smoothness: weight of the mean squared difference of neighbouring control points' displacements, after the
+            predicted shape is subtracted, 1/m^2.
+        prior_weight: weight of the Gaussian prior of simulated clothes about their prediction, along the surface in
+            directions that photographs do not determine (along stripes; any on plain cloth), 1/m^2.
+        body_motion_weight: weight of the mean displacement of control points off the clothes, 1/m. Parameters locate
+            the body better than few pixels do. Not applied to a template without clothes.
+        still_body: the body's own surface follows its joints alone, because poses locate it better than photographs of
+            a few hundred pixels. Not applied to a template that is a body alone.
+        tight_reach: distance from the skin in the T-pose, metres, within which clothes share the body's penalty,
+            falling linearly to 0 there. 0: none do.
+        extrapolation: share of the velocity of the two frames before with which a frame starts.
+        simulate: use simulated clothes as predictions, weighted by their errors in the frames before; needs `reference`
+            and the capture's frame rate.
+        weights: of the photometric loss.
+        back: track back from the last frames to the first too, at all levels but the finest, and measure the drift.
+        reference: frame on which the template was built, tracked first; None: the first training frame comes first.
         seed: of the order of views.
     """
 
@@ -58,7 +55,7 @@ class TrackConfig:
     control_points: int = 2400
     views: int = 4
     smoothness: float = 80.0
-    held: float = 1500.0
+    prior_weight: float = 1500.0
     body_motion_weight: float = 0.0
     tight_reach: float = 0.0
     still_body: bool = False
@@ -78,7 +75,7 @@ class TrackConfig:
             ("control_points", 1),
             ("views", 1),
             ("smoothness", 0),
-            ("held", 0),
+            ("prior_weight", 0),
             ("body_motion_weight", 0),
             ("tight_reach", 0),
             ("extrapolation", 0),
@@ -87,14 +84,14 @@ class TrackConfig:
 
     @property
     def steps(self) -> int:
-        """Steps of one frame."""
+        """Number of steps of one frame, over all levels."""
         return sum(level.steps for level in self.levels)
 
     def shortened(self, share: float) -> TrackConfig:
-        """Return the same with `share` of the steps of every level."""
+        """Return the configuration with `share` of the steps of every level."""
         levels = tuple(replace(level, steps=max(1, round(share * level.steps))) for level in self.levels)
         return replace(self, levels=levels)
 
     def coarse(self) -> TrackConfig:
-        """Return the same without the finest images, where there are others."""
+        """Return the configuration without its finest level, if it has others."""
         return replace(self, levels=self.levels[:-1] or self.levels)

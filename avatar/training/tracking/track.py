@@ -1,7 +1,6 @@
-"""Following the surface: displacements of every training frame, found one after the other from coarse to fine.
+"""The tracker: Adam on one frame's control points at a time, outwards from the reference frame, from coarse to fine.
 
-Cloth that swings moves by many pixels, and a pattern repeats within few: gradients of images lead a network that learns
-all frames at once into the wrong stripe. From one frame to the next the way is short.
+The loss, its terms and the schedule are described in `avatar.training.tracking`.
 """
 
 from __future__ import annotations
@@ -25,38 +24,48 @@ from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import BACK, Session
-from avatar.training.tracking.certainty import expected_distances, held_directions
-from avatar.training.tracking.config import LEVEL_END, Level, TrackConfig
-from avatar.training.tracking.foresight import Foresight, simulate_controls
-from avatar.training.tracking.structure import picture_structure
+from avatar.training.tracking.cloth_prediction import ClothPrediction, simulate_controls
+from avatar.training.tracking.config import Level, TrackConfig
+from avatar.training.tracking.track_uncertainty import expected_errors, structure_tensors, unobserved_weight
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import DEFAULT_FPS
 
-SEEN = 1
-"""Halvings of the photographs, about, that say how much can be told."""
+LEVEL_DECAY = 0.1
+"""Learning rate at the end of a level, as a fraction of that at its start."""
+STRUCTURE_HALVINGS = 1
+"""Halvings of the photographs of which structure tensors are taken, or the nearest number that a level has."""
 
 
 @dataclass(frozen=True, eq=False)
-class Begin:
-    """What a frame begins with, metres along the axes of the T-pose.
+class FramePriors:
+    """What is known of a frame's displacements before its photographs are used, metres along the axes of the T-pose.
 
     Attributes:
-        start: displacements. shape: those about which the frame's are smooth.
-        anchor: those that the frame's are held to. held: how much of that stands, see `held_directions`.
+        start: displacements at which the optimisation starts.
+        rest_shape: displacements about which the frame's are smooth.
+        anchor: centre of the Gaussian prior.
+        weight: of the prior in every direction, see `unobserved_weight`.
     """
 
     start: Float[Tensor, "K 3"]
-    shape: Float[Tensor, "K 3"]
+    rest_shape: Float[Tensor, "K 3"]
     anchor: Float[Tensor, "K 3"]
-    held: Float[Tensor, "K 3 3"]
+    weight: Float[Tensor, "K 3 3"]
 
 
 class TrackTask(PhotometricTask):
-    """Every frame starts from its nearest neighbour that is done, and takes the steps of all levels.
+    """Tracks frame after frame: each starts from predictions of its nearest solved neighbours and takes all levels.
 
     Args:
-        ahead: one that is done; the way back begins with what it found in the frames farthest from the first, and ends
-            there.
+        sequence: the training frames and views.
+        avatar: the Gaussians on control points.
+        config: of the tracking.
+        context: of the training.
+        forward: a finished forward pass. The backward pass starts from its displacements of the first and the last
+            frame and ends in the reference frame.
+
+    Raises:
+        InputError: a reference frame that is not a training frame.
     """
 
     sequence: AvatarSequence
@@ -68,20 +77,22 @@ class TrackTask(PhotometricTask):
         config: TrackConfig,
         context: TaskContext = ALONE,
         *,
-        ahead: TrackTask | None = None,
+        forward: TrackTask | None = None,
     ) -> None:
         frames = sequence.train_frames
         if config.reference is not None and config.reference not in frames:
             raise InputError(
                 "tracking: reference", expected="a training frame, or None", received=f"frame {config.reference}"
             )
+        # Order: outwards from the reference frame; backwards from the ends to it.
         first = frames[0] if config.reference is None else config.reference
         self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
         self.ends: tuple[int, ...] = ()
-        if ahead is not None:
+        if forward is not None:
             self.ends = tuple(sorted({frames[0], frames[-1]} - {first}))
             self.order = [frame for frame in reversed(self.order) if frame not in self.ends]
         self.row = {frame: row for row, frame in enumerate(frames)}
+        # One optimiser run over all frames: `steps` iterations each. `lr_factor` is the rate itself, so that lr is 1.
         shared = PhotometricConfig(
             iterations=len(self.order) * config.steps,
             views=config.views,
@@ -94,20 +105,21 @@ class TrackTask(PhotometricTask):
             sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], context
         )
         self.avatar, self.track_config = avatar, config
-        self.foresight = _foresight(sequence, avatar.cage, config) if ahead is None else ahead.foresight_known()
-        self._begun: tuple[int, Begin] | None = None
-        self._small: tuple[int, dict[tuple[str, int], View]] = (-1, {})
+        self.prediction = _prediction(sequence, avatar.cage, config) if forward is None else forward.known_prediction()
+        self._priors: tuple[int, FramePriors] | None = None
+        self._halved_views: tuple[int, dict[tuple[str, int], View]] = (-1, {})
+        # Results: displacements and structure tensors of all frames, a row each.
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
         self.structure = torch.zeros(len(frames), avatar.cage.count, 3, 3, device=sequence.device)
         self._unit = torch.eye(3, device=sequence.device)
         rig = sequence.rig
         self._normals = vertex_normals(rig.vertices, rig.faces)[avatar.cage.vertices]
         for row in (self.row[frame] for frame in self.ends):
-            assert ahead is not None
-            self.solved[row], self.structure[row] = ahead.solved[row], ahead.structure[row]
+            assert forward is not None
+            self.solved[row], self.structure[row] = forward.solved[row], forward.structure[row]
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
-        """Return one frame, until its steps are done."""
+        """Return the frame that is being tracked, with the cameras of this step."""
         self.iteration = iteration
         place, step = divmod(iteration, self.track_config.steps)
         now = self._item(place, step)
@@ -120,9 +132,9 @@ class TrackTask(PhotometricTask):
         return Item(frame, self.sequence.cameras(frame, step, self.track_config.views, self.track_config.seed))
 
     def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
-        """Return the rate itself: the level's, falling exponentially."""
+        """Return the learning rate: it starts at the level's and falls exponentially within it."""
         level, step = self._level(iteration)
-        return level.lr * LEVEL_END ** (step / level.steps)
+        return level.lr * LEVEL_DECAY ** (step / level.steps)
 
     def _level(self, iteration: int) -> tuple[Level, int]:
         """Return the level of a step, and the step's number within it."""
@@ -139,102 +151,115 @@ class TrackTask(PhotometricTask):
         return [self._halved(view, item.frame, halvings) for view in super().views(item)]
 
     def _halved(self, view: View, frame: int, times: int) -> View:
-        if self._small[0] != frame:
-            self._small = (frame, {})
-        kept = self._small[1]
+        """Return the view at half its size, `times` times; halved views of the current frame are cached."""
+        if self._halved_views[0] != frame:
+            self._halved_views = (frame, {})
+        cached = self._halved_views[1]
         if not times:
             return view
-        if (view.name, times) not in kept:
-            kept[view.name, times] = self._halved(view, frame, times - 1).halved()
-        return kept[view.name, times]
+        if (view.name, times) not in cached:
+            cached[view.name, times] = self._halved(view, frame, times - 1).halved()
+        return cached[view.name, times]
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Return `L_rec` with the roughness of what is not foreseen and how far the body moves, and its terms."""
+        """Return the loss of a frame and its terms; see `avatar.training.tracking` for the equation."""
         views = self.views(item)
         posed = self.avatar(self.sequence.pose(item.frame), camera_centers_of(views))
+        # Photometric loss L_rec.
         total, terms, _ = self.compared(posed, views)
         cage, controls = self.avatar.cage, self.avatar.controls
-        begin = self.begin(item.frame)
-        total = total + self.track_config.smoothness * cage.roughness(controls - begin.shape)
-        if self.track_config.held:
-            off = controls - begin.anchor
-            total = total + self.track_config.held * torch.einsum("ki,kij,kj->k", off, begin.held, off).mean()
+        priors = self.priors(item.frame)
+        # Smoothness of the difference from the predicted shape.
+        total = total + self.track_config.smoothness * cage.roughness(controls - priors.rest_shape)
+        # Gaussian prior about the anchor, in the directions that photographs do not determine.
+        if self.track_config.prior_weight:
+            off = controls - priors.anchor
+            squared = torch.einsum("ki,kij,kj->k", off, priors.weight, off).mean()
+            total = total + self.track_config.prior_weight * squared
+        # Robust penalty of motion off the clothes and of clothes near the skin.
         if self.track_config.body_motion_weight and not cage.off_clothes.all():
             left = cage.motion_off_clothes(controls, reach=self.track_config.tight_reach)
             total = total + self.track_config.body_motion_weight * left
         return total, {"loss": float(total.detach()), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """Take a step of the frame's; the first one leaves the frame before."""
+        """Take one step of the current frame; its first step sets the start and clears the optimiser's moments."""
         place, step = divmod(iteration, self.track_config.steps)
         if step == 0:
             with torch.no_grad():
-                self.avatar.controls.copy_(self.begin(self.order[place]).start)
+                self.avatar.controls.copy_(self.priors(self.order[place]).start)
             self.optimiser.state.clear()
         metrics = super().step(iteration)
         with torch.no_grad():
             self.solved[self.row[self.order[place]]] = self.avatar.controls
         return metrics
 
-    def begin(self, frame: int) -> Begin:
-        """Return what a frame begins with; it is kept while the frame is followed, what pictures tell for good."""
-        if self._begun is None or self._begun[0] != frame:
-            self._begun = (frame, self._begin(frame))
-        return self._begun[1]
+    def priors(self, frame: int) -> FramePriors:
+        """Return the priors of a frame, computed once; the frame's structure tensors are stored with them."""
+        if self._priors is None or self._priors[0] != frame:
+            self._priors = (frame, self._compute_priors(frame))
+        return self._priors[1]
 
-    def _begin(self, frame: int) -> Begin:
-        done = {}
+    def _compute_priors(self, frame: int) -> FramePriors:
+        # Solved frames, with the projection on the directions that photographs determined: I - W.
+        solved: dict[int, tuple[Tensor, Tensor | None]] = {}
         for other in (*self.ends, *self.order[: self.order.index(frame)]):
             row = self.row[other]
-            done[other] = (self.solved[row], self._unit - held_directions(self.structure[row], self._normals))
-        start = self.foresight.start(frame, done) if done else torch.zeros_like(self.avatar.controls)
+            solved[other] = (self.solved[row], self._unit - unobserved_weight(self.structure[row], self._normals))
+        start = self.prediction.start(frame, solved) if solved else torch.zeros_like(self.avatar.controls)
         own = self.structure[self.row[frame]]
         own.copy_(self._structure(frame, start))
-        if not done:
-            return Begin(start, start, start, torch.zeros_like(own))
-        # What is not simulated is not held: plain cloth that swings would stay where skinning has it.
-        held, anchor = self.foresight.share * held_directions(own, self._normals), self.foresight.anchor(frame, done)
-        start = start + torch.einsum("kij,kj->ki", held, anchor - start)
-        return Begin(start, self.foresight.shape(frame, done), anchor, held)
+        if not solved:
+            return FramePriors(start, start, start, torch.zeros_like(own))
+        # The prior acts on simulated clothes alone: it would hold other swinging cloth where skinning has it.
+        weight = self.prediction.share * unobserved_weight(own, self._normals)
+        anchor = self.prediction.anchor(frame, solved)
+        # Start at the anchor in the directions that photographs do not determine.
+        start = start + torch.einsum("kij,kj->ki", weight, anchor - start)
+        return FramePriors(start, self.prediction.rest_shape(frame, solved), anchor, weight)
 
     def _structure(self, frame: int, controls: Tensor) -> Tensor:
-        """What photographs of a frame can tell of displacements about these."""
-        halvings = min((level.halvings for level in self.track_config.levels), key=lambda size: abs(size - SEEN))
+        """Return the structure tensors of a frame's photographs by all training cameras, about given displacements."""
+        sizes = [level.halvings for level in self.track_config.levels]
+        halvings = min(sizes, key=lambda size: abs(size - STRUCTURE_HALVINGS))
         names = self.sequence.cameras(frame, 0, len(self.sequence.train_cameras), self.track_config.seed)
         views = [self._halved(self.sequence.view(name, frame), frame, halvings) for name in names]
         pose, background = self.sequence.pose(frame), self.sequence.background
-        return picture_structure(self.avatar, controls, pose, views, background, halvings=halvings)
+        return structure_tensors(self.avatar, controls, pose, views, background, halvings=halvings)
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Return nothing: the control points are those of one frame."""
+        """Return no figures, because the control points fit one frame alone."""
         return {"mean": {}}
 
     def state(self) -> Mapping[str, Tensor]:
-        """Return the frames that are done too."""
+        """Return the optimiser's state with the displacements and structure tensors of all frames."""
         return {**super().state(), **self.found()}
 
     def found(self) -> dict[str, Tensor]:
-        """Return displacements of the frames that are done and what pictures told; rows in the frames' order."""
+        """Return displacements (T, K, 3) and structure tensors (T, K, 3, 3); rows in the order of training frames."""
         return {"solved": self.solved, "structure": self.structure}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `state` gave."""
+        """Continue from a `state`, after checks of its shapes and numbers."""
         require_like(tensors, self.found(), subject="checkpoint")
         require_finite({name: tensors[name] for name in self.found()}, subject="checkpoint")
         super().restore(tensors)
         for name, own in self.found().items():
             own.copy_(tensors[name])
-        self._begun = None
+        self._priors = None
 
-    def foresight_known(self) -> Foresight:
-        """Return the foresight with what was found in the reference frame, where a way back has yet to come."""
+    def known_prediction(self) -> ClothPrediction:
+        """Return the predictor with the reference frame's displacements, for the backward pass that ends there."""
         reference = self.track_config.reference
-        return self.foresight if reference is None else replace(self.foresight, error=self.solved[self.row[reference]])
+        if reference is None:
+            return self.prediction
+        return replace(self.prediction, offset=self.solved[self.row[reference]])
 
     def track(self) -> Track:
-        """Return what was found, less what was found in the reference frame.
+        """Return the tracked surface: displacements relative to the reference frame's, and their expected errors.
 
-        There the template is the surface: what images ask of it is an error of the Gaussians, in all frames alike.
+        In the reference frame the template is the surface. Displacements found there are an error of the Gaussians,
+        the same in all frames, and are subtracted.
         """
         solved = self.solved.clone()
         if self.track_config.reference is not None:
@@ -242,53 +267,65 @@ class TrackTask(PhotometricTask):
         return Track(self.row, solved, self.avatar.cage, self._sigma(solved))
 
     def _sigma(self, solved: Tensor) -> Tensor:
-        """Distances (T, K) from the truth that are to be expected of displacements."""
+        """Return the expected error (T, K) of displacements, metres, by the Kalman filter of `expected_errors`."""
         structure = {frame: self.structure[self.row[frame]] for frame in self.order}
         seconds, known = 1.0 / (self.sequence.capture.fps or DEFAULT_FPS), self.track_config.reference is not None
         moved = solved.square().sum(-1).mean(0).sqrt()
-        found = expected_distances(self.order, seconds, structure, moved, known=known)
+        found = expected_errors(self.order, seconds, structure, moved, known=known)
         return torch.stack([found[frame] for frame in self.row])
 
-    def apart_at_first(self, back: TrackTask) -> Tensor:
-        """Return how far (K,), metres, a way back ends from where this one began."""
+    def drift(self, back: TrackTask) -> Tensor:
+        """Return the round-trip error (K,), metres: distance of the backward pass's end from the forward start."""
         frames = self.sequence.train_frames
         row = self.row[frames[0] if self.track_config.reference is None else self.track_config.reference]
         return (back.solved[row] - self.solved[row]).norm(dim=-1)
 
 
-def _foresight(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> Foresight:
+def _prediction(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> ClothPrediction:
+    """Return the predictor, with simulated clothes where the configuration and the capture allow them."""
     simulated, fps = None, sequence.capture.fps
     if config.simulate and config.reference is not None and fps is not None:
         poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
         reference = poses[config.reference].without_shape()
         simulated = simulate_controls(sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices)
-    return Foresight(config.extrapolation, simulated, config.reference, fps=fps or DEFAULT_FPS)
+    return ClothPrediction(config.extrapolation, simulated, config.reference, fps=fps or DEFAULT_FPS)
 
 
 def follow_surface(
     sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
 ) -> tuple[Track, Progress]:
-    """Find the displacements of every training frame, one frame after the other; go back, where that is asked for.
+    """Track the surface through all training frames, and back where `TrackConfig.back` is set.
 
-    Steps have one frame each: of several processes the first follows it, and the others hear what it found.
+    Steps have one frame each, so that the first of several processes tracks and sends its results to the others.
+
+    Args:
+        sequence: the training frames and views.
+        gaussians: on the template, fitted to the reference frame; they stay fixed.
+        config: of the tracking.
+        session: of the training; a stopped tracking continues from its checkpoint.
+
+    Returns:
+        The track and the progress of the steps.
     """
     count = min(config.control_points, len(sequence.rig.vertices))
     avatar = TrackedAvatar(sequence.rig, gaussians, count, still_body=config.still_body)
     context = replace(session.context, distributed=None)
+    # Forward pass.
     task = TrackTask(sequence, avatar, config, context)
     progress = session.run_alone(lambda: task, task.config)
     _share(task, session)
     if not (config.back and progress.finished and len(sequence.train_frames) > 1):
         return task.track(), progress
-    way_back = TrackTask(sequence, avatar, config.coarse(), context, ahead=task)
-    after = session.after(progress).within(BACK).run_alone(lambda: way_back, way_back.config)
-    _share(way_back, session)
-    found = replace(task.track(), drift=task.apart_at_first(way_back)) if after.finished else task.track()
+    # Backward pass without the finest level, which measures drift.
+    backward = TrackTask(sequence, avatar, config.coarse(), context, forward=task)
+    after = session.after(progress).within(BACK).run_alone(lambda: backward, backward.config)
+    _share(backward, session)
+    found = replace(task.track(), drift=task.drift(backward)) if after.finished else task.track()
     return found, replace(after, session_seconds=progress.session_seconds + after.session_seconds)
 
 
 def _share(task: TrackTask, session: Session) -> None:
-    """Tell all processes what the first one found."""
+    """Send the first process's results to all processes."""
     processes = session.distributed or Distributed()
     for own in task.found().values():
         own.copy_(processes.run_on_rank0(own.cpu))

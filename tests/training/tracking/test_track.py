@@ -147,9 +147,9 @@ def test_a_frame_starts_from_its_neighbours_carried_on(frames, monkeypatch):
     first, second = torch.full_like(made.avatar.controls, 0.01), torch.full_like(made.avatar.controls, 0.03)
     made.solved[0], made.solved[1] = first, second
     monkeypatch.setattr(made, "_structure", lambda frame, start: torch.full((24, 3, 3), 1e12) * torch.eye(3))
-    assert torch.equal(made.begin(0).start, torch.zeros_like(first))
-    torch.testing.assert_close(made.begin(1).start, first)
-    torch.testing.assert_close(made.begin(2).start, second + CONFIG.extrapolation * (second - first))
+    assert torch.equal(made.priors(0).start, torch.zeros_like(first))
+    torch.testing.assert_close(made.priors(1).start, first)
+    torch.testing.assert_close(made.priors(2).start, second + CONFIG.extrapolation * (second - first))
 
 
 def test_photographs_are_halved_once_a_frame(frames, monkeypatch):

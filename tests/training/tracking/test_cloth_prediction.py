@@ -1,4 +1,4 @@
-"""Where frames begin: clothes that were simulated well are believed, others are not, and nothing else changes."""
+"""Predictions of a frame: simulated clothes have weight where they were right, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import TrackedAvatar
+from avatar.training.tracking.cloth_prediction import (
+    CORRECTION_DECAY,
+    ClothPrediction,
+    SimulatedControls,
+    Solved,
+    simulate_controls,
+)
 from avatar.training.tracking.config import Level, TrackConfig
-from avatar.training.tracking.foresight import FADING, Foresight, SimulatedControls, Solved, simulate_controls
 from avatar.training.tracking.track import TrackTask
 from smplxpp.capture import open_capture
 from smplxpp.core.labels import LOWER
@@ -42,55 +48,58 @@ def solved(count: int) -> Solved:
     return {frame: (swung(frame), None) for frame in range(count)}
 
 
-def wrong(foresight: Foresight, frame: int = 8) -> float:
-    return float((foresight.start(frame, solved(frame)) - swung(frame))[:3].norm(dim=-1).mean())
+def start_error(prediction: ClothPrediction, frame: int = 8) -> float:
+    return float((prediction.start(frame, solved(frame)) - swung(frame))[:3].norm(dim=-1).mean())
 
 
-def test_a_swing_that_motion_carried_on_misses_is_foreseen():
-    carried, foreseen = wrong(Foresight(1.0, fps=FPS)), wrong(Foresight(1.0, simulated(), 0, fps=FPS))
-    assert foreseen < 0.1 * carried
-    late = wrong(Foresight(1.0, simulated(0.2), 0, fps=FPS))
-    assert foreseen < late < 0.6 * carried
+def test_simulated_clothes_predict_a_swing_that_extrapolation_misses():
+    extrapolated, predicted = (
+        start_error(ClothPrediction(1.0, fps=FPS)),
+        start_error(ClothPrediction(1.0, simulated(), 0, fps=FPS)),
+    )
+    assert predicted < 0.1 * extrapolated
+    late = start_error(ClothPrediction(1.0, simulated(0.2), 0, fps=FPS))
+    assert predicted < late < 0.6 * extrapolated
 
 
-def test_simulations_that_were_wrong_are_not_believed():
+def test_simulations_with_large_errors_have_little_weight():
     nonsense = simulated(3.0, scale=6.0)
-    shape, right = (Foresight(1.0, one, 0, fps=FPS).shape(8, solved(8)) for one in (nonsense, simulated()))
+    shape, right = (ClothPrediction(1.0, one, 0, fps=FPS).rest_shape(8, solved(8)) for one in (nonsense, simulated()))
     assert shape[:3].norm(dim=-1).max() < 0.1 * nonsense.displacements[8][0].norm()
     torch.testing.assert_close(right[:3], swung(8)[:3], rtol=0.05, atol=0.0)
-    assert wrong(Foresight(1.0, nonsense, 0, fps=FPS)) < 1.3 * wrong(Foresight(1.0, fps=FPS))
+    assert start_error(ClothPrediction(1.0, nonsense, 0, fps=FPS)) < 1.3 * start_error(ClothPrediction(1.0, fps=FPS))
 
 
-def test_what_is_not_simulated_is_carried_on():
-    start = Foresight(1.0, simulated(), 0, fps=FPS).start(8, solved(8))
-    carried = Foresight(1.0, fps=FPS).start(8, solved(8))
-    assert torch.equal(start[4:], carried[4:])
-    assert not torch.equal(start[:3], carried[:3])
+def test_points_without_a_simulation_are_extrapolated():
+    start = ClothPrediction(1.0, simulated(), 0, fps=FPS).start(8, solved(8))
+    extrapolated = ClothPrediction(1.0, fps=FPS).start(8, solved(8))
+    assert torch.equal(start[4:], extrapolated[4:])
+    assert not torch.equal(start[:3], extrapolated[:3])
 
 
-def test_anchors_fade_to_skinning_where_nothing_is_simulated():
+def test_anchors_decay_to_skinning_where_nothing_is_simulated():
     drifted = {frame: (torch.tensor([0.01, 0.0, 0.0]).expand(POINTS, 3), None) for frame in range(4)}
-    anchor = Foresight(1.0, fps=FPS).anchor(5, drifted)
-    torch.testing.assert_close(anchor, exp(-2 / FPS / FADING) * drifted[3][0])
+    anchor = ClothPrediction(1.0, fps=FPS).anchor(5, drifted)
+    torch.testing.assert_close(anchor, exp(-2 / FPS / CORRECTION_DECAY) * drifted[3][0])
     # What was found where the template is the surface is no motion and stays.
-    at_rest = Foresight(1.0, reference=0, fps=FPS).anchor(5, drifted)
+    at_rest = ClothPrediction(1.0, reference=0, fps=FPS).anchor(5, drifted)
     torch.testing.assert_close(at_rest, drifted[3][0])
-    simulated_too = Foresight(1.0, simulated(), 0, fps=FPS).anchor(8, solved(8))
+    simulated_too = ClothPrediction(1.0, simulated(), 0, fps=FPS).anchor(8, solved(8))
     torch.testing.assert_close(simulated_too[:3], swung(8)[:3], rtol=1e-3, atol=0.0)
 
 
 def test_the_error_of_the_reference_stays_in_all_frames():
     error = torch.tensor([0.0, 0.01, 0.0])
     found = {frame: (one + error, None) for frame, (one, _) in solved(8).items()}
-    moved = Foresight(1.0, simulated(), 0, fps=FPS).start(8, found)
-    torch.testing.assert_close(moved, Foresight(1.0, simulated(), 0, fps=FPS).start(8, solved(8)) + error)
+    moved = ClothPrediction(1.0, simulated(), 0, fps=FPS).start(8, found)
+    torch.testing.assert_close(moved, ClothPrediction(1.0, simulated(), 0, fps=FPS).start(8, solved(8)) + error)
 
 
-def test_both_directions_from_the_reference_are_judged_apart():
-    foresight = Foresight(1.0, simulated(), 5, fps=FPS)
+def test_errors_are_compared_on_each_side_of_the_reference_alone():
+    prediction = ClothPrediction(1.0, simulated(), 5, fps=FPS)
     found = {frame: (swung(frame), None) for frame in (5, 4, 6, 3, 7)}
-    assert foresight._judged(8, found) == [7, 6] and foresight._judged(2, found) == [3, 4]
-    forth = foresight.start(8, found)
+    assert prediction._recent(8, found) == [7, 6] and prediction._recent(2, found) == [3, 4]
+    forth = prediction.start(8, found)
     assert float((forth - swung(8))[:3].norm(dim=-1).mean()) < 0.01
 
 
@@ -158,14 +167,14 @@ def test_frames_of_a_capture_start_nearer_to_a_skirt_that_swings(skirted):
         true = torch.tensor(moved()[:, rows], dtype=torch.float32)
         for frame in skirted.train_frames:
             made.solved[made.row[frame]] = true[frame]
-        begins = {frame: made.begin(frame) for frame in made.order[3:]}
+        begins = {frame: made.priors(frame) for frame in made.order[3:]}
         wrong[simulate] = sum(float((one.start - true[frame]).norm(dim=-1).mean()) for frame, one in begins.items())
-        assert (begins[5].shape.abs().max() > 1e-3) == simulate
+        assert (begins[5].rest_shape.abs().max() > 1e-3) == simulate
     assert wrong[True] < 0.7 * wrong[False]
 
 
 def test_without_a_reference_nothing_is_simulated(skirted):
-    assert task(skirted, reference=None).foresight.simulated is None
+    assert task(skirted, reference=None).prediction.simulated is None
 
 
 def test_resumed_with_simulated_clothes_bit_for_bit(skirted):

@@ -1,4 +1,4 @@
-"""What pictures tell of a followed surface: along stripes and on plain cloth little, and it says so; the way back."""
+"""Structure tensors, the prior's weight and expected errors of a track, and the backward pass."""
 
 from __future__ import annotations
 
@@ -15,11 +15,18 @@ from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.session import Session
-from avatar.training.tracking.certainty import ASTRAY, CONTRAST, KNOWN, LIT, expected_distances, held_directions
+from avatar.training.tracking.cloth_prediction import CORRECTION_DECAY
 from avatar.training.tracking.config import Level
-from avatar.training.tracking.foresight import FADING
-from avatar.training.tracking.structure import picture_structure
 from avatar.training.tracking.track import TrackTask, follow_surface
+from avatar.training.tracking.track_uncertainty import (
+    OBSERVED_GRADIENT,
+    REFERENCE_SIGMA,
+    SHADING_SIGMA,
+    SIMULATION_SHARE,
+    expected_errors,
+    structure_tensors,
+    unobserved_weight,
+)
 from smplxpp.capture import open_capture
 from tests.cloth.persons import person
 from tests.dolls.dancing import doll, gaussians, sequence, template
@@ -28,7 +35,7 @@ from tests.dolls.skirted import moved, write_skirted
 from tests.training.tracking.test_track import CONFIG
 
 STRIPED, PLAIN = 40.0, 0.0
-HELD = replace(CONFIG, levels=(Level(0, 12, 8e-3),), reference=0)
+PRIOR = replace(CONFIG, levels=(Level(0, 12, 8e-3),), reference=0)
 
 
 def painted(stripes: float):
@@ -52,7 +59,7 @@ def dances(tmp_path_factory) -> dict[float, AvatarSequence]:
 def tracks(dances, tmp_path_factory) -> dict[float, Track]:
     found = {}
     for stripes, frames in dances.items():
-        config = replace(HELD, back=stripes == STRIPED)
+        config = replace(PRIOR, back=stripes == STRIPED)
         found[stripes], progress = follow_surface(
             frames, painted(stripes), config, Session(tmp_path_factory.mktemp("track"))
         )
@@ -64,67 +71,67 @@ def structure(frames: AvatarSequence, stripes: float, cameras: tuple[str, ...]) 
     avatar = TrackedAvatar(frames.rig, painted(stripes), 48)
     views = [frames.view(camera, 0) for camera in cameras]
     still = torch.zeros_like(avatar.controls)
-    return picture_structure(avatar, still, frames.pose(0), views, frames.background, halvings=0), avatar
+    return structure_tensors(avatar, still, frames.pose(0), views, frames.background, halvings=0), avatar
 
 
-def test_what_has_contrast_is_let_go_and_what_has_none_is_held():
-    told = torch.diag(torch.tensor([0.0, CONTRAST**2, 100.0 * CONTRAST**2]))[None]
-    held = held_directions(told, torch.zeros(1, 3))[0].diagonal()
-    torch.testing.assert_close(held, torch.tensor([1.0, 0.25, 1e-8]), rtol=1e-3, atol=1e-8)
+def test_the_prior_acts_where_contrast_is_low_alone():
+    information = torch.diag(torch.tensor([0.0, OBSERVED_GRADIENT**2, 100.0 * OBSERVED_GRADIENT**2]))[None]
+    weight = unobserved_weight(information, torch.zeros(1, 3))[0].diagonal()
+    torch.testing.assert_close(weight, torch.tensor([1.0, 0.25, 1e-8]), rtol=1e-3, atol=1e-8)
 
 
-def test_a_point_is_held_along_the_surface_alone():
+def test_the_prior_acts_along_the_surface_alone():
     normal = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, -2.0]]), dim=-1)
-    held = held_directions(torch.zeros(1, 3, 3), normal)[0]
-    torch.testing.assert_close(held @ normal[0], torch.zeros(3), atol=1e-6, rtol=0)
-    torch.testing.assert_close(torch.linalg.eigvalsh(held), torch.tensor([0.0, 1.0, 1.0]), atol=1e-6, rtol=0)
+    weight = unobserved_weight(torch.zeros(1, 3, 3), normal)[0]
+    torch.testing.assert_close(weight @ normal[0], torch.zeros(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.eigvalsh(weight), torch.tensor([0.0, 1.0, 1.0]), atol=1e-6, rtol=0)
 
 
-def test_what_is_expected_of_points_that_nothing_tells_of_and_of_others():
-    blind, seen = torch.zeros(1, 3, 3), 4.0 * LIT**2 / KNOWN**2 * torch.eye(3)[None]
+def test_expected_errors_of_unseen_and_seen_points_are_the_kalman_filters():
+    blind, seen = torch.zeros(1, 3, 3), 4.0 * SHADING_SIGMA**2 / REFERENCE_SIGMA**2 * torch.eye(3)[None]
     order, step, swing = [0, 1, 2, 60], 0.1, torch.tensor([0.03])
-    unseen = expected_distances(order, step, {frame: blind for frame in order}, swing, known=True)
-    kept, astray = exp(-2.0 * step / FADING), ASTRAY * 0.03 + KNOWN
-    once = sqrt(3.0 * (kept * KNOWN**2 + (1.0 - kept) * astray**2))
-    assert float(unseen[0]) == pytest.approx(sqrt(3.0) * KNOWN) and float(unseen[1]) == pytest.approx(once)
+    unseen = expected_errors(order, step, {frame: blind for frame in order}, swing, known=True)
+    kept, astray = exp(-2.0 * step / CORRECTION_DECAY), SIMULATION_SHARE * 0.03 + REFERENCE_SIGMA
+    once = sqrt(3.0 * (kept * REFERENCE_SIGMA**2 + (1.0 - kept) * astray**2))
+    assert float(unseen[0]) == pytest.approx(sqrt(3.0) * REFERENCE_SIGMA) and float(unseen[1]) == pytest.approx(once)
     assert unseen[1] < unseen[2] < unseen[60] and float(unseen[60]) == pytest.approx(sqrt(3.0) * astray)
-    told = expected_distances(order, step, {frame: seen for frame in order}, swing, known=True)
-    assert max(map(float, told.values())) < 0.5 * sqrt(3.0) * KNOWN
-    lost = expected_distances(order, step, {frame: blind for frame in order}, swing, known=False)
+    information = expected_errors(order, step, {frame: seen for frame in order}, swing, known=True)
+    assert max(map(float, information.values())) < 0.5 * sqrt(3.0) * REFERENCE_SIGMA
+    lost = expected_errors(order, step, {frame: blind for frame in order}, swing, known=False)
     assert float(lost[0]) == pytest.approx(sqrt(3.0) * astray)
 
 
-def test_stripes_tell_across_them_and_plain_cloth_tells_of_nothing(dances):
+def test_stripes_determine_the_direction_across_them_and_plain_cloth_none(dances):
     cameras = tuple(dances[STRIPED].train_cameras)
     across, along = {}, {}
     for stripes in (STRIPED, PLAIN):
-        told, avatar = structure(dances[stripes], stripes, cameras)
-        dress = told[~avatar.cage.off_clothes]
+        information, avatar = structure(dances[stripes], stripes, cameras)
+        dress = information[~avatar.cage.off_clothes]
         across[stripes], along[stripes] = dress[:, 1, 1].median(), torch.linalg.eigvalsh(dress)[:, 0].median()
     assert across[STRIPED] > 2.0 * across[PLAIN]
     assert across[STRIPED] > 2.0 * along[STRIPED]
 
 
-def test_what_no_camera_sees_is_not_told_of(dances):
+def test_structure_tensors_of_hidden_points_are_near_zero(dances):
     (camera,) = (name for name in dances[STRIPED].train_cameras if name == "Ring0")
-    told, avatar = structure(dances[STRIPED], STRIPED, (camera,))
+    information, avatar = structure(dances[STRIPED], STRIPED, (camera,))
     rig, towards = dances[STRIPED].rig, dances[STRIPED].capture.cameras[camera].position
     posed = rig.skin(dances[STRIPED].pose(0))[avatar.cage.vertices]
     side = (posed - posed.mean(0)) @ torch.tensor(towards / np.linalg.norm(towards), dtype=torch.float32)
-    size = told.diagonal(dim1=1, dim2=2).sum(-1)
+    size = information.diagonal(dim1=1, dim2=2).sum(-1)
     hidden, shown = size[side < side.quantile(0.2)], size[side > side.quantile(0.8)]
     assert hidden.min() < 0.01 * shown.min()
 
 
-def test_a_plain_skirt_is_believed_less_and_least_where_it_is_wrong(tmp_path):
-    """A hem that swings, in stripes and plain: what is expected of its errors, beside what they are."""
+def test_expected_errors_of_a_plain_skirt_are_larger_and_rank_its_true_errors(tmp_path):
+    """Compare expected and true errors of a swinging hem, striped and plain."""
     found, wrong = {}, []
     for stripes in (STRIPED, PLAIN):
         frames = AvatarSequence(open_capture(write_skirted(tmp_path / f"{stripes:g}", stripes=stripes)), person())
         bound = sample_on_mesh(person(), SamplingConfig(count=1500, sh_degree=0))
         where = world_from_local(bound, frames.rig.vertices, frames.rig.faces).means
         bound = replace(bound, dc=torch.tensor(paint(where.numpy(), stripes), dtype=torch.float32))
-        config = replace(HELD, levels=(Level(0, 4, 5e-3),), control_points=60)
+        config = replace(PRIOR, levels=(Level(0, 4, 5e-3),), control_points=60)
         found[stripes], _ = follow_surface(frames, bound, config, Session(tmp_path / f"track{stripes:g}"))
     skirt = torch.tensor(person().cloth_mask)
     expected = []
@@ -140,27 +147,27 @@ def test_a_plain_skirt_is_believed_less_and_least_where_it_is_wrong(tmp_path):
 @pytest.mark.parametrize(
     ("reference", "ends", "order"), [(0, (3,), [2, 1, 0]), (2, (0, 3), [1, 2]), (3, (0,), [1, 2, 3])]
 )
-def test_the_way_back_begins_with_what_was_found_at_the_ends(dances, reference, ends, order):
+def test_the_backward_pass_starts_from_the_displacements_of_the_ends(dances, reference, ends, order):
     avatar = TrackedAvatar(dances[STRIPED].rig, painted(STRIPED), CONFIG.control_points)
-    config = replace(HELD, reference=reference, held=0.0)
-    ahead = TrackTask(dances[STRIPED], avatar, config)
-    ahead.solved[:] = torch.randn(ahead.solved.shape, generator=torch.Generator().manual_seed(1))
-    back = TrackTask(dances[STRIPED], avatar, config.coarse(), ahead=ahead)
+    config = replace(PRIOR, reference=reference, prior_weight=0.0)
+    forward = TrackTask(dances[STRIPED], avatar, config)
+    forward.solved[:] = torch.randn(forward.solved.shape, generator=torch.Generator().manual_seed(1))
+    back = TrackTask(dances[STRIPED], avatar, config.coarse(), forward=forward)
     assert (back.ends, back.order) == (ends, order) and back.config.iterations == len(order) * config.steps
     nearest = min(ends, key=lambda end: abs(end - order[0]))
-    torch.testing.assert_close(back.begin(order[0]).start, ahead.solved[nearest])
-    back.solved[reference] = ahead.solved[reference] + torch.tensor([0.0, 0.03, 0.04])
-    torch.testing.assert_close(ahead.apart_at_first(back), torch.full((CONFIG.control_points,), 0.05))
+    torch.testing.assert_close(back.priors(order[0]).start, forward.solved[nearest])
+    back.solved[reference] = forward.solved[reference] + torch.tensor([0.0, 0.03, 0.04])
+    torch.testing.assert_close(forward.drift(back), torch.full((CONFIG.control_points,), 0.05))
 
 
-def test_the_way_back_is_measured_where_it_was_asked_for(tracks):
+def test_drift_is_measured_where_it_was_requested(tracks):
     assert tracks[PLAIN].drift is None
     drift = tracks[STRIPED].drift
     assert drift.shape == (CONFIG.control_points,) and drift.isfinite().all() and drift.any()
 
 
-def test_a_way_back_that_was_stopped_goes_on(dances, tracks, tmp_path):
-    config, frames = replace(HELD, back=True), dances[STRIPED]
+def test_a_stopped_backward_pass_continues_bit_for_bit(dances, tracks, tmp_path):
+    config, frames = replace(PRIOR, back=True), dances[STRIPED]
     stops = 0
     while True:
         track, progress = follow_surface(frames, painted(STRIPED), config, Session(tmp_path, max_seconds=1e-9))
